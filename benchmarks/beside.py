@@ -26,4 +26,9 @@ def spinning() -> Iterator[None]:
 
 def result_file(name: str) -> Path:
     """Where the results of a benchmark go."""
-    return Path(__file__).parents[1] / "results" / "benchmarks" / f"{name}{'_busy' if BUSY else ''}.json"
+    return (
+        Path(__file__).parents[1]
+        / "results"
+        / "benchmarks"
+        / f"{name}{'_busy' if BUSY else ''}.json"
+    )

@@ -29,8 +29,15 @@ RESULT = ROOT / "results" / "benchmarks" / "cnn_ukf.json"
 THREADS = int(os.environ.get("BENCH_THREADS", "1"))
 HOURS, RATE, STEPS, BATCH = 2.0, 100, 256, 32
 MEMBERS, MINUTES, SAMPLES_A_STEP = 20, 10.0, 1024
-FLOPS_A_SAMPLE = 2 * (3 * (17 * 250 + 250 * 125 + 125 * 2) - 17 * 250)  # of matrix products: forwards, by the weights, by what is below
-DRIVES = ("train_slalom_18_on_001", "train_j_turn_off_001", "train_lane_change_1_on_001", "train_random_steer_on_001")
+FLOPS_A_SAMPLE = 2 * (
+    3 * (17 * 250 + 250 * 125 + 125 * 2) - 17 * 250
+)  # of matrix products: forwards, by the weights, by what is below
+DRIVES = (
+    "train_slalom_18_on_001",
+    "train_j_turn_off_001",
+    "train_lane_change_1_on_001",
+    "train_random_steer_on_001",
+)
 LEAST_RATIO, MOST_EPOCH, LEAST_ENSEMBLE = 6.0, 240.0, 2.5  # 1, s, 1
 MOST_DIFFERENCE = 1e-4  # relative, of losses and gradients, of a network in single precision
 TYRES = {"cornering_stiffness": 1.2e5, "friction": 1.1, "reduction": 1e-3}
@@ -51,7 +58,9 @@ def drives(seconds: float) -> list[Any]:
     from vehest.sources.base import open_source
 
     temporary = tempfile.gettempdir()
-    config = compose_config("ingest", ["dataset=sim_bmw", f"root={temporary}", f"output={temporary}"])
+    config = compose_config(
+        "ingest", ["dataset=sim_bmw", f"root={temporary}", f"output={temporary}"]
+    )
     source = open_source(config["dataset"])
     own = [source.read(name).cut(2.0, 1e9) for name in DRIVES]
     found: list[Any] = []
@@ -73,7 +82,12 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
     estimator.network.reset([torch.Generator().manual_seed(0)])
     with torch.no_grad():
         estimator.network.get_parameter("bias_3")[0, 1:] = torch.tensor([-3.0, -6.5, -6.5])
-    return estimator, EndToEnd(estimator, estimator.network.samples(*raw), recordings, EndToEndSettings(steps=STEPS, batch_size=BATCH))
+    return estimator, EndToEnd(
+        estimator,
+        estimator.network.samples(*raw),
+        recordings,
+        EndToEndSettings(steps=STEPS, batch_size=BATCH),
+    )
 
 
 def plain(estimator: Any, training: Any, batch: Any) -> Any:
@@ -89,7 +103,9 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
     angle, shares = hidden[..., 0] * estimator.network.unit.double(), torch.sigmoid(hidden[..., 1:])
     process = torch.diag_embed(shares[..., 1:].square())
     of_sensors = training.sensors[batch.trusted.long()].diagonal(dim1=-2, dim2=-1)
-    sensors = torch.diag_embed(torch.cat([of_sensors, shares[..., :1].square() + LEAST_VARIANCE], -1))
+    sensors = torch.diag_embed(
+        torch.cat([of_sensors, shares[..., :1].square() + LEAST_VARIANCE], -1)
+    )
     measured = torch.cat([batch.measured, angle.unsqueeze(-1)], -1)
     track = training.filter.track
     n, total = 2, 3.0
@@ -100,11 +116,17 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
         centre = mean.unsqueeze(-2)
         return torch.cat([centre, centre + offsets, centre - offsets], -2)
 
-    mean, covariance, means = batch.start, torch.tensor(START, dtype=torch.float64).square().diag().expand(len(batch.start), n, n), []
+    mean, covariance, means = (
+        batch.start,
+        torch.tensor(START, dtype=torch.float64).square().diag().expand(len(batch.start), n, n),
+        [],
+    )
     for k in range(batch.sideslip.shape[1]):
         now = batch.driven[:, k, None]
         if k:
-            after = track.transition(points(mean, covariance), batch.driven[:, k - 1, None].expand(-1, 5, -1))
+            after = track.transition(
+                points(mean, covariance), batch.driven[:, k - 1, None].expand(-1, 5, -1)
+            )
             mean = weights @ after
             deviation = after - mean.unsqueeze(-2)
             covariance = (weights[:, None] * deviation).mT @ deviation + process[:, k - 1]
@@ -113,7 +135,9 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
         predicted = weights @ expected
         deviation = expected - predicted.unsqueeze(-2)
         own = (weights[:, None] * deviation).mT @ deviation + sensors[:, k]
-        gain = torch.linalg.solve(own, (weights[:, None] * deviation).mT @ (at - mean.unsqueeze(-2))).mT
+        gain = torch.linalg.solve(
+            own, (weights[:, None] * deviation).mT @ (at - mean.unsqueeze(-2))
+        ).mT
         mean = mean + (gain @ (measured[:, k] - predicted).unsqueeze(-1)).squeeze(-1)
         covariance = covariance - gain @ own @ gain.mT
         covariance = 0.5 * (covariance + covariance.mT)
@@ -145,7 +169,10 @@ def through_the_filter(recordings: list[Any]) -> list[dict[str, Any]]:
     estimator, training = end_to_end(recordings[: len(DRIVES)], 0.0)
     firsts = 300 + 200 * torch.arange(BATCH)
     batch = training.cut(firsts, torch.zeros(1, dtype=torch.int64))
-    ways: dict[str, Callable[[], Any]] = {"plain": lambda: plain(estimator, training, batch), "ours": lambda: training.loss(batch)}
+    ways: dict[str, Callable[[], Any]] = {
+        "plain": lambda: plain(estimator, training, batch),
+        "ours": lambda: training.loss(batch),
+    }
     stepped(ways["ours"], estimator.network)  # compiles
     seconds: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
     outcomes = {}
@@ -153,8 +180,14 @@ def through_the_filter(recordings: list[Any]) -> list[dict[str, Any]]:
         for way, loss in ways.items():
             *times, outcomes[way] = timed(lambda loss=loss: stepped(loss, estimator.network))
             seconds[way].append((times[0], times[1]))
-    best = {way: tuple(min(column) for column in zip(*rows, strict=True)) for way, rows in seconds.items()}
-    off = [float((one - other).norm()) for one, other in zip(outcomes["ours"][1], outcomes["plain"][1], strict=True)]
+    best = {
+        way: tuple(min(column) for column in zip(*rows, strict=True))
+        for way, rows in seconds.items()
+    }
+    off = [
+        float((one - other).norm())
+        for one, other in zip(outcomes["ours"][1], outcomes["plain"][1], strict=True)
+    ]
     size = sum(float(gradient.norm()) ** 2 for gradient in outcomes["plain"][1]) ** 0.5
     step = {
         "case": f"CNN-UKF, {BATCH} sequences of {STEPS} samples: one training step, a filter in a loop in torch against vehest",
@@ -164,11 +197,22 @@ def through_the_filter(recordings: list[Any]) -> list[dict[str, Any]]:
         "least_ratio": LEAST_RATIO,
         "baseline_processor_seconds": round(best["plain"][1], 3),
         "ours_processor_seconds": round(best["ours"][1], 4),
-        "relative_difference_of_losses": float(f"{abs(outcomes['ours'][0] / outcomes['plain'][0] - 1.0):.1e}"),
-        "relative_difference_of_gradients": float(f"{sum(value**2 for value in off) ** 0.5 / size:.1e}"),
+        "relative_difference_of_losses": float(
+            f"{abs(outcomes['ours'][0] / outcomes['plain'][0] - 1.0):.1e}"
+        ),
+        "relative_difference_of_gradients": float(
+            f"{sum(value**2 for value in off) ** 0.5 / size:.1e}"
+        ),
     }
     estimator, training = end_to_end(recordings, 0.2)
-    phase = Phase("end_to_end", PhaseSettings(8e-4, max_epochs=1), estimator.network, training.batches, training.loss, lambda: 0.0)
+    phase = Phase(
+        "end_to_end",
+        PhaseSettings(8e-4, max_epochs=1),
+        estimator.network,
+        training.batches,
+        training.loss,
+        lambda: 0.0,
+    )
     wall, busy, _ = timed(lambda: train_phases([phase], 0, FitContext()))
     epoch = {
         "case": f"CNN-UKF: one epoch over {HOURS:g} hours at {RATE} Hz, sequences of {STEPS} samples, {BATCH} a batch",
@@ -220,14 +264,22 @@ def ensemble(recordings: list[Any]) -> dict[str, Any]:
         nn, generator = torch.nn, torch.Generator().manual_seed(0)
         for _ in range(MEMBERS):
             own = nn.Sequential(
-                nn.Linear(17, 250), nn.ReLU(), nn.Dropout(0.2), nn.Linear(250, 125), nn.ReLU(), nn.Dropout(0.2), nn.Linear(125, 2)
+                nn.Linear(17, 250),
+                nn.ReLU(),
+                nn.Dropout(0.2),
+                nn.Linear(250, 125),
+                nn.ReLU(),
+                nn.Dropout(0.2),
+                nn.Linear(125, 2),
             )
             adam = torch.optim.AdamW(own.parameters(), lr=8e-4, weight_decay=0.0)
             for rows in torch.randperm(count, generator=generator).split(SAMPLES_A_STEP):
                 adam.zero_grad()
                 out = own(samples.inputs[rows])
                 variance = nn.functional.softplus(out[:, 1]) + 1e-6
-                nn.functional.gaussian_nll_loss(out[:, 0], samples.targets[rows], variance).backward()
+                nn.functional.gaussian_nll_loss(
+                    out[:, 0], samples.targets[rows], variance
+                ).backward()
                 adam.step()
 
     ways = {"together": by_vehest(MEMBERS), "one after another": by_vehest(1), "plain": by_torch}
@@ -274,7 +326,10 @@ def measure() -> None:
 
     recordings = drives(HOURS * 3600)
     step, epoch = through_the_filter(recordings)
-    same = max(step["relative_difference_of_losses"], step["relative_difference_of_gradients"]) <= MOST_DIFFERENCE
+    same = (
+        max(step["relative_difference_of_losses"], step["relative_difference_of_gradients"])
+        <= MOST_DIFFERENCE
+    )
     tell(
         f"{step['ratio']:6.1f} x (at least {LEAST_RATIO:g})  {step['case']}",
         f"{step['baseline_seconds']:.2f} s -> {step['ours_seconds']:.3f} s, processor {step['baseline_processor_seconds']:.2f} s -> "
@@ -283,7 +338,11 @@ def measure() -> None:
     )
     met = epoch["ours_seconds"] <= MOST_EPOCH
     details = f"processor {epoch['ours_processor_seconds']:.0f} s"
-    tell(f"{epoch['ours_seconds']:6.0f} s (at most {MOST_EPOCH:.0f})  {epoch['case']}", details, met=met)
+    tell(
+        f"{epoch['ours_seconds']:6.0f} s (at most {MOST_EPOCH:.0f})  {epoch['case']}",
+        details,
+        met=met,
+    )
     row = ensemble(drives(MINUTES * 60))
     tell(
         f"{row['ratio']:6.1f} x (at least {LEAST_ENSEMBLE:g})  {row['case']}",
@@ -292,10 +351,23 @@ def measure() -> None:
         f"{row['gigaflops']} Gflop/s",
         met=row["ratio"] >= LEAST_ENSEMBLE,
     )
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": THREADS}
-    machine |= {"cores": os.cpu_count() or 1, "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None}
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": THREADS,
+    }
+    machine |= {
+        "cores": os.cpu_count() or 1,
+        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
+    }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": [step, epoch, row], "versions": library_versions(), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps(
+            {"cases": [step, epoch, row], "versions": library_versions(), "machine": machine},
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 if __name__ == "__main__":

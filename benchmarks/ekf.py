@@ -62,11 +62,20 @@ def main() -> None:
         "ours_mb": round(peak, 1),
         "largest_difference_of_states": float(f"{np.abs(compiled.mean - readable).max():.2g}"),
     }
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": 1}
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": 1,
+    }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": [row], "versions": library_versions(), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps({"cases": [row], "versions": library_versions(), "machine": machine}, indent=1)
+        + "\n"
+    )
     met = ours <= MOST_SECONDS and row["largest_difference_of_states"] <= MOST_DIFFERENCE
-    print(f"{row['ratio']:.0f} x  {row['case']}  ({baseline:.0f} s -> {ours:.2f} s; target {'met' if met else 'MISSED'})")
+    print(
+        f"{row['ratio']:.0f} x  {row['case']}  ({baseline:.0f} s -> {ours:.2f} s; target {'met' if met else 'MISSED'})"
+    )
 
 
 if __name__ == "__main__":

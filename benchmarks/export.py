@@ -31,7 +31,13 @@ DRIVES = {
     "f1tenth": ("hoons_all_test_run_4", 0.0, 150.0),
     "sim_bmw": ("test_slalom*", 0.0, 150.0),  # the first of them in the store
 }
-GOALS = {"ksnn-linear": 0.5, "ksnn-nonlinear": 4.0, "gru": 7.0, "rational_ekf": 5.0, "learned_ukf": 150.0}
+GOALS = {
+    "ksnn-linear": 0.5,
+    "ksnn-nonlinear": 4.0,
+    "gru": 7.0,
+    "rational_ekf": 5.0,
+    "learned_ukf": 150.0,
+}
 """Start of family-variant -> microseconds a step of the method in double that were asked for."""
 FLAGS = ["-std=c99", "-O2", "-ffp-contract=off"]
 
@@ -60,8 +66,13 @@ def models(output: Path) -> list[tuple[str, Path]]:
         except VehestError:
             continue
     real = {key[1:] for key in found if key[0] != "sim_bmw"}
-    kept = {key: folder for key, folder in found.items() if key[0] != "sim_bmw" or key[1:] not in real}
-    return [(dataset, folder) for (dataset, _, _), folder in sorted(kept.items(), key=lambda entry: entry[0])]
+    kept = {
+        key: folder for key, folder in found.items() if key[0] != "sim_bmw" or key[1:] not in real
+    }
+    return [
+        (dataset, folder)
+        for (dataset, _, _), folder in sorted(kept.items(), key=lambda entry: entry[0])
+    ]
 
 
 def onnx_time(model: Any, samples: dict[str, np.ndarray]) -> float:
@@ -79,9 +90,15 @@ def onnx_time(model: Any, samples: dict[str, np.ndarray]) -> float:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(
+            str(file), options, providers=["CPUExecutionProvider"]
+        )
     kind = np.float64 if session.get_inputs()[0].type == "tensor(double)" else np.float32
-    starts = {name.removeprefix("start_"): text for name, text in session.get_modelmeta().custom_metadata_map.items() if "start_" in name}
+    starts = {
+        name.removeprefix("start_"): text
+        for name, text in session.get_modelmeta().custom_metadata_map.items()
+        if "start_" in name
+    }
     state = {f"state_{name}": np.array(json.loads(text), kind) for name, text in starts.items()}
     rows = np.ascontiguousarray(np.stack([samples[name] for name in model.channels], axis=1), kind)
     names = [output.name for output in session.get_outputs()]
@@ -92,7 +109,9 @@ def onnx_time(model: Any, samples: dict[str, np.ndarray]) -> float:
     return 1e9 * (time.process_time() - begun) / len(rows)
 
 
-def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> dict[str, np.ndarray]:
+def rows_of(
+    model: Any, folder: Path, dataset: str, root: str, output: Path
+) -> dict[str, np.ndarray]:
     """The drive's channels at the model's rate."""
     from vehest.data.store import read_recording
     from vehest.run.config import compose_config
@@ -101,11 +120,17 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> 
 
     name, first, last = DRIVES[dataset]
     if "*" in name:
-        recording = read_recording(sorted((output / "ingest").glob(f"{dataset}-*/{name}.parquet"))[0]).without_references()
+        recording = read_recording(
+            sorted((output / "ingest").glob(f"{dataset}-*/{name}.parquet"))[0]
+        ).without_references()
     else:
-        source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
+        source = open_source(
+            compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"]
+        )
         recording = source.read(name).without_references()
-    cut = recording.cut(max(first, recording.start_time), min(last, recording.start_time + recording.duration))
+    cut = recording.cut(
+        max(first, recording.start_time), min(last, recording.start_time + recording.duration)
+    )
     model.preparation = preparation_of(folder)
     return dict(prepared_recording(model, cut).channels)
 
@@ -117,10 +142,24 @@ def sizes(files: dict[str, str], target: Any, folder: Path, prefix: str) -> dict
     own = footprint(files, target)
     if own is None:
         return {}
-    subprocess.run([target.compiler, *STRICT, *target.options, "-c", "vehest_method.c"], cwd=folder, check=True)
-    said = subprocess.run([f"{target.prefix}size", "-A", "vehest_method.o"], cwd=folder, check=True, capture_output=True, text=True).stdout
+    subprocess.run(
+        [target.compiler, *STRICT, *target.options, "-c", "vehest_method.c"], cwd=folder, check=True
+    )
+    said = subprocess.run(
+        [f"{target.prefix}size", "-A", "vehest_method.o"],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
     method = sum(int(line.split()[1]) for line in said.splitlines() if line.startswith(".text"))
-    kinds = {"state": own.state, "method_code": method, "code": own.code, "tables": own.tables, "stack": own.stack}
+    kinds = {
+        "state": own.state,
+        "method_code": method,
+        "code": own.code,
+        "tables": own.tables,
+        "stack": own.stack,
+    }
     return {f"{prefix}{kind}_bytes": size for kind, size in kinds.items()}
 
 
@@ -137,13 +176,20 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     from vehest.trust.contract import GuardedStepper
 
     model, trust = load_model(folder), trust_of(folder, output)
-    samples = {name: values for name, values in rows_of(model, folder, dataset, root, output).items() if name in model.channels}
+    samples = {
+        name: values
+        for name, values in rows_of(model, folder, dataset, root, output).items()
+        if name in model.channels
+    }
     samples = {name: samples[name] for name in model.channels}
     steps = len(next(iter(samples.values())))
     wanted = replayed(GuardedStepper(in_float64(model), trust), np.full(steps, np.nan), samples)
     stepper, sampled = (
         GuardedStepper(model, trust),
-        [dict(zip(samples, row, strict=True)) for row in zip(*(v.tolist() for v in samples.values()), strict=True)],
+        [
+            dict(zip(samples, row, strict=True))
+            for row in zip(*(v.tolist() for v in samples.values()), strict=True)
+        ],
     )
     begun = time.process_time()
     for sample in sampled:
@@ -162,15 +208,38 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
             for name, text in files.items():
                 (place / name).write_text(text)
             np.column_stack(list(samples.values())).astype(np.float64).tofile(place / "rows.bin")
-            (place / "in.csv").write_text(table_text(tuple(samples), np.column_stack(list(samples.values()))))
-            sources = sorted(name for name in files if name.startswith("vehest_") and name.endswith(".c"))
-            subprocess.run(["gcc", *FLAGS, "main.c", *sources, "-lm", "-o", "main"], cwd=place, check=True)
-            subprocess.run(
-                ["gcc", *FLAGS, "-I.", str(ROOT / "benchmarks/export_time.c"), *sources, "-lm", "-o", "timed"], cwd=place, check=True
+            (place / "in.csv").write_text(
+                table_text(tuple(samples), np.column_stack(list(samples.values())))
             )
-            subprocess.run(["./main", "in.csv", "out.csv"], cwd=place, check=True, capture_output=True)
+            sources = sorted(
+                name for name in files if name.startswith("vehest_") and name.endswith(".c")
+            )
+            subprocess.run(
+                ["gcc", *FLAGS, "main.c", *sources, "-lm", "-o", "main"], cwd=place, check=True
+            )
+            subprocess.run(
+                [
+                    "gcc",
+                    *FLAGS,
+                    "-I.",
+                    str(ROOT / "benchmarks/export_time.c"),
+                    *sources,
+                    "-lm",
+                    "-o",
+                    "timed",
+                ],
+                cwd=place,
+                check=True,
+            )
+            subprocess.run(
+                ["./main", "in.csv", "out.csv"], cwd=place, check=True, capture_output=True
+            )
             said = subprocess.run(
-                ["./timed", "rows.bin", str(PASSES)], cwd=place, check=True, capture_output=True, text=True
+                ["./timed", "rows.bin", str(PASSES)],
+                cwd=place,
+                check=True,
+                capture_output=True,
+                text=True,
             ).stdout.split()
             own = np.genfromtxt(place / "out.csv", delimiter=",", skip_header=1)
             bytes_taken = sizes(files, HOST, place, "") | sizes(files, CORTEX_M4F, place, "m4f_")
@@ -203,12 +272,17 @@ def report(table: pd.DataFrame) -> str:
     lines, ratio = ["# Models in C against Python", ""], double["python_over_c"]
     for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
         good = rows["largest_difference_vy"] <= limit
-        beyond = ", ".join(f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}" for row in rows[~good].itertuples())
+        beyond = ", ".join(
+            f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}"
+            for row in rows[~good].itertuples()
+        )
         lines.append(
             f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64"
             + (f"; beyond: {beyond}." if beyond else ".")
         )
-    lines.append(f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands.")
+    lines.append(
+        f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands."
+    )
     known = double[double["onnxruntime_ns"].notna()]
     if len(known):
         times = known["onnxruntime_ns"] / known["c_method_ns"]
@@ -218,11 +292,19 @@ def report(table: pd.DataFrame) -> str:
     for start, goal in GOALS.items():
         named = (double["family"] + "-" + double["variant"]).str.startswith(start)
         if named.any():
-            lines.append(f"- {start}: {double[named]['c_method_ns'].max() / 1e3:.3g} µs a step of the method; asked for were {goal:g} µs.")
+            lines.append(
+                f"- {start}: {double[named]['c_method_ns'].max() / 1e3:.3g} µs a step of the method; asked for were {goal:g} µs."
+            )
     columns = list(table.columns)
-    lines += ["", "| " + " | ".join(columns) + " |", "| " + " | ".join("--" for _ in columns) + " |"]
     lines += [
-        "| " + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row) + " |"
+        "",
+        "| " + " | ".join(columns) + " |",
+        "| " + " | ".join("--" for _ in columns) + " |",
+    ]
+    lines += [
+        "| "
+        + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row)
+        + " |"
         for row in table.itertuples(index=False)
     ]
     lines += [
@@ -241,7 +323,9 @@ def main() -> None:
     root, output = os.environ.get("VEHEST_DATA"), Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
     found = models(output)
     if root is None or not found:
-        sys.exit("export_all needs VEHEST_DATA and models that learnt on real cars: make ferrari_drive, make real_cars, make learned_ukf")
+        sys.exit(
+            "export_all needs VEHEST_DATA and models that learnt on real cars: make ferrari_drive, make real_cars, make learned_ukf"
+        )
     torch.set_num_threads(1)
     rows = []
     for dataset, folder in found:

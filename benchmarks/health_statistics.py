@@ -48,14 +48,23 @@ RATE = 20.0
 WHEELS = tuple(f"wheel_speed_{place}" for place in ("fl", "fr", "rl", "rr"))
 PLAIN = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 WATCHED = (*PLAIN, *WHEELS)
-LASTS, LEARNT, TRIED = 10.0, 300.0, 150.0  # s: of a fault; of a simulated drive; of a drive that faults are tried in
-LEAST, MOST = 25.0, 6  # s of drives that faults are tried on, and how many of them after the same learning
+LASTS, LEARNT, TRIED = (
+    10.0,
+    300.0,
+    150.0,
+)  # s: of a fault; of a simulated drive; of a drive that faults are tried in
+LEAST, MOST = (
+    25.0,
+    6,
+)  # s of drives that faults are tried on, and how many of them after the same learning
 HORIZONS = (1.0, 3.0, 10.0)  # s after its onset, within which a fault has to be found
 GUARDED = ("nan", "inf", "huge")  # faults that the guard finds, whatever health does
 FERRARI = "20140222_01_01_03_250lm"
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.75)
 
-Drives = Iterator[tuple[list[Recording], list[Recording], list[Recording]]]  # training, validation, and what is tried
+Drives = Iterator[
+    tuple[list[Recording], list[Recording], list[Recording]]
+]  # training, validation, and what is tried
 
 
 class Trial(NamedTuple):
@@ -63,7 +72,9 @@ class Trial(NamedTuple):
 
     groups: list[str]
     nominal: FloatArray  # without a fault, (T, G)
-    faulty: list[tuple[int, FloatArray]]  # first row, and the rows from there on while a fault lasts, (K, G)
+    faulty: list[
+        tuple[int, FloatArray]
+    ]  # first row, and the rows from there on while a fault lasts, (K, G)
     rate_hz: float
 
 
@@ -101,8 +112,17 @@ def tts() -> Drives:
     """Two drivers, each tried after learning on the other."""
     drives = []
     for file in sorted((Path(os.environ["VEHEST_DATA"]) / "stanford_tts").glob("*.mat")):
-        held = {name: np.ravel(values).astype(float) for name, values in scipy.io.loadmat(file).items() if not name.startswith("_")}
-        columns = {"yaw_rate": "YawRate_radps", "vx": "Speed_mps", "ay": "LateralAcceleration_mps2", "steer": "deltaRoadwheels_rad"}
+        held = {
+            name: np.ravel(values).astype(float)
+            for name, values in scipy.io.loadmat(file).items()
+            if not name.startswith("_")
+        }
+        columns = {
+            "yaw_rate": "YawRate_radps",
+            "vx": "Speed_mps",
+            "ay": "LateralAcceleration_mps2",
+            "steer": "deltaRoadwheels_rad",
+        }
         channels = {name: held[column] for name, column in columns.items()}
         drives.append(Resample(RATE)(Recording(file.stem, "audi_tts", 200.0, 0.0, channels)))
     for drive, other in (drives, drives[::-1]):
@@ -119,11 +139,18 @@ def av21() -> Drives:
 def fleet() -> Drives:
     """Two cars of the first four kinds and courses."""
     counts = [f"dataset.drives.{k}.count={2 * (k < 4)}" for k in range(6)]
-    own = source("sim_fleet_real", *counts, *(f"dataset.drives.{k}.manoeuvre.duration=1800" for k in range(6)))
+    own = source(
+        "sim_fleet_real",
+        *counts,
+        *(f"dataset.drives.{k}.manoeuvre.duration=1800" for k in range(6)),
+    )
     for name in own.ids():
         drive = Resample(RATE)(plain(own.read(name)))
         split = drive.start_time + LEARNT
-        yield *([half] for half in parts(drive.cut(drive.start_time, split), 2)), [drive.cut(split, drive.end_time)]
+        yield (
+            *([half] for half in parts(drive.cut(drive.start_time, split), 2)),
+            [drive.cut(split, drive.end_time)],
+        )
 
 
 def plain(drive: Recording) -> Recording:
@@ -139,7 +166,10 @@ def of_split(output: Path, *words: str) -> Drives:
     data = runner.data_for(split, RATE, config)
 
     def read(spans: Sequence[Span]) -> list[Recording]:
-        return [plain(read_recording(recording_file(data[own.dataset], own)).cut(own.start, own.stop)) for own in spans]
+        return [
+            plain(read_recording(recording_file(data[own.dataset], own)).cut(own.start, own.stop))
+            for own in spans
+        ]
 
     tests = [span for name, spans in split.tests.items() if name != "tyre_d" for span in spans]
     yield read(split.train), read(split.validation), read(tests)
@@ -163,10 +193,16 @@ OPENED = {
 
 def groups_of(model: HealthModel) -> list[str]:
     """A name for each statistic: its kind, and its time constant where there are several."""
-    kinds = {value: name.lower() for name, value in vars(kernel).items() if name.isupper() and isinstance(value, int)}
+    kinds = {
+        value: name.lower()
+        for name, value in vars(kernel).items()
+        if name.isupper() and isinstance(value, int)
+    }
     names, jumps = [], ("jump", "step")
     for position, one in enumerate(model.statistics):
-        name = jumps[position // len(model.channels)] if one.kind == kernel.JUMP else kinds[one.kind]
+        name = (
+            jumps[position // len(model.channels)] if one.kind == kernel.JUMP else kinds[one.kind]
+        )
         names.append(f"{name} {one.seconds:g} s" if one.seconds else name)
     return names
 
@@ -176,21 +212,31 @@ def ratios_of(model: HealthModel, limits: GuardLimits, rows: FloatArray) -> Floa
     received, labels = np.ascontiguousarray(rows), np.array(groups_of(model))
     statistics = np.empty((len(rows), len(labels)))
     measured = Guard(model.channels, (), limits, model.rate_hz)(received).measured
-    kernel.health_kernel(received, measured, model.packed(), model.start(), np.empty((3, len(rows))), statistics)
+    kernel.health_kernel(
+        received, measured, model.packed(), model.start(), np.empty((3, len(rows))), statistics
+    )
     over = statistics / np.array(model.limits)
-    return np.stack([over[:, labels == group].max(axis=1) for group in dict.fromkeys(labels)], axis=1)
+    return np.stack(
+        [over[:, labels == group].max(axis=1) for group in dict.fromkeys(labels)], axis=1
+    )
 
 
-def faults_of(test: Recording, channels: Sequence[str], ratios: Callable[[FloatArray], FloatArray]) -> list[tuple[int, FloatArray]]:
+def faults_of(
+    test: Recording, channels: Sequence[str], ratios: Callable[[FloatArray], FloatArray]
+) -> list[tuple[int, FloatArray]]:
     """First row of each fault, and what it shows from there on while it lasts."""
     part, found = test.cut(test.start_time, test.start_time + TRIED), []
     clean = {name: part[name] for name in channels}
     for kind in (kind for kind in KINDS if kind not in GUARDED):
-        for channel in (channel for channel in channels if applies(kind, channel) and channel not in WHEELS[1:]):
+        for channel in (
+            channel for channel in channels if applies(kind, channel) and channel not in WHEELS[1:]
+        ):
             for severity in SEVERITIES:
                 fault = Fault(kind, channel, severity, round(part.duration / 3.0, 2), LASTS)
                 first, end = window(fault, len(part), test.rate_hz)
-                rows = np.stack([inject(clean, test.rate_hz, fault)[name] for name in channels], axis=1)[:end]
+                rows = np.stack(
+                    [inject(clean, test.rate_hz, fault)[name] for name in channels], axis=1
+                )[:end]
                 found.append((first, ratios(rows)[first:]))
     return found
 
@@ -201,22 +247,41 @@ def tried(drives: Drives) -> list[Trial]:
     for train, validation, tests in drives:
         everything, rate = [*train, *validation, *tests], tests[0].rate_hz
         channels = tuple(name for name in WATCHED if all(name in own for own in everything))
-        model, limits = learn_health(train, validation, channels, rate), learn_limits([*train, *validation], channels, rate)
-        ratios, long = partial(ratios_of, model, limits), [test for test in tests if test.duration >= LEAST]
+        model, limits = (
+            learn_health(train, validation, channels, rate),
+            learn_limits([*train, *validation], channels, rate),
+        )
+        ratios, long = (
+            partial(ratios_of, model, limits),
+            [test for test in tests if test.duration >= LEAST],
+        )
         for test in tests:
-            faulty = faults_of(test, channels, ratios) if any(test is own for own in long[:MOST]) else []
-            found.append(Trial(list(dict.fromkeys(groups_of(model))), ratios(test.stack(channels)), faulty, rate))
+            faulty = (
+                faults_of(test, channels, ratios) if any(test is own for own in long[:MOST]) else []
+            )
+            found.append(
+                Trial(
+                    list(dict.fromkeys(groups_of(model))),
+                    ratios(test.stack(channels)),
+                    faulty,
+                    rate,
+                )
+            )
     return found
 
 
-def flags_of(ratios: FloatArray, groups: Sequence[str], left_out: Sequence[str], factor: float) -> NDArray[np.bool_]:
+def flags_of(
+    ratios: FloatArray, groups: Sequence[str], left_out: Sequence[str], factor: float
+) -> NDArray[np.bool_]:
     """Rows beyond limits that are so many times as high; those of values and of their range stay as they are."""
     of_values = np.array([name.startswith(("frozen", "held", "outside")) for name in groups])
     kept = np.array([name not in left_out for name in groups])
     return np.asarray((ratios >= np.where(of_values, 1.0, factor))[:, kept].any(axis=1))
 
 
-def outcome(trials: Sequence[Trial], left_out: Sequence[str] = (), factor: float = 1.0) -> dict[str, Any]:
+def outcome(
+    trials: Sequence[Trial], left_out: Sequence[str] = (), factor: float = 1.0
+) -> dict[str, Any]:
     """Faults found and alarms, which have a second without any between two, with the exact 95 % Poisson interval an hour."""
     found, tried_faults, counts, hours = 0, 0, [0, 0], 0.0
     for trial in trials:
@@ -227,12 +292,32 @@ def outcome(trials: Sequence[Trial], left_out: Sequence[str] = (), factor: float
             counts[position] += int((np.diff(times, prepend=-1e9) > trial.rate_hz).sum())
         nominal = flags_of(trial.nominal, trial.groups, left_out, factor)
         for first, ratios in trial.faulty:
-            flags = flags_of(ratios, trial.groups, left_out, factor) & ~nominal[first : first + len(ratios)]
-            found += sum(bool(flags[: round(horizon * trial.rate_hz)].any()) for horizon in HORIZONS)
+            flags = (
+                flags_of(ratios, trial.groups, left_out, factor)
+                & ~nominal[first : first + len(ratios)]
+            )
+            found += sum(
+                bool(flags[: round(horizon * trial.rate_hz)].any()) for horizon in HORIZONS
+            )
             tried_faults += len(HORIZONS)
-    low, high = (chi2.ppf(0.025, 2 * counts[0]) / 2.0 if counts[0] else 0.0), chi2.ppf(0.975, 2 * counts[0] + 2) / 2.0
-    rate = {"hours": hours, "alarms": counts[0], "per_hour": counts[0] / hours, "low": low / hours, "high": high / hours}
-    return {"faults": tried_faults, "found": found, "share": found / tried_faults, **rate, "of_a_sensor": counts[1]}
+    low, high = (
+        (chi2.ppf(0.025, 2 * counts[0]) / 2.0 if counts[0] else 0.0),
+        chi2.ppf(0.975, 2 * counts[0] + 2) / 2.0,
+    )
+    rate = {
+        "hours": hours,
+        "alarms": counts[0],
+        "per_hour": counts[0] / hours,
+        "low": low / hours,
+        "high": high / hours,
+    }
+    return {
+        "faults": tried_faults,
+        "found": found,
+        "share": found / tried_faults,
+        **rate,
+        "of_a_sensor": counts[1],
+    }
 
 
 def figure(table: pd.DataFrame) -> None:
@@ -243,13 +328,27 @@ def figure(table: pd.DataFrame) -> None:
     from matplotlib import pyplot
 
     names = list(dict.fromkeys(table["drives"]))
-    drawn, axes = pyplot.subplots(1, len(names), figsize=(3.0 * len(names), 3.2), sharex=True, sharey=True, layout="constrained")
+    drawn, axes = pyplot.subplots(
+        1,
+        len(names),
+        figsize=(3.0 * len(names), 3.2),
+        sharex=True,
+        sharey=True,
+        layout="constrained",
+    )
     for axis, name in zip(axes, names, strict=True):
         for rule, own in table[table["drives"] == name].groupby("rule", sort=False):
             line = axis.plot(own["per_hour"], 100.0 * own["share"], ".-", label=rule)[0]
             at = own[own["limits_times"] == 1.0].iloc[0]
             spread = [[at["per_hour"] - at["low"]], [at["high"] - at["per_hour"]]]
-            axis.errorbar(at["per_hour"], 100.0 * at["share"], xerr=spread, fmt="o", color=line.get_color(), capsize=3)
+            axis.errorbar(
+                at["per_hour"],
+                100.0 * at["share"],
+                xerr=spread,
+                fmt="o",
+                color=line.get_color(),
+                capsize=3,
+            )
         axis.axvline(10.0, color="0.7", linewidth=1, zorder=0)
         axis.set(
             title=name if "imulated" in name else f"{name} (real)",
@@ -267,7 +366,12 @@ def main() -> None:
     """Print and write the trade, and print what each group of statistics earns."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rule", default="present", help="name of the rows")
-    parser.add_argument("--opened", type=Path, metavar="OUTPUT", help="only the tests that chose nothing, with data in an output root")
+    parser.add_argument(
+        "--opened",
+        type=Path,
+        metavar="OUTPUT",
+        help="only the tests that chose nothing, with data in an output root",
+    )
     given = parser.parse_args()
     for name, words in OPENED.items() if given.opened else ():
         own = outcome(tried(of_split(given.opened, *words)))
@@ -279,14 +383,33 @@ def main() -> None:
         trials = tried(drives())
         everything += trials
         for factor in FACTORS:
-            rows.append({"rule": given.rule, "drives": name, "limits_times": factor, **outcome(trials, factor=factor)})
-        print(pd.DataFrame(rows).query("drives == @name").to_string(index=False, float_format="%.4g"), flush=True)
+            rows.append(
+                {
+                    "rule": given.rule,
+                    "drives": name,
+                    "limits_times": factor,
+                    **outcome(trials, factor=factor),
+                }
+            )
+        print(
+            pd.DataFrame(rows).query("drives == @name").to_string(index=False, float_format="%.4g"),
+            flush=True,
+        )
         whole = outcome(trials)
         for group in dict.fromkeys(group for trial in trials for group in trial.groups):
             own = outcome(trials, [group])
-            print(f"  without {group:<16} {own['found'] - whole['found']:+5d} found {own['alarms'] - whole['alarms']:+4d} alarms")
+            print(
+                f"  without {group:<16} {own['found'] - whole['found']:+5d} found {own['alarms'] - whole['alarms']:+4d} alarms"
+            )
     for factor in FACTORS:
-        rows.append({"rule": given.rule, "drives": "all", "limits_times": factor, **outcome(everything, factor=factor)})
+        rows.append(
+            {
+                "rule": given.rule,
+                "drives": "all",
+                "limits_times": factor,
+                **outcome(everything, factor=factor),
+            }
+        )
     before = [pd.read_csv(RESULT).query("rule != @given.rule")] if RESULT.exists() else []
     table = pd.concat([*before, pd.DataFrame(rows)], ignore_index=True)
     table.to_csv(RESULT, index=False, float_format="%.6g", lineterminator="\n")

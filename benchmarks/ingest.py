@@ -66,8 +66,13 @@ def all_channels(root: Path) -> Callable[[], Any]:
 
     with open(csv_file(root), encoding="latin-1") as stream:
         names = [next(stream) for _ in range(12)][10].strip().split(",")[1:]
-    channels = {name: {"column": column, "unit": CHANNELS[name].unit} for name, column in zip(CHANNELS, names, strict=False)}
-    source = open_source({**configuration(root)["dataset"], "channels": channels, "units_row": "ignore"})
+    channels = {
+        name: {"column": column, "unit": CHANNELS[name].unit}
+        for name, column in zip(CHANNELS, names, strict=False)
+    }
+    source = open_source(
+        {**configuration(root)["dataset"], "channels": channels, "units_row": "ignore"}
+    )
     return lambda: source.read(RECORDING)
 
 
@@ -81,7 +86,10 @@ def whole_stage(root: Path) -> Callable[[], Any]:
 
     def run() -> Any:
         plan = plan_ingest(config)
-        return make(plan, lambda folder: write_ingest(config, plan, folder, 1, StopSignals(), lambda *_: None))
+        return make(
+            plan,
+            lambda folder: write_ingest(config, plan, folder, 1, StopSignals(), lambda *_: None),
+        )
 
     return run
 
@@ -90,7 +98,12 @@ def configuration(root: Path) -> dict[str, Any]:
     """The data set's configuration, one recording long."""
     from vehest.run.config import compose_config
 
-    overrides = ["dataset=revs_targa_2014", f"dataset.recordings=[{RECORDING}]", f"root={root}", f"output={root / 'outputs'}"]
+    overrides = [
+        "dataset=revs_targa_2014",
+        f"dataset.recordings=[{RECORDING}]",
+        f"root={root}",
+        f"output={root / 'outputs'}",
+    ]
     return compose_config("ingest", overrides)
 
 
@@ -119,7 +132,9 @@ def in_own_process(work: Callable[..., Any], *arguments: object) -> Any:
 
 def median(runs: list[tuple[float, float]]) -> tuple[float, float]:
     """Medians of seconds and memory."""
-    return statistics.median(seconds for seconds, _ in runs), statistics.median(memory for _, memory in runs)
+    return statistics.median(seconds for seconds, _ in runs), statistics.median(
+        memory for _, memory in runs
+    )
 
 
 def case(name: str, baseline: tuple[float, float], ours: tuple[float, float]) -> dict[str, Any]:
@@ -150,7 +165,9 @@ def main() -> None:
     }
     free, needed = shutil.disk_usage(tempfile.gettempdir()).free, ROWS * COLUMNS * 14
     if free < needed:
-        sys.exit(f"{needed / 1e9:.1f} GB are needed in {tempfile.gettempdir()}, {free / 1e9:.1f} GB are free; set TMPDIR")
+        sys.exit(
+            f"{needed / 1e9:.1f} GB are needed in {tempfile.gettempdir()}, {free / 1e9:.1f} GB are free; set TMPDIR"
+        )
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         root = Path(folder)
         in_own_process(generate, root)
@@ -164,11 +181,23 @@ def main() -> None:
                 if turn:
                     runs[name].append(figures)
     rows = [case(name, median(runs["bare"]), median(runs[name])) for name in cases]
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": os.cpu_count()}
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": os.cpu_count(),
+    }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": rows, "versions": in_own_process(versions), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps(
+            {"cases": rows, "versions": in_own_process(versions), "machine": machine}, indent=1
+        )
+        + "\n"
+    )
     for row in rows:
-        time_share, memory_share = row["ours_seconds"] / row["baseline_seconds"], row["ours_mb"] / TABLE_MB
+        time_share, memory_share = (
+            row["ours_seconds"] / row["baseline_seconds"],
+            row["ours_mb"] / TABLE_MB,
+        )
         met = "met" if time_share <= MOST_TIME and memory_share < MOST_MEMORY else "MISSED"
         print(
             f"{row['ratio']:6.2f} x  {row['case']}  ({row['baseline_seconds']:.2f} s -> {row['ours_seconds']:.2f} s; "

@@ -44,12 +44,17 @@ STUDIES = (20, 200, 2000)  # tasks of a study, for which the break-even is compu
 
 def groups_of(output: Path, number: int) -> list[Group]:
     """Groups of one member each, which differ in their seed."""
-    config = compose_config("eval", ["split=quickstart", "estimator=zero", f"output={output}", "tracking=none"])
+    config = compose_config(
+        "eval", ["split=quickstart", "estimator=zero", f"output={output}", "tracking=none"]
+    )
     runner = Runner(output, QUIET, StopSignals())
     split = runner.split(config)
     data = runner.data_for(split, float(config["estimator"]["rate_hz"]), config)
     evaluation = runner.evaluation(config, data)
-    return [Group([plan_training({**config, "seed": seed}, split, data)], split, evaluation) for seed in range(number)]
+    return [
+        Group([plan_training({**config, "seed": seed}, split, data)], split, evaluation)
+        for seed in range(number)
+    ]
 
 
 def timed(launcher: LocalLauncher | RayLauncher, groups: Sequence[Group]) -> dict[str, float]:
@@ -57,14 +62,23 @@ def timed(launcher: LocalLauncher | RayLauncher, groups: Sequence[Group]) -> dic
     asked = time.perf_counter()
     begun: list[float] = []
     seconds, ended = [], asked
-    for done in launcher.launch(groups, StopSignals(), lambda *_: begun.append(time.perf_counter())):
+    for done in launcher.launch(
+        groups, StopSignals(), lambda *_: begun.append(time.perf_counter())
+    ):
         if isinstance(done.outcome, Failure):
             raise SystemExit(done.outcome.message)
-        seconds.append(sum(made.provenance["seconds"] for member in done.outcome for made in member.made))
+        seconds.append(
+            sum(made.provenance["seconds"] for member in done.outcome for made in member.made)
+        )
         ended = time.perf_counter()
     launcher.close()
     added = (CORES * (ended - begun[0]) - sum(seconds)) / len(groups)
-    return {"start_s": begun[0] - asked, "added_s": added, "task_s": float(np.median(seconds)), "tasks": len(groups)}
+    return {
+        "start_s": begun[0] - asked,
+        "added_s": added,
+        "task_s": float(np.median(seconds)),
+        "tasks": len(groups),
+    }
 
 
 def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
@@ -75,16 +89,29 @@ def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
         for name, own in found.items():
             output = scratch / f"{name}-{repeat}"
             shutil.copytree(recordings, output)
-            launcher = LocalLauncher(CORES) if name == "local" else RayLauncher("local", CORES, output, QUIET)
+            launcher = (
+                LocalLauncher(CORES)
+                if name == "local"
+                else RayLauncher("local", CORES, output, QUIET)
+            )
             own.append(timed(launcher, groups_of(output, number)))
-    return {name: {key: round(float(np.median([one[key] for one in own])), 5) for key in own[0]} for name, own in found.items()}
+    return {
+        name: {key: round(float(np.median([one[key] for one in own])), 5) for key in own[0]}
+        for name, own in found.items()
+    }
 
 
 def scheduler(number: int) -> dict[str, float]:
     """Tasks that do nothing, a second, from one process [1/s]."""
     import ray
 
-    ray.init(address="local", num_cpus=CORES, include_dashboard=False, log_to_driver=False, logging_level=50)
+    ray.init(
+        address="local",
+        num_cpus=CORES,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=50,
+    )
     nothing = ray.remote(num_cpus=1)(_nothing)
     ray.get([nothing.remote() for _ in range(200)])
     begun = time.perf_counter()
@@ -103,8 +130,22 @@ def sweep(scratch: Path, combinations: int, seeds: int, tracking: str) -> dict[s
     output = scratch / f"sweep-{tracking}"
     shutil.copytree(scratch / "recordings", output)
     rates = ",".join(f"{1e-3 + 1e-6 * k:g}" for k in range(combinations))
-    words = ["split=quickstart", "estimator=ksnn", "estimator.n_hidden=0", "training.max_epochs=1", f"training.learning_rate={rates}"]
-    words += [f"seed=range({seeds})", f"tracking={tracking}", "--launcher", "ray", "-j", str(CORES), "-q"]
+    words = [
+        "split=quickstart",
+        "estimator=ksnn",
+        "estimator.n_hidden=0",
+        "training.max_epochs=1",
+        f"training.learning_rate={rates}",
+    ]
+    words += [
+        f"seed=range({seeds})",
+        f"tracking={tracking}",
+        "--launcher",
+        "ray",
+        "-j",
+        str(CORES),
+        "-q",
+    ]
     command = [sys.executable, "-c", "from vehest.cli import main; main()", "sweep", *words]
     environment = {**os.environ, "VEHEST_OUTPUT": str(output)}
     begun = time.perf_counter()
@@ -112,7 +153,9 @@ def sweep(scratch: Path, combinations: int, seeds: int, tracking: str) -> dict[s
         process = subprocess.Popen(command, cwd=scratch, env=environment, stdout=log, stderr=log)
     samples = []
     while process.poll() is None:
-        samples.append((_done(output, tracking), _resident_mb(process.pid), _cpu_seconds(process.pid)))
+        samples.append(
+            (_done(output, tracking), _resident_mb(process.pid), _cpu_seconds(process.pid))
+        )
         time.sleep(1.0)
     if process.returncode:
         raise SystemExit((scratch / f"{tracking}.log").read_text())
@@ -121,18 +164,35 @@ def sweep(scratch: Path, combinations: int, seeds: int, tracking: str) -> dict[s
     made = {"trainings": number, "seconds": round(seconds, 1)}
     if len(busy) > 5:
         memory, cpu = (float(np.polyfit(busy[:, 0], busy[:, column], 1)[0]) for column in (1, 2))
-        made |= {"parent_mb": round(busy[:, 1].max()), "parent_mb_a_1000_trainings": round(1000 * memory, 1)}
+        made |= {
+            "parent_mb": round(busy[:, 1].max()),
+            "parent_mb_a_1000_trainings": round(1000 * memory, 1),
+        }
         made |= {"parent_cpu_s_a_training": round(cpu, 4)}
-    stages = [output / stage for stage in ("train", "calibrate", "evaluate", "locks", "tracked", "journal")]
+    stages = [
+        output / stage
+        for stage in ("train", "calibrate", "evaluate", "locks", "tracked", "journal")
+    ]
     files = [file for stage in stages for file in stage.rglob("*") if file.is_file()]
-    made |= {"files_a_training": len(files) / number, "bytes_a_training": round(sum(file.stat().st_size for file in files) / number)}
+    made |= {
+        "files_a_training": len(files) / number,
+        "bytes_a_training": round(sum(file.stat().st_size for file in files) / number),
+    }
     return made | (_rows(output, number) if tracking != "none" else {})
 
 
 def _done(output: Path, tracking: str) -> int:
     """Trainings that the parent is done with."""
-    folder = output / "evaluate" if tracking == "none" else next(iter((output / "tracked").glob("*")), output / "tracked")
-    return sum(name.startswith("evaluate-") or tracking == "none" for name in os.listdir(folder)) if folder.is_dir() else 0
+    folder = (
+        output / "evaluate"
+        if tracking == "none"
+        else next(iter((output / "tracked").glob("*")), output / "tracked")
+    )
+    return (
+        sum(name.startswith("evaluate-") or tracking == "none" for name in os.listdir(folder))
+        if folder.is_dir()
+        else 0
+    )
 
 
 def _cpu_seconds(process: int) -> float:
@@ -149,14 +209,29 @@ def _resident_mb(process: int) -> float:
         status = Path(f"/proc/{process}/status").read_text()
     except OSError:
         return 0.0
-    return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")), 0.0)
+    return next(
+        (int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")),
+        0.0,
+    )
 
 
 def _rows(output: Path, number: int) -> dict[str, float]:
     """Rows of MLflow's store a training, and how many artefacts have a run that is finished."""
     with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
-        tables = ("runs", "metrics", "latest_metrics", "params", "tags", "inputs", "input_tags", "datasets", "logged_models")
-        rows = {table: store.execute(f"select count(*) from {table}").fetchone()[0] for table in tables}
+        tables = (
+            "runs",
+            "metrics",
+            "latest_metrics",
+            "params",
+            "tags",
+            "inputs",
+            "input_tags",
+            "datasets",
+            "logged_models",
+        )
+        rows = {
+            table: store.execute(f"select count(*) from {table}").fetchone()[0] for table in tables
+        }
         finished = store.execute(
             "select count(distinct value) from tags join runs using (run_uuid) where key = 'vehest.key' and status = 'FINISHED'"
         ).fetchone()[0]
@@ -186,8 +261,13 @@ def planning(number: int) -> dict[str, float]:
     """What planning a sweep takes before anything is trained, a combination, of processor time [s]."""
     rates = ",".join(f"{1e-3 + 1e-6 * k:g}" for k in range(number))
     begun = time.process_time()
-    sweep_of(["split=quickstart", "estimator=ksnn", f"training.learning_rate={rates}", "tracking=none"])
-    return {"combinations": number, "seconds_a_combination": round((time.process_time() - begun) / number, 5)}
+    sweep_of(
+        ["split=quickstart", "estimator=ksnn", f"training.learning_rate={rates}", "tracking=none"]
+    )
+    return {
+        "combinations": number,
+        "seconds_a_combination": round((time.process_time() - begun) / number, 5),
+    }
 
 
 def break_even(local: Mapping[str, float], cluster: Mapping[str, float]) -> dict[str, float]:
@@ -200,7 +280,9 @@ def break_even(local: Mapping[str, float], cluster: Mapping[str, float]) -> dict
     return {f"{n} tasks": round(max(0.0, 2 * CORES * late / n + gained), 4) for n in STUDIES}
 
 
-def million(measured: Mapping[str, Any], seconds: float = 10.0, trainings: float = 1e6, cores: float = 1e3) -> dict[str, float]:
+def million(
+    measured: Mapping[str, Any], seconds: float = 10.0, trainings: float = 1e6, cores: float = 1e3
+) -> dict[str, float]:
     """10⁶ trainings of 10 s on 1,000 cores, each part by itself, from what was measured here [h, unless it says otherwise]."""
     plain, tracked = measured["sweep"]["none"], measured["sweep"]["mlflow"]
     wanted = trainings / (trainings * seconds / cores)
@@ -212,7 +294,12 @@ def million(measured: Mapping[str, Any], seconds: float = 10.0, trainings: float
         "the rest of the parent, one process": trainings * plain["parent_cpu_s_a_training"],
         "MLflow, one process": trainings * tracked["mlflow_s_a_training"],
         "planning, one process": trainings * measured["planning"]["seconds_a_combination"],
-        "looking for leftovers, all cores": 3 * trainings * (trainings / 2) * listing["seconds"] / listing["folders"] / cores,
+        "looking for leftovers, all cores": 3
+        * trainings
+        * (trainings / 2)
+        * listing["seconds"]
+        / listing["folders"]
+        / cores,
     }
     return {
         **{name: round(value / 3600, 2) for name, value in quick.items()},
@@ -231,36 +318,53 @@ def parts(scratch: Path, given: argparse.Namespace) -> dict[str, Callable[[], An
         "scheduler": lambda: scheduler(5000),
         "planning": lambda: planning(100),
         "listing": lambda: folder_listing(scratch, 100_000),
-        "sweep": lambda: {name: sweep(scratch, given.combinations, given.seeds, name) for name in ("none", "mlflow")},
+        "sweep": lambda: {
+            name: sweep(scratch, given.combinations, given.seeds, name)
+            for name in ("none", "mlflow")
+        },
     }
 
 
 def computed(result: dict[str, Any]) -> None:
     """Add what follows from what was measured."""
     if "launchers" in result:
-        result["second_node_pays_from_s"] = break_even(result["launchers"]["local"], result["launchers"]["ray"])
+        result["second_node_pays_from_s"] = break_even(
+            result["launchers"]["local"], result["launchers"]["ray"]
+        )
     if "sweep" in result:
         plain, tracked = result["sweep"]["none"], result["sweep"]["mlflow"]
         if "parent_cpu_s_a_training" in plain and "parent_cpu_s_a_training" in tracked:
-            tracked["mlflow_s_a_training"] = round(tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4)
-    if {"launchers", "scheduler", "planning", "listing"} <= set(result) and "mlflow_s_a_training" in result.get("sweep", {}).get(
-        "mlflow", {}
-    ):
+            tracked["mlflow_s_a_training"] = round(
+                tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4
+            )
+    if {"launchers", "scheduler", "planning", "listing"} <= set(
+        result
+    ) and "mlflow_s_a_training" in result.get("sweep", {}).get("mlflow", {}):
         result["million_trainings_on_1000_cores"] = million(result)
 
 
 def main() -> None:
     """Measure every part, or those that are named; write each as soon as it is measured."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", type=int, default=100, help="groups of the comparison of launchers")
+    parser.add_argument(
+        "--tasks", type=int, default=100, help="groups of the comparison of launchers"
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--combinations", type=int, default=200, help="of the sweeps of trainings")
     parser.add_argument("--seeds", type=int, default=10, help="of each combination")
-    parser.add_argument("--parts", nargs="*", help="of: launchers scheduler planning listing sweep; what others measured before stays")
+    parser.add_argument(
+        "--parts",
+        nargs="*",
+        help="of: launchers scheduler planning listing sweep; what others measured before stays",
+    )
     given = parser.parse_args()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    result: dict[str, Any] = json.loads(RESULT.read_text(encoding="utf-8")) if given.parts and RESULT.is_file() else {}
-    result["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    result: dict[str, Any] = (
+        json.loads(RESULT.read_text(encoding="utf-8")) if given.parts and RESULT.is_file() else {}
+    )
+    result["machine"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    )
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="launchers-") as folder:
         scratch = Path(folder)

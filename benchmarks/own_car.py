@@ -29,7 +29,10 @@ G = 9.80665
 
 def write_log(data: Path, file: Path) -> None:
     """The drive in a logger's dress."""
-    told = {name: np.loadtxt(data / DRIVE / f"{name}.txt").ravel() for name in ("t", "vx", "axCG", "ayCG", "yawRate", "delta", "beta_true")}
+    told = {
+        name: np.loadtxt(data / DRIVE / f"{name}.txt").ravel()
+        for name in ("t", "vx", "axCG", "ayCG", "yawRate", "delta", "beta_true")
+    }
     columns = {
         "Time": told["t"],
         "Speed": told["vx"] * 3.6,
@@ -42,13 +45,17 @@ def write_log(data: Path, file: Path) -> None:
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(columns)
-        writer.writerows(zip(*(np.round(values, 6).tolist() for values in columns.values()), strict=True))
+        writer.writerows(
+            zip(*(np.round(values, 6).tolist() for values in columns.values()), strict=True)
+        )
 
 
 def timed(folder: Path, *words: str) -> tuple[float, str]:
     """Seconds and standard output of a command; its standard error goes on to ours."""
     start = time.monotonic()
-    done = subprocess.run([sys.executable, "-m", "vehest", *words], cwd=folder, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "vehest", *words], cwd=folder, stdout=subprocess.PIPE, text=True
+    )
     if done.returncode != 0:
         sys.exit(f"vehest {' '.join(words)} ended with {done.returncode}")
     return time.monotonic() - start, done.stdout
@@ -72,7 +79,14 @@ def main() -> None:
         for words in (new, run, run):
             seconds, output = timed(folder, *words)
             left = len(re.findall(r"^left out: .*not done yet", output, re.MULTILINE))
-            rows.append({"command": f"vehest {' '.join(words)}", "seconds": f"{seconds:.1f}", "left": left, "processors": os.cpu_count()})
+            rows.append(
+                {
+                    "command": f"vehest {' '.join(words)}",
+                    "seconds": f"{seconds:.1f}",
+                    "left": left,
+                    "processors": os.cpu_count(),
+                }
+            )
             sys.stdout.write(f"{rows[-1]}\n{output}\n")
             sys.stdout.flush()
         _, told = timed(folder, "report", "my_car", "--json", "--quiet")
@@ -83,7 +97,9 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     verdict = "\n".join(figures["verdict"])
-    (RESULTS / "verdict.txt").write_text(re.sub(r"-[0-9a-f]{12}\b", "-…", verdict) + "\n", encoding="utf-8")
+    (RESULTS / "verdict.txt").write_text(
+        re.sub(r"-[0-9a-f]{12}\b", "-…", verdict) + "\n", encoding="utf-8"
+    )
     keys = (
         "title",
         "rmse_sideslip",
@@ -98,7 +114,12 @@ def main() -> None:
         board = csv.DictWriter(stream, keys, lineterminator="\n", extrasaction="ignore")
         board.writeheader()
         for row in figures["leaderboard"]:
-            board.writerow({key: f"{row[key]:.4f}" if isinstance(row[key], float) else row[key] for key in keys})
+            board.writerow(
+                {
+                    key: f"{row[key]:.4f}" if isinstance(row[key], float) else row[key]
+                    for key in keys
+                }
+            )
 
 
 if __name__ == "__main__":

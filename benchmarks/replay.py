@@ -35,14 +35,20 @@ def models_of_training_range(output: Path) -> list[Path]:
     found: dict[tuple[str, str, float], Path] = {}
     for folder in sorted((output / "train").glob("[!.]*")):
         described = read_description(folder)
-        ranges = [re.search(r"\[([\d.]+), ([\d.]+)\)", text) for text in described.about.trained_on or ()]
+        ranges = [
+            re.search(r"\[([\d.]+), ([\d.]+)\)", text) for text in described.about.trained_on or ()
+        ]
         if not ranges or any("20140222" not in text for text in described.about.trained_on or ()):
             continue
-        if not all(one and float(one[1]) >= TRAINING[0] and float(one[2]) <= TRAINING[1] for one in ranges):
+        if not all(
+            one and float(one[1]) >= TRAINING[0] and float(one[2]) <= TRAINING[1] for one in ranges
+        ):
             continue
         model = load_model(folder)
         if model.causal:
-            found.setdefault((described.estimator, described.variant, model.settings.rate_hz), folder)
+            found.setdefault(
+                (described.estimator, described.variant, model.settings.rate_hz), folder
+            )
     return list(found.values())
 
 
@@ -106,18 +112,33 @@ def soak(minutes: float, model: str) -> int:
 
         def look() -> bool:
             if time.monotonic() > begun + len(resident):
-                resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6)
+                resident.append(
+                    int(Path("/proc/self/statm").read_text().split()[1])
+                    * os.sysconf("SC_PAGE_SIZE")
+                    / 1e6
+                )
             return False
 
         begun = time.monotonic()
-        figures = replay_log(written.log, (), look, model=model, dbc=written.dbc, signals=signals, out=out, quiet=False)
+        figures = replay_log(
+            written.log,
+            (),
+            look,
+            model=model,
+            dbc=written.dbc,
+            signals=signals,
+            out=out,
+            quiet=False,
+        )
     row: dict[str, Any] = {
         "drive": name,
         "model": re.sub(r"-[0-9a-f]{12}$", "", Path(model).name),
         "minutes": round(figures["seconds"] / 60, 3),
     }
     keys = ("samples_hz", "samples", "samples_lost", "estimates", "latest_ms", "deadlines_missed")
-    row |= {key: figures[key] for key in keys} | {"memory_growth_mb": max(resident) - resident[min(3, len(resident) - 1)]}
+    row |= {key: figures[key] for key in keys} | {
+        "memory_growth_mb": max(resident) - resident[min(3, len(resident) - 1)]
+    }
     row |= {"python": platform.python_version(), "processors": os.cpu_count()}
     for key, value in row.items():
         say(f"{key}: {value}")
@@ -131,7 +152,13 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({key: f"{value:.5g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows)
+        writer.writerows(
+            {
+                key: f"{value:.5g}" if isinstance(value, float) else value
+                for key, value in row.items()
+            }
+            for row in rows
+        )
     say(f"written: {path}")
 
 
@@ -143,7 +170,9 @@ def say(text: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("what", choices=["check", "soak"])
-    parser.add_argument("--model", action="append", default=[], help="a folder, or a name; several for check")
+    parser.add_argument(
+        "--model", action="append", default=[], help="a folder, or a name; several for check"
+    )
     parser.add_argument("--minutes", type=float, default=30.0)
     asked = parser.parse_args()
     if asked.what == "check":

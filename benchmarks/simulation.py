@@ -59,7 +59,9 @@ def plant_runs() -> tuple[float, float, float]:
 
     def compiled() -> Any:
         turning, straight = np.array([STEERING, 0.0, 0.0, 0.0, 0.0]), np.zeros(5)
-        return plant.advance(plant.advance(start, turning, n_steps // 2), straight, n_steps - n_steps // 2).values
+        return plant.advance(
+            plant.advance(start, turning, n_steps // 2), straight, n_steps - n_steps // 2
+        ).values
 
     compiled()
     times: dict[str, list[float]] = {"plain": [], "compiled": []}
@@ -86,7 +88,10 @@ def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
         artefact = Runner(Path(folder), Messages(quiet=True), StopSignals(), jobs).ingest(config)
         seconds = time.perf_counter() - started
         n_drives = outcome_of(artefact)["drives"]
-    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    peak = max(
+        resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
     return seconds, peak * 1024 / 1e6, n_drives
 
 
@@ -105,7 +110,9 @@ def versions() -> dict[str, str]:
 
 def main() -> None:
     """Measure, write, print the ratios."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     in_own_process(dataset_run, "sim_small", 1)  # compiles
     plain, compiled, difference = in_own_process(plant_runs)
     if not difference < 1e-9:
@@ -131,16 +138,29 @@ def main() -> None:
                 "ours_mb": round(together_mb, 1),
             }
         )
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": cores}
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": cores,
+    }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": rows, "versions": in_own_process(versions), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps(
+            {"cases": rows, "versions": in_own_process(versions), "machine": machine}, indent=1
+        )
+        + "\n"
+    )
     for row in rows:
         name = str(row["case"]).split(",")[0]
         limit = MOST_SECONDS.get(name)
         seconds = float(row["ours_seconds"])
-        target = f"; target of {limit:g} s {'met' if seconds <= limit else 'MISSED'}" if limit else ""
+        target = (
+            f"; target of {limit:g} s {'met' if seconds <= limit else 'MISSED'}" if limit else ""
+        )
         memory = f"; {row['ours_mb']:.0f} MB a process" if "ours_mb" in row else ""
-        print(f"{row['ratio']:6.1f} x  {row['case']}  ({row['baseline_seconds']} s -> {row['ours_seconds']} s{memory}{target})")
+        print(
+            f"{row['ratio']:6.1f} x  {row['case']}  ({row['baseline_seconds']} s -> {row['ours_seconds']} s{memory}{target})"
+        )
 
 
 if __name__ == "__main__":

@@ -40,7 +40,10 @@ def one_epoch(structure: str, compiled: bool, members: int) -> tuple[float, floa
     torch.set_num_threads(1)
     generator = np.random.default_rng(0)
     scales = {"yaw_rate": 0.2, "vx": 1.0, "ay": 3.0, "ax": 1.0, "vy_ref": 0.5}
-    channels = {name: scale * generator.standard_normal(SAMPLES) + 25.0 * (name == "vx") for name, scale in scales.items()}
+    channels = {
+        name: scale * generator.standard_normal(SAMPLES) + 25.0 * (name == "vx")
+        for name, scale in scales.items()
+    }
     drive = Recording("random", "none", 20.0, 0.0, channels, "simulated")
     name, config = STRUCTURES[structure]
     kind = estimator_class(name)
@@ -59,7 +62,9 @@ def one_epoch(structure: str, compiled: bool, members: int) -> tuple[float, floa
     return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def in_own_process(work: Callable[..., tuple[float, float]], *arguments: object) -> tuple[float, float]:
+def in_own_process(
+    work: Callable[..., tuple[float, float]], *arguments: object
+) -> tuple[float, float]:
     """Run in a fresh process, so that peak memory is its own."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()
@@ -74,13 +79,34 @@ def main() -> None:
         together = in_own_process(one_epoch, structure, True, MEMBERS)
         plain = in_own_process(one_epoch, structure, False, MEMBERS)
         alone = in_own_process(one_epoch, structure, True, 1)
-        cases.append(case(f"{structure}: {MEMBERS} members, plain PyTorch against compiled, one epoch", plain, together))
-        cases.append(case(f"{structure}: {MEMBERS} seeds each alone against together, one epoch", (MEMBERS * alone[0], alone[1]), together))
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": 1}
+        cases.append(
+            case(
+                f"{structure}: {MEMBERS} members, plain PyTorch against compiled, one epoch",
+                plain,
+                together,
+            )
+        )
+        cases.append(
+            case(
+                f"{structure}: {MEMBERS} seeds each alone against together, one epoch",
+                (MEMBERS * alone[0], alone[1]),
+                together,
+            )
+        )
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": 1,
+    }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": cases, "versions": library_versions(), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps({"cases": cases, "versions": library_versions(), "machine": machine}, indent=1)
+        + "\n"
+    )
     for entry in cases:
-        print(f"{entry['ratio']:6.1f} x  {entry['case']}  ({entry['baseline_seconds']:.3f} s -> {entry['ours_seconds']:.3f} s)")
+        print(
+            f"{entry['ratio']:6.1f} x  {entry['case']}  ({entry['baseline_seconds']:.3f} s -> {entry['ours_seconds']:.3f} s)"
+        )
 
 
 def case(name: str, baseline: tuple[float, float], ours: tuple[float, float]) -> dict[str, object]:

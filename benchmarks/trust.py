@@ -61,7 +61,11 @@ def bootstrap_row() -> dict[str, Any]:
     sums = [sizes * generator.gamma(2.0, 1.0, (3, 150)) for _ in range(20)]
     pairs = [(sums[0], other) for other in sums[1:]]
     apart = least(lambda: [difference_of_blocks(*pair, sizes) for pair in pairs])
-    return compared("block bootstrap of 20 candidates, 10,000 draws", apart, least(lambda: differences_of_blocks(pairs, sizes)))
+    return compared(
+        "block bootstrap of 20 candidates, 10,000 draws",
+        apart,
+        least(lambda: differences_of_blocks(pairs, sizes)),
+    )
 
 
 def faults_row() -> dict[str, Any]:
@@ -73,7 +77,10 @@ def faults_row() -> dict[str, Any]:
     from vehest.trust.faults import KINDS, Fault, inject
 
     model = vehest.load_model()
-    trust, drive = vehest.api._TRUST[model], prepared_recording(model, linear_drive(150.0, 100.0, 0)[0])
+    trust, drive = (
+        vehest.api._TRUST[model],
+        prepared_recording(model, linear_drive(150.0, 100.0, 0)[0]),
+    )
     faults = [
         Fault(kind, "vx" if kind == "lost_wheel" else "ay", severity, onset=onset)  # type: ignore[arg-type]
         for kind in KINDS
@@ -81,7 +88,12 @@ def faults_row() -> dict[str, Any]:
         for onset in range(30, 80, 5)
     ]
     alone = least(lambda: [model.estimate([drive]) for _ in faults])
-    whole = least(lambda: [GuardedRun(model, trust)(inject(drive.channels, drive.rate_hz, fault), drive) for fault in faults])
+    whole = least(
+        lambda: [
+            GuardedRun(model, trust)(inject(drive.channels, drive.rate_hz, fault), drive)
+            for fault in faults
+        ]
+    )
     return compared(f"ksnn: {len(faults)} faults in 150 s", alone, whole)
 
 
@@ -102,7 +114,10 @@ def main() -> None:
         assert trust.health is not None
         columns = {channel: np.array(drives[2][channel]) for channel in model.channels}
         measured = drives[2].select(model.channels)
-        samples = [dict(zip(columns, row, strict=True)) for row in np.stack(list(columns.values()), 1).tolist()]
+        samples = [
+            dict(zip(columns, row, strict=True))
+            for row in np.stack(list(columns.values()), 1).tolist()
+        ]
 
         def walk(stepper: Any, samples: list[dict[str, float]] = samples) -> None:
             for sample in samples:
@@ -131,10 +146,20 @@ def main() -> None:
         )
         rows.append(compared(f"{name}: a minute in batch", alone, whole))
     machine = f"{platform.machine()}, {platform.system()} {platform.release()}"
-    RESULT.write_text(json.dumps({"cases": rows, "versions": library_versions(), "machine": machine}, indent=1) + "\n", encoding="utf-8")
+    RESULT.write_text(
+        json.dumps({"cases": rows, "versions": library_versions(), "machine": machine}, indent=1)
+        + "\n",
+        encoding="utf-8",
+    )
     for row in rows:
-        beyond = f", band and health {row['band_and_health_us']} µs" if "band_and_health_us" in row else ""
-        print(f"{row['case']}: {row['baseline_seconds']:g} s alone, {row['ours_seconds']:g} s together{beyond}; ratio {row['ratio']}")
+        beyond = (
+            f", band and health {row['band_and_health_us']} µs"
+            if "band_and_health_us" in row
+            else ""
+        )
+        print(
+            f"{row['case']}: {row['baseline_seconds']:g} s alone, {row['ours_seconds']:g} s together{beyond}; ratio {row['ratio']}"
+        )
 
 
 if __name__ == "__main__":

@@ -37,11 +37,25 @@ ROOT = Path(__file__).parents[1]
 RESULT = result_file("ukf")
 STEPS, ONLINE_STEPS = 500, 10_000
 THREADS = int(os.environ.get("BENCH_THREADS", "2"))
-CASES = {28: (8.0, 3, 2), 256: (4.0, 2, 2)}  # sequences: ratio that is asked for, repeats within a process, rounds
-TRAINED_ON = {"f1tenth": "iros", "sim_tyre_sets": "learn"}  # how the names of training recordings begin
+CASES = {
+    28: (8.0, 3, 2),
+    256: (4.0, 2, 2),
+}  # sequences: ratio that is asked for, repeats within a process, rounds
+TRAINED_ON = {
+    "f1tenth": "iros",
+    "sim_tyre_sets": "learn",
+}  # how the names of training recordings begin
 MOST_MEMORY, MOST_DIFFERENCE, MOST_COMPILING = 0.5, 1e-3, 90.0  # of the plain one's, relative, s
 MEDIAN_STEP, WORST_STEP = 2.0, 10.0  # ms
-FORCE_SIGN_STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = 100.0, 1e-6, -2.0, 0.01, -9.0, 1e-7, 0.01
+FORCE_SIGN_STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = (
+    100.0,
+    1e-6,
+    -2.0,
+    0.01,
+    -9.0,
+    1e-7,
+    0.01,
+)
 
 
 class Problem(NamedTuple):
@@ -73,12 +87,16 @@ def recordings(prefix: str) -> list[Any]:
     from vehest.sources.base import open_source
 
     root = os.environ.get("VEHEST_DATA", tempfile.gettempdir())
-    config = compose_config("ingest", [f"dataset={dataset()}", f"root={root}", f"output={tempfile.gettempdir()}"])
+    config = compose_config(
+        "ingest", [f"dataset={dataset()}", f"root={root}", f"output={tempfile.gettempdir()}"]
+    )
     source = open_source(config["dataset"])
     return [source.read(name) for name in source.ids() if name.startswith(prefix)]
 
 
-def problem(sequences: int, steps: int = STEPS, dtype: str = "float32", weights: str = "") -> Problem:
+def problem(
+    sequences: int, steps: int = STEPS, dtype: str = "float32", weights: str = ""
+) -> Problem:
     """NNTF_UH before training or as a file has it, noise started from residuals, sequences at random places of the training recordings."""
     import torch
 
@@ -87,7 +105,9 @@ def problem(sequences: int, steps: int = STEPS, dtype: str = "float32", weights:
 
     torch.set_default_dtype(torch.float32)
     estimator = LearnedUkf.from_config({})
-    train = [estimator.drive(recording, torch.float32) for recording in recordings(TRAINED_ON[dataset()])]
+    train = [
+        estimator.drive(recording, torch.float32) for recording in recordings(TRAINED_ON[dataset()])
+    ]
     estimator._scale(train)
     generator = torch.Generator().manual_seed(0)
     estimator.filter.reset(generator)
@@ -100,7 +120,12 @@ def problem(sequences: int, steps: int = STEPS, dtype: str = "float32", weights:
         drawn.append(placed(train, steps, generator))
     torch.set_default_dtype(getattr(torch, dtype))
     estimator.filter.to(torch.get_default_dtype())
-    drives = Drive(*(torch.cat(parts)[:sequences].to(torch.get_default_dtype()) for parts in zip(*drawn, strict=True)))
+    drives = Drive(
+        *(
+            torch.cat(parts)[:sequences].to(torch.get_default_dtype())
+            for parts in zip(*drawn, strict=True)
+        )
+    )
     return Problem(estimator, drives, torch.tensor([*WEIGHTS, 1.0]))
 
 
@@ -114,11 +139,19 @@ def pretrain(file: str) -> None:
 
     torch.set_num_threads(1)
     task = problem(1)
-    model, counted = task.estimator.filter, Weights(*[task.weights * task.weights.new_tensor([1.0] * 4 + [0.0])] * 3)
-    train = [task.estimator.drive(recording, torch.float32) for recording in recordings(TRAINED_ON[dataset()])]
+    model, counted = (
+        task.estimator.filter,
+        Weights(*[task.weights * task.weights.new_tensor([1.0] * 4 + [0.0])] * 3),
+    )
+    train = [
+        task.estimator.drive(recording, torch.float32)
+        for recording in recordings(TRAINED_ON[dataset()])
+    ]
     how = PhaseSettings(learning_rate=2e-3, max_epochs=40, validate_every=40, schedule="cosine")
     settings = ThroughFilterSettings(one_step=how)
-    phase = one_step_phase(model, train, train[:1], counted, settings, lambda name: name.startswith("dynamics."))
+    phase = one_step_phase(
+        model, train, train[:1], counted, settings, lambda name: name.startswith("dynamics.")
+    )
     train_phases([phase], 0, FitContext())
     model.begin_noise(train, 0.0)
     torch.save(model.state_dict(), file)
@@ -139,7 +172,11 @@ def plain(task: Problem) -> Any:
 
     fixed_grid.rk4_alt_step_func = rk_common.rk4_step_func
     car_filter, drives = task.estimator.filter, task.drives
-    car, chassis, network = car_filter.dynamics.car.learnt, car_filter.dynamics.car, car_filter.dynamics.network
+    car, chassis, network = (
+        car_filter.dynamics.car.learnt,
+        car_filter.dynamics.car,
+        car_filter.dynamics.network,
+    )
     p = {name.removeprefix("log_"): logarithm.exp() for name, logarithm in car.named_parameters()}
     rear = p["cg_to_rear_axle"]
     front = chassis.wheelbase - rear
@@ -151,26 +188,47 @@ def plain(task: Problem) -> Any:
         along = vx + STILL
         slip_front = torch.atan((vy + front * yaw_rate) / along) - steer
         slip_rear = torch.atan((vy - rear * yaw_rate) / along)
-        seen = torch.stack([vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along], -1)
+        seen = torch.stack(
+            [vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along], -1
+        )
         hidden = torch.sigmoid(network[0](seen / network.input_scale))
         out = network[4](torch.sigmoid(network[2](hidden))) * network.output_scale
         rear_x, front_x = friction * out[..., 0], friction * out[..., 1]
-        rear_y = -friction * functional.softplus(out[..., 2]) * torch.tanh(FORCE_SIGN_STEEPNESS * slip_rear)
-        front_y = -friction * functional.softplus(out[..., 3]) * torch.tanh(FORCE_SIGN_STEEPNESS * slip_front)
-        drag = p["drag_constant"] * torch.sign(vx) + p["drag_linear"] * vx + p["drag_quadratic"] * vx**2
-        ax = (rear_x + front_x * torch.cos(steer) - front_y * torch.sin(steer) - drag) / chassis.mass
+        rear_y = (
+            -friction
+            * functional.softplus(out[..., 2])
+            * torch.tanh(FORCE_SIGN_STEEPNESS * slip_rear)
+        )
+        front_y = (
+            -friction
+            * functional.softplus(out[..., 3])
+            * torch.tanh(FORCE_SIGN_STEEPNESS * slip_front)
+        )
+        drag = (
+            p["drag_constant"] * torch.sign(vx)
+            + p["drag_linear"] * vx
+            + p["drag_quadratic"] * vx**2
+        )
+        ax = (
+            rear_x + front_x * torch.cos(steer) - front_y * torch.sin(steer) - drag
+        ) / chassis.mass
         sideways = front_x * torch.sin(steer) + front_y * torch.cos(steer)
         ay = (sideways + rear_y) / chassis.mass
         lost = p["friction_viscous"] * rim + p["friction_coulomb"] * torch.sign(rim)
         torque = p["torque_constant"] * current - chassis.wheel_radius * (front_x + rear_x) - lost
-        turning, spinning = (sideways * front - rear_y * rear) / p["yaw_inertia"], chassis.wheel_radius / p["powertrain_inertia"] * torque
+        turning, spinning = (
+            (sideways * front - rear_y * rear) / p["yaw_inertia"],
+            chassis.wheel_radius / p["powertrain_inertia"] * torque,
+        )
         return ax, ay, turning, spinning
 
     def moved(x: Any, u: Any) -> Any:
         def rates(_: Any, x: Any) -> Any:
             ax, ay, turning, spinning = motion(x, u)
             vy_yaw, vx_yaw = x[..., 1] * x[..., 2], x[..., 0] * x[..., 2]
-            return torch.stack([ax + vy_yaw, ay - vx_yaw, turning, spinning, torch.zeros_like(ax)], -1)
+            return torch.stack(
+                [ax + vy_yaw, ay - vx_yaw, turning, spinning, torch.zeros_like(ax)], -1
+            )
 
         return odeint(rates, x, torch.tensor([0.0, GAP]), method="rk4")[-1]
 
@@ -212,7 +270,9 @@ def plain(task: Problem) -> Any:
         innovation_covariance = product(deviation, deviation) + observation[:, k]
         cross = product(at - mean.unsqueeze(-2), deviation)
         gain = torch.linalg.solve(innovation_covariance, cross.mT).mT
-        mean = torch.maximum(mean + (gain @ (drives.measurements[:, k] - predicted).unsqueeze(-1)).squeeze(-1), lower)
+        mean = torch.maximum(
+            mean + (gain @ (drives.measurements[:, k] - predicted).unsqueeze(-1)).squeeze(-1), lower
+        )
         covariance = covariance - gain @ innovation_covariance @ gain.mT
         covariance = 0.5 * (covariance + covariance.mT)
         means.append(mean)
@@ -237,13 +297,18 @@ def _noise(noise: Any, states: Any, least_entropy: float | None = None) -> Any:
     import torch
 
     constant = _factor(noise.constant.factor, noise.constant.unit)
-    varying = _factor(torch.nn.functional.linear(states / noise.state_unit, noise.weight, noise.offset), noise.unit)
+    varying = _factor(
+        torch.nn.functional.linear(states / noise.state_unit, noise.weight, noise.offset),
+        noise.unit,
+    )
     n = len(noise.unit)
     covariance = constant @ constant.mT + FLOOR * torch.eye(n) + SCALE * varying @ varying.mT
     if least_entropy is None:
         return covariance
     entropy = 0.5 * (n * math.log(2.0 * math.pi * math.e) + torch.logdet(covariance))
-    return torch.exp(2.0 / n * (least_entropy - entropy).clamp(min=0.0))[..., None, None] * covariance
+    return (
+        torch.exp(2.0 / n * (least_entropy - entropy).clamp(min=0.0))[..., None, None] * covariance
+    )
 
 
 def scanned(task: Problem) -> Any:
@@ -256,7 +321,9 @@ def scanned(task: Problem) -> Any:
 WAYS = {"plain": plain, "ours": ours} | ({"jax": scanned} if find_spec("jax") else {})
 
 
-def training_step(way: str, sequences: int, repeats: int, weights: str, dtype: str = "float32") -> Figures:
+def training_step(
+    way: str, sequences: int, repeats: int, weights: str, dtype: str = "float32"
+) -> Figures:
     """Forward and backward; the best of repeats."""
     import torch
 
@@ -273,7 +340,10 @@ def training_step(way: str, sequences: int, repeats: int, weights: str, dtype: s
         busy.append(time.process_time() - began)
         value = float(loss.detach())
         del loss
-    gradients = {name: parameter.grad.double().numpy() for name, parameter in task.estimator.filter.named_parameters()}
+    gradients = {
+        name: parameter.grad.double().numpy()
+        for name, parameter in task.estimator.filter.named_parameters()
+    }
     return Figures(min(seconds), min(busy), _peak() - before, value, gradients)
 
 
@@ -287,7 +357,9 @@ def online_steps() -> tuple[float, float]:
     samples = []
     for recording in recordings(""):
         rows = {name: recording[name].tolist() for name in estimator.channels}
-        samples += [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
+        samples += [
+            dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)
+        ]
     while len(samples) < ONLINE_STEPS + 100:
         samples += samples
     times = []
@@ -313,7 +385,10 @@ def compiling() -> tuple[float, float]:
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         command = [sys.executable, __file__, "first_steps"]
-        runs = [subprocess.run(command, env=environment, check=True, capture_output=True, text=True) for _ in range(2)]
+        runs = [
+            subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+            for _ in range(2)
+        ]
     return float(runs[0].stdout), float(runs[1].stdout)
 
 
@@ -340,20 +415,29 @@ def differences(one: Figures, other: Figures) -> dict[str, float]:
     """Of losses, of whole gradients and of the gradient of the parameter where it is largest, all relative and the latter as lengths."""
     import numpy as np
 
-    off = {name: float(np.linalg.norm(one.gradients[name] - values)) for name, values in other.gradients.items()}
+    off = {
+        name: float(np.linalg.norm(one.gradients[name] - values))
+        for name, values in other.gradients.items()
+    }
     size = {name: float(np.linalg.norm(values)) for name, values in other.gradients.items()}
-    whole = (sum(value**2 for value in off.values()) / sum(value**2 for value in size.values())) ** 0.5
+    whole = (
+        sum(value**2 for value in off.values()) / sum(value**2 for value in size.values())
+    ) ** 0.5
     figures = {
         "relative_difference_of_losses": abs(one.loss - other.loss) / other.loss,
         "relative_difference_of_gradients": whole,
-        "relative_difference_of_one_parameters_gradient": max(off[name] / size[name] for name in off),
+        "relative_difference_of_one_parameters_gradient": max(
+            off[name] / size[name] for name in off
+        ),
     }
     return {name: float(f"{value:.1e}") for name, value in figures.items()}
 
 
 def exactness(weights: str) -> dict[str, float]:
     """Differences in double precision, over a few sequences."""
-    return differences(*(in_own_process(training_step, way, 4, 1, weights, "float64") for way in ("ours", "plain")))
+    return differences(
+        *(in_own_process(training_step, way, 4, 1, weights, "float64") for way in ("ours", "plain"))
+    )
 
 
 def row_of(sequences: int, weights: str) -> dict[str, Any]:
@@ -362,15 +446,27 @@ def row_of(sequences: int, weights: str) -> dict[str, Any]:
     runs: dict[str, list[Figures]] = {way: [] for way in WAYS}
     for _ in range(rounds):
         for way in WAYS:
-            runs[way].append(in_own_process(training_step, way, sequences, 1 if way == "plain" else repeats, weights))
+            runs[way].append(
+                in_own_process(
+                    training_step, way, sequences, 1 if way == "plain" else repeats, weights
+                )
+            )
     best = {way: min(figures.seconds for figures in own) for way, own in runs.items()}
     busy = {way: min(figures.processor_seconds for figures in own) for way, own in runs.items()}
-    memory = {way: statistics.median(figures.megabytes for figures in own) for way, own in runs.items()}
+    memory = {
+        way: statistics.median(figures.megabytes for figures in own) for way, own in runs.items()
+    }
     beside: dict[str, Any] = {}
     if "jax" in WAYS:
-        beside = {"jax_seconds": round(best["jax"], 3), "jax_processor_seconds": round(busy["jax"], 3)}
+        beside = {
+            "jax_seconds": round(best["jax"], 3),
+            "jax_processor_seconds": round(busy["jax"], 3),
+        }
         beside |= {"ratio_to_jax": round(best["jax"] / best["ours"], 2)}
-        beside |= {f"jax_{name}": value for name, value in differences(runs["jax"][0], runs["plain"][0]).items()}
+        beside |= {
+            f"jax_{name}": value
+            for name, value in differences(runs["jax"][0], runs["plain"][0]).items()
+        }
     return {
         "case": f"NNTF_UH, {sequences} sequences of {STEPS} samples of {dataset()}: one training step, plain PyTorch against vehest",
         "baseline_seconds": round(best["plain"], 3),
@@ -392,7 +488,8 @@ def tell(row: dict[str, Any]) -> None:
     met = (
         row["ratio"] >= row["least_ratio"]
         and row["ours_mb"] <= MOST_MEMORY * row["baseline_mb"]
-        and max(row["relative_difference_of_losses"], row["relative_difference_of_gradients"]) <= MOST_DIFFERENCE
+        and max(row["relative_difference_of_losses"], row["relative_difference_of_gradients"])
+        <= MOST_DIFFERENCE
     )
     print(
         f"{row['ratio']:6.1f} x (at least {row['least_ratio']:.0f})  {row['case']}  ({row['baseline_seconds']:.2f} s -> "
@@ -422,20 +519,40 @@ def main() -> None:
         f"gradients by {exact['relative_difference_of_gradients']:.1e}"
     )
     median, worst = in_own_process(online_steps)
-    print(f"compilation: {compilation:.1f} s with an empty cache (at most {MOST_COMPILING:.0f}), {loading:.1f} s with a filled one")
+    print(
+        f"compilation: {compilation:.1f} s with an empty cache (at most {MOST_COMPILING:.0f}), {loading:.1f} s with a filled one"
+    )
     print(
         f"step(): {median:.2f} ms at the median (below {MEDIAN_STEP:g}), {worst:.2f} ms at worst (below {WORST_STEP:g}) of {ONLINE_STEPS}"
     )
-    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": THREADS}
+    machine = {
+        "processor": platform.processor() or platform.machine(),
+        "system": platform.system(),
+        "cores_used": THREADS,
+    }
     machine["cores"] = os.cpu_count() or 1
     machine["load"] = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
     once = {
         "double_precision": exact,
-        "compilation": {"seconds_with_empty_cache": round(compilation, 1), "seconds_with_filled_cache": round(loading, 1)},
-        "online": {"steps": ONLINE_STEPS, "median_ms": round(median, 3), "worst_ms": round(worst, 3), "threads": 1},
+        "compilation": {
+            "seconds_with_empty_cache": round(compilation, 1),
+            "seconds_with_filled_cache": round(loading, 1),
+        },
+        "online": {
+            "steps": ONLINE_STEPS,
+            "median_ms": round(median, 3),
+            "worst_ms": round(worst, 3),
+            "threads": 1,
+        },
     }
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"cases": rows, **once, "versions": in_own_process(versions), "machine": machine}, indent=1) + "\n")
+    RESULT.write_text(
+        json.dumps(
+            {"cases": rows, **once, "versions": in_own_process(versions), "machine": machine},
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-STILL, STEEPNESS, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = 1e-6, 100.0, -2.0, 0.01, -9.0, 1e-7, 0.01  # as in ukf.py
+STILL, STEEPNESS, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = (
+    1e-6,
+    100.0,
+    -2.0,
+    0.01,
+    -9.0,
+    1e-7,
+    0.01,
+)  # as in ukf.py
 
 
 def loss_of(task: Any) -> torch.Tensor:
@@ -24,12 +32,35 @@ def loss_of(task: Any) -> torch.Tensor:
 class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, task: Any, names: list[str], *values: torch.Tensor) -> torch.Tensor:
-        parameters = {name: jnp.asarray(value.detach().numpy()) for name, value in zip(names, values, strict=True)}
+        parameters = {
+            name: jnp.asarray(value.detach().numpy())
+            for name, value in zip(names, values, strict=True)
+        }
         car = task.estimator.filter.dynamics.car
-        known = {name: jnp.asarray(value.numpy()) for name, value in task.estimator.filter.named_buffers()}
+        known = {
+            name: jnp.asarray(value.numpy())
+            for name, value in task.estimator.filter.named_buffers()
+        }
         noise = task.estimator.filter
-        fixed = (car.mass, car.wheelbase, car.wheel_radius, FLOOR, FLOOR, FLOOR, SCALE, *noise.lower)
-        data = [jnp.asarray(part.numpy()) for part in (task.drives.states, task.drives.inputs, task.drives.measurements, task.weights)]
+        fixed = (
+            car.mass,
+            car.wheelbase,
+            car.wheel_radius,
+            FLOOR,
+            FLOOR,
+            FLOOR,
+            SCALE,
+            *noise.lower,
+        )
+        data = [
+            jnp.asarray(part.numpy())
+            for part in (
+                task.drives.states,
+                task.drives.inputs,
+                task.drives.measurements,
+                task.weights,
+            )
+        ]
         loss, gradients = _compiled(fixed)(parameters, known, *data)
         ctx.gradients = [torch.from_numpy(np.array(gradients[name])) for name in names]
         return torch.tensor(float(loss))
@@ -44,18 +75,38 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
     mass, wheelbase, radius, process_floor, observation_floor, initial_floor, scale, *least = fixed
     lower = jnp.array(least)
 
-    def loss(own: dict[str, Any], known: dict[str, Any], states: Any, inputs: Any, measurements: Any, weighting: Any) -> Any:
-        p = {name.removeprefix("dynamics.car.learnt.log_"): jnp.exp(value) for name, value in own.items() if ".log_" in name}
+    def loss(
+        own: dict[str, Any],
+        known: dict[str, Any],
+        states: Any,
+        inputs: Any,
+        measurements: Any,
+        weighting: Any,
+    ) -> Any:
+        p = {
+            name.removeprefix("dynamics.car.learnt.log_"): jnp.exp(value)
+            for name, value in own.items()
+            if ".log_" in name
+        }
         rear = p["cg_to_rear_axle"]
         front = wheelbase - rear
-        layers = [(own[f"dynamics.network.{k}.weight"].T, own[f"dynamics.network.{k}.bias"]) for k in (0, 2, 4)]
+        layers = [
+            (own[f"dynamics.network.{k}.weight"].T, own[f"dynamics.network.{k}.bias"])
+            for k in (0, 2, 4)
+        ]
 
         def motion(x: Any, u: Any) -> tuple[Any, ...]:
             vx, vy, yaw_rate, rim, friction = (x[..., i] for i in range(5))
             steer, current = (jnp.broadcast_to(u[..., i], vx.shape) for i in range(2))
             along = vx + STILL
-            slip_front, slip_rear = jnp.arctan((vy + front * yaw_rate) / along) - steer, jnp.arctan((vy - rear * yaw_rate) / along)
-            seen = jnp.stack([vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along], -1)
+            slip_front, slip_rear = (
+                jnp.arctan((vy + front * yaw_rate) / along) - steer,
+                jnp.arctan((vy - rear * yaw_rate) / along),
+            )
+            seen = jnp.stack(
+                [vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along],
+                -1,
+            )
             hidden = seen / known["dynamics.network.input_scale"]
             for weight, offset in layers[:2]:
                 hidden = jax.nn.sigmoid(hidden @ weight + offset)
@@ -63,7 +114,11 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
             rear_x, front_x = friction * out[..., 0], friction * out[..., 1]
             rear_y = -friction * jax.nn.softplus(out[..., 2]) * jnp.tanh(STEEPNESS * slip_rear)
             front_y = -friction * jax.nn.softplus(out[..., 3]) * jnp.tanh(STEEPNESS * slip_front)
-            drag = p["drag_constant"] * jnp.sign(vx) + p["drag_linear"] * vx + p["drag_quadratic"] * vx**2
+            drag = (
+                p["drag_constant"] * jnp.sign(vx)
+                + p["drag_linear"] * vx
+                + p["drag_quadratic"] * vx**2
+            )
             sideways = front_x * jnp.sin(steer) + front_y * jnp.cos(steer)
             lost = p["friction_viscous"] * rim + p["friction_coulomb"] * jnp.sign(rim)
             torque = p["torque_constant"] * current - radius * (front_x + rear_x) - lost
@@ -76,7 +131,16 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
 
         def rates(x: Any, u: Any) -> Any:
             ax, ay, turning, spinning = motion(x, u)
-            return jnp.stack([ax + x[..., 1] * x[..., 2], ay - x[..., 0] * x[..., 2], turning, spinning, jnp.zeros_like(ax)], -1)
+            return jnp.stack(
+                [
+                    ax + x[..., 1] * x[..., 2],
+                    ay - x[..., 0] * x[..., 2],
+                    turning,
+                    spinning,
+                    jnp.zeros_like(ax),
+                ],
+                -1,
+            )
 
         def moved(x: Any, u: Any) -> Any:
             k1 = rates(x, u)
@@ -91,20 +155,34 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
         def points(mean: Any, covariance: Any) -> Any:
             offsets = total**0.5 * jnp.linalg.cholesky(covariance, symmetrize_input=False).mT
             centre = mean[:, None]
-            return jnp.maximum(jnp.concatenate([centre, centre + offsets, centre - offsets], -2), lower)
+            return jnp.maximum(
+                jnp.concatenate([centre, centre + offsets, centre - offsets], -2), lower
+            )
 
         def product(left: Any, right: Any) -> Any:
             return (weights[:, None] * left).mT @ right
 
         def noise(name: str, floor: float) -> Any:
             constant = _factor(own[f"{name}.constant.factor"], known[f"{name}.constant.unit"])
-            entries = states / known[f"{name}.state_unit"] @ own[f"{name}.weight"].T + own[f"{name}.offset"]
+            entries = (
+                states / known[f"{name}.state_unit"] @ own[f"{name}.weight"].T
+                + own[f"{name}.offset"]
+            )
             varying = _factor(entries, known[f"{name}.unit"])
-            return constant @ constant.mT + floor * jnp.eye(len(constant)) + scale * varying @ varying.mT
+            return (
+                constant @ constant.mT
+                + floor * jnp.eye(len(constant))
+                + scale * varying @ varying.mT
+            )
 
-        process, observation = noise("process_noise", process_floor), noise("observation_noise", observation_floor)
+        process, observation = (
+            noise("process_noise", process_floor),
+            noise("observation_noise", observation_floor),
+        )
         entropy = 0.5 * (n * math.log(2.0 * math.pi * math.e) + jnp.linalg.slogdet(process)[1])
-        process = jnp.exp(2.0 / n * jnp.maximum(LEAST_ENTROPY - entropy, 0.0))[..., None, None] * process
+        process = (
+            jnp.exp(2.0 / n * jnp.maximum(LEAST_ENTROPY - entropy, 0.0))[..., None, None] * process
+        )
 
         def updated(mean: Any, covariance: Any, u: Any, y: Any, spread: Any) -> Any:
             at = points(mean, covariance)
@@ -123,14 +201,18 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
             after = moved(points(*carry), before[:, None])
             mean = weights @ after
             deviation = after - mean[:, None]
-            new = updated(jnp.maximum(mean, lower), product(deviation, deviation) + added, u, y, spread)
+            new = updated(
+                jnp.maximum(mean, lower), product(deviation, deviation) + added, u, y, spread
+            )
             return new, new[0]
 
         def by_time(values: Any) -> Any:
             return jnp.swapaxes(values, 0, 1)
 
         initial = _factor(own["initial_noise.factor"], known["initial_noise.unit"])
-        start = jnp.broadcast_to(initial @ initial.mT + initial_floor * jnp.eye(n), (len(states), n, n))
+        start = jnp.broadcast_to(
+            initial @ initial.mT + initial_floor * jnp.eye(n), (len(states), n, n)
+        )
         u, y, q, r = (by_time(values) for values in (inputs, measurements, process, observation))
         first = updated(states[:, 0], start, u[0], y[0], r[0])
         _, means = jax.lax.scan(step, first, (u[:-1], q[:-1], u[1:], y[1:], r[1:]))
@@ -144,4 +226,8 @@ def _factor(entries: Any, unit: Any) -> Any:
     """Lower triangular matrices of their entries row by row, (..., n (n + 1) / 2) -> (..., n, n)."""
     n = len(unit)
     rows, columns = np.tril_indices(n)
-    return jnp.zeros((*entries.shape[:-1], n, n), entries.dtype).at[..., rows, columns].set(entries * unit[rows])
+    return (
+        jnp.zeros((*entries.shape[:-1], n, n), entries.dtype)
+        .at[..., rows, columns]
+        .set(entries * unit[rows])
+    )

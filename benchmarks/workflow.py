@@ -30,13 +30,23 @@ RATE, MINUTE, LONG = 100.0, 60.0, 15 * 3600.0
 LIBRARIES = "import numba, scipy.special, pyarrow.parquet, hydra"
 
 
-def measured(command: Sequence[str], folder: Path, repeats: int = REPEATS, source: Path | None = None) -> dict[str, float]:
+def measured(
+    command: Sequence[str], folder: Path, repeats: int = REPEATS, source: Path | None = None
+) -> dict[str, float]:
     """Seconds of the quickest run and peak memory [MB] of the largest, of the code in ``source`` or else of the installed one."""
     seconds, memory = [], []
-    environment = {**os.environ, "VEHEST_OUTPUT": str(folder / "outputs")} | ({"PYTHONPATH": str(source)} if source else {})
+    environment = {**os.environ, "VEHEST_OUTPUT": str(folder / "outputs")} | (
+        {"PYTHONPATH": str(source)} if source else {}
+    )
     for _ in range(repeats):
         begun = time.perf_counter()
-        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         _, status, usage = os.wait4(process.pid, 0)
         if status != 0:
             raise SystemExit(f"{' '.join(command)} ended with {os.waitstatus_to_exitcode(status)}")
@@ -66,49 +76,84 @@ def cases_of(folder: Path, source: Path | None = None) -> dict[str, dict[str, fl
     for file in ("minute.parquet", "long.parquet"):
         (folder / file).symlink_to(folder.parent / file)
     vehest = (sys.executable, "-c", "from vehest.cli import main; main()")
-    run, minute = (*vehest, "run", "quickstart", "tracking=none"), (*vehest, "estimate", "minute.parquet", "-o", "out.parquet")
+    run, minute = (
+        (*vehest, "run", "quickstart", "tracking=none"),
+        (*vehest, "estimate", "minute.parquet", "-o", "out.parquet"),
+    )
     for command in (run, minute):
         measured(command, folder, 1, source)
     return {
         "help": measured((*vehest, "--help"), folder, REPEATS, source),
         "run_finished": measured(run, folder, REPEATS, source),
         "estimate_minute": measured(minute, folder, REPEATS, source),
-        "estimate_15_h": measured((*vehest, "estimate", "long.parquet", "-o", "out.parquet"), folder, 2, source),
+        "estimate_15_h": measured(
+            (*vehest, "estimate", "long.parquet", "-o", "out.parquet"), folder, 2, source
+        ),
     }
 
 
 def main() -> None:
     """Measure every case, print and write it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--before", metavar="REV", help="a commit whose code is measured in the same run")
+    parser.add_argument(
+        "--before", metavar="REV", help="a commit whose code is measured in the same run"
+    )
     before = parser.parse_args().before
     with tempfile.TemporaryDirectory(prefix="workflow-") as scratch:
         folder = Path(scratch)
         for file, seconds in (("minute.parquet", MINUTE), ("long.parquet", LONG)):
-            process = get_context("spawn").Process(target=write_drive, args=(folder / file, seconds))
+            process = get_context("spawn").Process(
+                target=write_drive, args=(folder / file, seconds)
+            )
             process.start()
             process.join()
         plain = {
             "python": measured((sys.executable, "-c", "pass"), folder),
             "libraries": measured((sys.executable, "-c", LIBRARIES), folder),
-            "read_15_h": measured((sys.executable, "-c", "import pyarrow.parquet; pyarrow.parquet.read_table('long.parquet')"), folder, 2),
+            "read_15_h": measured(
+                (
+                    sys.executable,
+                    "-c",
+                    "import pyarrow.parquet; pyarrow.parquet.read_table('long.parquet')",
+                ),
+                folder,
+                2,
+            ),
         }
         now = cases_of(folder / "now")
-        result: dict[str, object] = {"command": " ".join(["benchmarks/workflow.py", *sys.argv[1:]]), "plain": plain, "now": now}
-        ratios = {
-            f"{name} over libraries": now[name]["seconds"] / plain["libraries"]["seconds"] for name in ("run_finished", "estimate_minute")
+        result: dict[str, object] = {
+            "command": " ".join(["benchmarks/workflow.py", *sys.argv[1:]]),
+            "plain": plain,
+            "now": now,
         }
-        ratios["estimate_15_h over read_15_h"] = now["estimate_15_h"]["seconds"] / plain["read_15_h"]["seconds"]
+        ratios = {
+            f"{name} over libraries": now[name]["seconds"] / plain["libraries"]["seconds"]
+            for name in ("run_finished", "estimate_minute")
+        }
+        ratios["estimate_15_h over read_15_h"] = (
+            now["estimate_15_h"]["seconds"] / plain["read_15_h"]["seconds"]
+        )
         if before:
-            subprocess.run(["git", "worktree", "add", "-q", "--detach", folder / "code", before], cwd=ROOT, check=True)
+            subprocess.run(
+                ["git", "worktree", "add", "-q", "--detach", folder / "code", before],
+                cwd=ROOT,
+                check=True,
+            )
             try:
                 then = cases_of(folder / "then", folder / "code" / "src")
             finally:
-                subprocess.run(["git", "worktree", "remove", "--force", folder / "code"], cwd=ROOT, check=True)
+                subprocess.run(
+                    ["git", "worktree", "remove", "--force", folder / "code"], cwd=ROOT, check=True
+                )
             result["before"] = {"commit": before, **then}
-            ratios |= {f"{name} before over now": then[name]["seconds"] / now[name]["seconds"] for name in now}
+            ratios |= {
+                f"{name} before over now": then[name]["seconds"] / now[name]["seconds"]
+                for name in now
+            }
     result["ratios"] = {name: round(value, 2) for name, value in ratios.items()}
-    result["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    result["machine"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    )
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(result, indent=1))

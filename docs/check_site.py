@@ -29,7 +29,10 @@ class _Page(HTMLParser):
 
 def broken_links(site: Path) -> list[str]:
     """Links of all pages below a folder that lead to no file, outside the folder, or to no anchor: ``page: link``."""
-    pages = {file.resolve(): _Page(file.read_text(encoding="utf-8")) for file in sorted(site.rglob("*.html"))}
+    pages = {
+        file.resolve(): _Page(file.read_text(encoding="utf-8"))
+        for file in sorted(site.rglob("*.html"))
+    }
     broken = []
     for file, page in pages.items():
         for target in dict.fromkeys(page.targets):

@@ -18,7 +18,11 @@ import yaml
 
 EXAMPLES = Path(__file__).with_name("examples")
 RESULT = Path(__file__).parents[1] / "results" / "examples" / "leaderboard.csv"
-CLASSES = {"saturating_ekf": "SaturatingEkf", "sliding_mode": "SlidingMode", "window_transformer": "WindowTransformer"}
+CLASSES = {
+    "saturating_ekf": "SaturatingEkf",
+    "sliding_mode": "SlidingMode",
+    "window_transformer": "WindowTransformer",
+}
 CAR = {  # CommonRoad's vehicle 2, a BMW 320i; stiffness of an axle: 1.0489 · 20.89/rad · its load
     "mass": 1093.3,
     "yaw_inertia": 1791.6,
@@ -38,11 +42,23 @@ PIPELINE = {
         ["estimator=data_sheet", "estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"],
         ["estimator=sliding_mode"],
         ["estimator=window_transformer", "seed=range(3)"],
-        ["estimator=saturating_ekf", *(f"+estimator.car.{name}={value}" for name, value in CAR.items())],
+        [
+            "estimator=saturating_ekf",
+            *(f"+estimator.car.{name}={value}" for name, value in CAR.items()),
+        ],
     ],
     "evaluation": {"rate_hz": 20},
 }
-SHOWN = ["title", "rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high", "beats_zero", "beats_static_map", "fvu", "n_seeds"]
+SHOWN = [
+    "title",
+    "rmse_sideslip",
+    "rmse_sideslip_low",
+    "rmse_sideslip_high",
+    "beats_zero",
+    "beats_static_map",
+    "fvu",
+    "n_seeds",
+]
 
 
 def install(site: Path, place: Path) -> None:
@@ -65,8 +81,20 @@ def main() -> None:
         install(site, place)
         (place / "pipelines").mkdir()
         (place / "pipelines" / "examples.yaml").write_text(yaml.safe_dump(PIPELINE))
-        command = (sys.executable, "-c", "from vehest.cli import main; main()", "run", "examples", "tracking=none")
-        subprocess.run(command, cwd=place, env={**os.environ, "PYTHONPATH": str(site), "VEHEST_OUTPUT": "outputs"}, check=True)
+        command = (
+            sys.executable,
+            "-c",
+            "from vehest.cli import main; main()",
+            "run",
+            "examples",
+            "tracking=none",
+        )
+        subprocess.run(
+            command,
+            cwd=place,
+            env={**os.environ, "PYTHONPATH": str(site), "VEHEST_OUTPUT": "outputs"},
+            check=True,
+        )
         (table,) = place.glob("outputs/report/examples-*/tables/leaderboard_test.csv")
         board = pd.read_csv(table)
         RESULT.parent.mkdir(parents=True, exist_ok=True)

@@ -22,9 +22,15 @@ from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
 REAL = ("f1tenth", "iros_hoons_1_with_friction_run_*")
-SIMULATED = (("sim_tyre_sets", "learn_a_*"), ("sim_tyre_sets", "test_a_*"), ("sim_tyre_sets", "test_d_*"))
+SIMULATED = (
+    ("sim_tyre_sets", "learn_a_*"),
+    ("sim_tyre_sets", "test_a_*"),
+    ("sim_tyre_sets", "test_d_*"),
+)
 SLOWEST = 0.5  # [m/s]; the real recordings are cut where the car is slower
-CAR = yaml.safe_load((Path(__file__).parents[1] / "conf" / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8"))["parameters"]
+CAR = yaml.safe_load(
+    (Path(__file__).parents[1] / "conf" / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8")
+)["parameters"]
 REAR = CAR["cg_to_rear_axle"]
 QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.95, 0.99)
 DIGITS = (2, 2, 2, 1, 1, 1, 2, 0, 2, 1, 1, 2)
@@ -78,10 +84,15 @@ def identified(drives: Sequence[Recording]) -> Iterator[str]:
     yield f"torque_constant {per_ampere * mass * radius:.4f} N m/A, or {per_ampere:.3f} m/s² per ampere"
     yield f"motor_inertia and wheels {inertia * mass * radius**2:.2e} kg m², or {inertia * mass:.2f} kg at the rim"
     yield f"coulomb_torque {friction * mass * radius:.2f} N m, or {friction:.2f} m/s²"
-    steer_rate = np.concatenate([np.abs(np.gradient(drive["steer"])) * drive.rate_hz for drive in drives])
+    steer_rate = np.concatenate(
+        [np.abs(np.gradient(drive["steer"])) * drive.rate_hz for drive in drives]
+    )
     largest = max(drive["steer"].max() for drive in drives)
     yield f"steering_rate: 99 % below {np.quantile(steer_rate, 0.99):.2f} rad/s; largest_steer {largest:.3f} rad"
-    shown, speed = pd.concat(map(quantities, drives)), np.concatenate([drive["motor_speed"] for drive in drives])
+    shown, speed = (
+        pd.concat(map(quantities, drives)),
+        np.concatenate([drive["motor_speed"] for drive in drives]),
+    )
     spread = (shown.filter(like="less its truth") ** 2).groupby(speed // 10 * 10).mean() ** 0.5
     yield f"RMS by wheel speed from [rad/s]:\n{spread.loc[10:70].round(2).to_string()}"
     for channel in ("yaw_rate_ref", "vx_ref", "vy_ref", "vx", "motor_current"):
@@ -96,12 +107,30 @@ def table(sets: dict[str, list[Recording]]) -> Iterator[str]:
     yield "| :-- |" + " :-- |" * len(sets)
     for name, digits in zip(frames[0], DIGITS, strict=True):
         cells = [frame[name][frame["v_x [m/s]"] > SLOWEST].quantile(QUANTILES) for frame in frames]
-        yield f"| {name} | " + " | ".join(", ".join(f"{value:.{digits}f}" for value in cell) for cell in cells) + " |"
+        yield (
+            f"| {name} | "
+            + " | ".join(", ".join(f"{value:.{digits}f}" for value in cell) for cell in cells)
+            + " |"
+        )
     yield "| minutes | " + " | ".join(f"{len(frame) / 6000.0:.1f}" for frame in frames) + " |"
     slow = [100.0 * (frame["v_x [m/s]"] <= SLOWEST).mean() for frame in frames]
-    yield f"| % of samples at {SLOWEST} m/s or less, left out above | " + " | ".join(f"{share:.1f}" for share in slow) + " |"
+    yield (
+        f"| % of samples at {SLOWEST} m/s or less, left out above | "
+        + " | ".join(f"{share:.1f}" for share in slow)
+        + " |"
+    )
 
 
 if __name__ == "__main__":
     real = drives_of(*REAL)
-    print("\n".join([*identified(real), "", *table({"real": real, **{f"`{name}`": drives_of(of, name) for of, name in SIMULATED}})]))
+    print(
+        "\n".join(
+            [
+                *identified(real),
+                "",
+                *table(
+                    {"real": real, **{f"`{name}`": drives_of(of, name) for of, name in SIMULATED}}
+                ),
+            ]
+        )
+    )

@@ -17,12 +17,31 @@ ROOT = Path(__file__).resolve().parents[1]
 project = "vehest"
 author = "the authors of vehest"
 copyright = "the authors of vehest, MIT licence"
-release = re.findall(r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "version.py").read_text(encoding="utf-8"))[0]
+release = re.findall(
+    r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "version.py").read_text(encoding="utf-8")
+)[0]
 
 extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md", "CONTRIBUTING.md"]
-exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines", "benchmarks", "docs/examples"]
+include_patterns = [
+    "docs/*.md",
+    "docs/estimators/*.md",
+    "docs/sources/*.md",
+    "results/*/*.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+]
+exclude_patterns = [
+    ".*",
+    "build",
+    "outputs",
+    "src",
+    "tests",
+    "conf",
+    "pipelines",
+    "benchmarks",
+    "docs/examples",
+]
 
 myst_heading_anchors = 5
 myst_enable_extensions = ["colon_fence"]
@@ -46,8 +65,16 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_js_files = ["site.js"]
 html_theme_options = {
-    "light_css_variables": {"color-brand-primary": "#0b4f9c", "color-brand-content": "#0b4f9c", "color-brand-visited": "#0b4f9c"},
-    "dark_css_variables": {"color-brand-primary": "#8cc4f5", "color-brand-content": "#8cc4f5", "color-brand-visited": "#8cc4f5"},
+    "light_css_variables": {
+        "color-brand-primary": "#0b4f9c",
+        "color-brand-content": "#0b4f9c",
+        "color-brand-visited": "#0b4f9c",
+    },
+    "dark_css_variables": {
+        "color-brand-primary": "#8cc4f5",
+        "color-brand-content": "#8cc4f5",
+        "color-brand-visited": "#8cc4f5",
+    },
     "navigation_with_keys": True,
 }
 

@@ -46,13 +46,32 @@ def chosen_step(table: Path = TABLE) -> pd.Series:
     """The row of the study's table that has the model, with its median FVU on the car that made the choice."""
     frame, scores = pd.read_csv(table), pd.read_csv(table.parents[1] / "metrics.csv")
     (row,) = (row for _, row in frame[frame["model"].notna()].iterrows())
-    own = scores["trained_on"].str.endswith(f"/{row['part']}") & (scores["test_set"] == "other_simulator") & (scores["metric"] == "fvu")
-    return pd.concat([row, pd.Series({"other_simulator_fvu": scores.loc[own & (scores["condition"] == "nominal"), "value"].median()})])
+    own = (
+        scores["trained_on"].str.endswith(f"/{row['part']}")
+        & (scores["test_set"] == "other_simulator")
+        & (scores["metric"] == "fvu")
+    )
+    return pd.concat(
+        [
+            row,
+            pd.Series(
+                {
+                    "other_simulator_fvu": scores.loc[
+                        own & (scores["condition"] == "nominal"), "value"
+                    ].median()
+                }
+            ),
+        ]
+    )
 
 
 def note_of(row: pd.Series, estimator: Estimator) -> str:
     """What people should know who use the model."""
-    patent = " The KS-NN is patented by its authors (PCT/IT2023/050058)." if estimator.name == "ksnn" else ""
+    patent = (
+        " The KS-NN is patented by its authors (PCT/IT2023/050058)."
+        if estimator.name == "ksnn"
+        else ""
+    )
     left, worse = row["other_simulator_fvu"], ""
     if left > 1.0:  # of the candidate with the lowest error there
         worse = " All candidates of the rule are worse than v = 0 on the simulated car that it asked; this one leaves FVU "
@@ -85,16 +104,28 @@ def write(row: pd.Series, model: Path) -> None:
 
 def write_its_trust(step: str, output: Path) -> None:
     """Learn from a step's training and validation ranges, all of them simulated, how far the model can be trusted."""
-    words = [f"split=sim_to_real_{step}", f"estimator={read_description(TARGET).estimator}", f"output={output}", "tracking=none"]
+    words = [
+        f"split=sim_to_real_{step}",
+        f"estimator={read_description(TARGET).estimator}",
+        f"output={output}",
+        "tracking=none",
+    ]
     config = compose_config("eval", words)
     runner = Runner(output, Messages(), StopSignals())
     whole = runner.split(config)
     split = replace(whole, tests={})
-    job = plan_calibrate(model_artefact(TARGET), split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
+    job = plan_calibrate(
+        model_artefact(TARGET),
+        split,
+        runner.data_for(split, float(config["estimator"]["rate_hz"]), config),
+        output,
+    )
     if job is None:
         raise SystemExit(f"split '{split.name}' has no validation range")
     job[1](TARGET)
-    write_trust(replace(read_trust(TARGET), guard=None), TARGET)  # samples are held to what any car's sensors do, not to simulated ones
+    write_trust(
+        replace(read_trust(TARGET), guard=None), TARGET
+    )  # samples are held to what any car's sensors do, not to simulated ones
 
 
 def write_filter(output: Path) -> None:
@@ -104,10 +135,17 @@ def write_filter(output: Path) -> None:
         compose_config("ingest", ["dataset=sim_fleet_real", *counts, f"output={output}"])
     )
     estimator = estimator_class("self_calibrating").from_config({})
-    drives = [resampled(read_recording(made.folder / name), estimator.rate_hz, estimator.preparation) for name in sorted(made.outputs)]
+    drives = [
+        resampled(read_recording(made.folder / name), estimator.rate_hz, estimator.preparation)
+        for name in sorted(made.outputs)
+    ]
     fleet = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
     FILTER.mkdir(exist_ok=True)
-    save_model(estimator, FILTER, {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE})
+    save_model(
+        estimator,
+        FILTER,
+        {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE},
+    )
     health = read_trust(TARGET).health  # of the same channels, from more cars
     trust = learn_trust(estimator, fleet, development_drives(output))
     if trust.bands is None:

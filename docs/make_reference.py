@@ -20,24 +20,43 @@ import typer
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
-PART = re.compile(r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL)
+PART = re.compile(
+    r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL
+)
 
 BASELINES = ("zero", "static_map")
 OVERVIEWS = {
     "rational_ekf": (
         "heavy_ekf",
         "RMSE(β) [deg], the truck **simulated**",
-        {"test": "test", **{key: key for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")}},
+        {
+            "test": "test",
+            **{
+                key: key
+                for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")
+            },
+        },
     ),
     "cnn_ukf": (
         "cnn_ukf",
         "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
-        {"part": "learnt on", "candidate": "method", "ours_mse": "MSE", "ours_mse_nonlinear": "MSE_nl", "n_seeds": "seeds"},
+        {
+            "part": "learnt on",
+            "candidate": "method",
+            "ours_mse": "MSE",
+            "ours_mse_nonlinear": "MSE_nl",
+            "n_seeds": "seeds",
+        },
     ),
     "learned_ukf": (
         "learned_ukf",
         "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
-        {"candidate": "method", "ours_tyre_a": "tyre A", "ours_tyre_d": "tyre D", "n_seeds": "seeds"},
+        {
+            "candidate": "method",
+            "ours_tyre_a": "tyre A",
+            "ours_tyre_d": "tyre D",
+            "n_seeds": "seeds",
+        },
     ),
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
@@ -48,7 +67,9 @@ TYPER_OWN = {"install_completion", "show_completion", "help"}
 
 def pages() -> dict[Path, str]:
     """Every page with made parts, by its path: what it should hold."""
-    found = {file: file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").rglob("*.md"))}
+    found = {
+        file: file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").rglob("*.md"))
+    }
     return {file: PART.sub(_made, text) for file, text in found.items() if PART.search(text)}
 
 
@@ -114,22 +135,36 @@ def _parameters(command: Any) -> list[tuple[str, str]]:
             value = "" if parameter.is_flag else f" {parameter.name.upper()}"
             name = ", ".join(f"`{option}{value}`" for option in parameter.opts)
         default = parameter.default
-        shown = f" Default: `{default}`." if not (default is None or isinstance(default, bool) or callable(default)) else ""
+        shown = (
+            f" Default: `{default}`."
+            if not (default is None or isinstance(default, bool) or callable(default))
+            else ""
+        )
         rows.append((name, f"{parameter.help}{shown}"))
     return rows
 
 
 def files(*folders: str) -> Iterable[str]:
     """A row for each YAML file of some folders: a link, and the first sentence of its comment."""
-    found = sorted((file for folder in folders for file in (ROOT / folder).glob("*.yaml")), key=lambda file: file.name)
-    rows = [(f"[`{file.stem}`](../{file.relative_to(ROOT).as_posix()})", _first_sentence(file)) for file in found]
+    found = sorted(
+        (file for folder in folders for file in (ROOT / folder).glob("*.yaml")),
+        key=lambda file: file.name,
+    )
+    rows = [
+        (f"[`{file.stem}`](../{file.relative_to(ROOT).as_posix()})", _first_sentence(file))
+        for file in found
+    ]
     yield _table(("file", "content"), rows)
 
 
 def _first_sentence(file: Path) -> str:
     """Of the comment at the top of a file."""
     comment = re.match(r"(?:#.*\n)+", file.read_text(encoding="utf-8"))
-    lines = [line.lstrip("# ").rstrip() for line in comment[0].splitlines() if "@package" not in line] if comment else []
+    lines = (
+        [line.lstrip("# ").rstrip() for line in comment[0].splitlines() if "@package" not in line]
+        if comment
+        else []
+    )
     return re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(lines), maxsplit=1)[0]
 
 
@@ -145,7 +180,10 @@ def channels() -> Iterable[str]:
         of_all = re.sub(r"(the )?(front|rear) (left|right)( wheel)?", "each wheel", c.meaning)
         possible = f"{c.low:g} … {c.high:g}" if abs(c.low) != math.pi else "-π … π"
         rows.setdefault((c.unit, of_all, possible), []).append(f"`{c.name}`")
-    yield _table(("channel", "unit", "meaning", "possible range"), [(", ".join(names), *row) for row, names in rows.items()])
+    yield _table(
+        ("channel", "unit", "meaning", "possible range"),
+        [(", ".join(names), *row) for row, names in rows.items()],
+    )
 
 
 def units() -> Iterable[str]:
@@ -154,8 +192,13 @@ def units() -> Iterable[str]:
 
     conversions: dict[str, list[str]] = {}
     for unit, (si, factor) in _UNITS.items():
-        conversions.setdefault(si, []).append(f"`{unit}`" + (f" × {factor:.10g}" if factor != 1.0 else ""))
-    yield _table(("unit of channels", "may be given as"), [(si, ", ".join(dict.fromkeys(given))) for si, given in conversions.items()])
+        conversions.setdefault(si, []).append(
+            f"`{unit}`" + (f" × {factor:.10g}" if factor != 1.0 else "")
+        )
+    yield _table(
+        ("unit of channels", "may be given as"),
+        [(si, ", ".join(dict.fromkeys(given))) for si, given in conversions.items()],
+    )
 
 
 # Manoeuvres and courses
@@ -171,7 +214,10 @@ def manoeuvres(plant: str) -> Iterable[str]:
     for name, made in sorted(known.items()):
         described = _sections(made)
         rows.append((f"**`{name}`**", "", described[""]))
-        rows += [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
+        rows += [
+            (f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, ""))
+            for field in fields(made)
+        ]
     yield _table(("manoeuvre, parameters", "default", "meaning"), rows)
 
 
@@ -182,7 +228,12 @@ def courses() -> Iterable[str]:
 
     known = [(name, course_by_name(name)) for name in tracks.LAYOUTS]
     rows = [
-        (f"`{name}`", f"{c.length:.0f}", f"{1.0 / abs(c.curvature).max():.0f}", f"{math.degrees(abs(c.bank).max()):.1f}")
+        (
+            f"`{name}`",
+            f"{c.length:.0f}",
+            f"{1.0 / abs(c.curvature).max():.0f}",
+            f"{math.degrees(abs(c.bank).max()):.1f}",
+        )
         for name, c in known
     ]
     yield _table(("course", "length [m]", "smallest radius [m]", "bank up to [deg]"), rows, right=3)
@@ -193,7 +244,11 @@ def _as_yaml(value: Any) -> str:
         return f"[{', '.join(_as_yaml(entry) for entry in value)}]"
     if isinstance(value, float):
         return f"{value:.6g}"
-    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if value is None or isinstance(value, bool) else str(value)
+    return (
+        {None: "null", True: "true", False: "false"}.get(value, str(value))
+        if value is None or isinstance(value, bool)
+        else str(value)
+    )
 
 
 def _sections(described: type) -> dict[str, str]:
@@ -205,7 +260,9 @@ def _sections(described: type) -> dict[str, str]:
             names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
             if names:
                 sections |= dict.fromkeys(names.split(", "), meaning)
-    for name, meaning in re.findall(r"^    (\w+): .*?  # (.+)$", inspect.getsource(described), re.MULTILINE):
+    for name, meaning in re.findall(
+        r"^    (\w+): .*?  # (.+)$", inspect.getsource(described), re.MULTILINE
+    ):
         sections.setdefault(name, f"{meaning.removesuffix('.')}.".replace("``", "`"))
     return sections
 
@@ -220,9 +277,18 @@ def settings(*estimators: str) -> Iterable[str]:
     listed: set[tuple[str, ...]] = set()
     for name in estimators:
         rows = list(_declared(estimator_class(name).settings_type(), ""))
-        same, own = [row[0] for row in rows if row in listed], [row for row in rows if row not in listed]
+        same, own = (
+            [row[0] for row in rows if row in listed],
+            [row for row in rows if row not in listed],
+        )
         if len(estimators) > 1:
-            yield f"`{name}`" + (f", besides {', '.join(same)} as above:" if same and own else ":" if own else ": as above.")
+            yield f"`{name}`" + (
+                f", besides {', '.join(same)} as above:"
+                if same and own
+                else ":"
+                if own
+                else ": as above."
+            )
         if own:
             yield _table(("`estimator.`", "default", "unit", "meaning"), own)
         listed.update(own)
@@ -236,7 +302,13 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
         if isinstance(value, Group):
             yield from _declared(value, f"{above}{field.name}.")
         elif declared is not None:
-            default = "fitted" if declared.is_fitted else "[…]" if is_dataclass(value) else f"`{_as_yaml(value)}`"
+            default = (
+                "fitted"
+                if declared.is_fitted
+                else "[…]"
+                if is_dataclass(value)
+                else f"`{_as_yaml(value)}`"
+            )
             yield f"`{above}{field.name}`", default, declared.unit, declared.doc
 
 
@@ -244,13 +316,20 @@ def figures(shown: str, *estimators: str) -> Iterable[str]:
     """What published studies say of families, and a figure, named as STUDY/FIGURE, with its caption."""
     yield from _on_the_same_drive(estimators)
     for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
-        rows = [tuple(_rounded(row[key]) for key in columns) for row in _rows(RESULTS / study / "tables" / "overview.csv")]
+        rows = [
+            tuple(_rounded(row[key]) for key in columns)
+            for row in _rows(RESULTS / study / "tables" / "overview.csv")
+        ]
         if rows:
             yield f"{caption} ([{study}](../../results/{study}/report.md)):"
             yield _table(tuple(columns.values()), rows)
     study, _, figure = shown.partition("/")
     report = RESULTS / study / "report.md"
-    found = re.search(rf"!\[([^\]]*)\]\(figures/{figure}\.png\)", report.read_text(encoding="utf-8")) if report.is_file() else None
+    found = (
+        re.search(rf"!\[([^\]]*)\]\(figures/{figure}\.png\)", report.read_text(encoding="utf-8"))
+        if report.is_file()
+        else None
+    )
     if found:
         yield f"![{found[1]}](../../results/{study}/figures/{figure}.png)"
         yield f"{found[1]} From [results/{study}](../../results/{study}/report.md)."
@@ -289,7 +368,15 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         )
         for row in _rows(RESULTS / source)
     ]
-    columns = ("parameters", "RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0", "beats static map", "FVU")
+    columns = (
+        "parameters",
+        "RMSE(β) [deg]",
+        "95 % interval [deg]",
+        "to the lowest [deg]",
+        "beats v = 0",
+        "beats static map",
+        "FVU",
+    )
     if lines:
         yield _table(("estimator", *columns), lines, right=len(columns))
 

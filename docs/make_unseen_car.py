@@ -70,10 +70,24 @@ class Car(NamedTuple):
 
 
 HELD_BACK = "telemetry_train_1"  # the Ferrari's unlabelled drive that is the labelled one
-ROBUSTNESS = ("dataset=roboracer", "dataset.files=robustness/*.csv", "~dataset.drop_rows", "~dataset.pose", "~dataset.reference_point")
+ROBUSTNESS = (
+    "dataset=roboracer",
+    "dataset.files=robustness/*.csv",
+    "~dataset.drop_rows",
+    "~dataset.pose",
+    "~dataset.reference_point",
+)
 FIRST = tuple(f"dataset.drives.{at}.count=1" for at in range(5))
 CARS = (
-    Car("Ferrari 250 LM", "real", True, 2.4, 1.07, "ferrari_250lm", unlabelled=("dataset=ferrari_250lm_unlabelled",)),
+    Car(
+        "Ferrari 250 LM",
+        "real",
+        True,
+        2.4,
+        1.07,
+        "ferrari_250lm",
+        unlabelled=("dataset=ferrari_250lm_unlabelled",),
+    ),
     Car("Volvo S90", "real", True, 2.941, 1.291, "s90"),
     Car("Audi TTS, no ax", "real", True, 2.468, 1.45, "stanford_tts"),
     Car("DevBot, by TUM", "simulated", True, 3.0, None, "tum"),
@@ -83,12 +97,29 @@ CARS = (
     Car("BMW 545i", "simulated", False, 2.88, 1.41, "sim_bmw_unseen", "unseen_*"),
     Car("F1TENTH, 1:8", "real", False, 0.33, 0.115, "f1tenth", slowest=1.0),
     Car("DART, 1:10", "real", False, 0.175, 0.094, "dart", slowest=0.5),
-    Car("RoboRacer, 1:10", "real", False, 0.33, None, "roboracer", slowest=0.5, unlabelled=ROBUSTNESS),
+    Car(
+        "RoboRacer, 1:10",
+        "real",
+        False,
+        0.33,
+        None,
+        "roboracer",
+        slowest=0.5,
+        unlabelled=ROBUSTNESS,
+    ),
     Car("AutoRally, 1:5, smoothed signals", "real", False, 0.57, None, "autorally", slowest=1.0),
 )
 SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
 LARGEST_RATIO = 1.1
-METHODS = ("v = 0", "data sheet", "shipped", "self-calibrating", "carried over", "smoothed, offline", "map with reference")
+METHODS = (
+    "v = 0",
+    "data sheet",
+    "shipped",
+    "self-calibrating",
+    "carried over",
+    "smoothed, offline",
+    "map with reference",
+)
 WORSE = ("drives", "worse than v = 0", "than 1.1 times shipped")
 HEADS = ("car", "choices", *METHODS, "over shipped", "FVU, median (worst)", "band holds", *WORSE)
 PAGE = """# A car that nobody has trained on
@@ -144,18 +175,41 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
     """Its recordings at the filter's rate, with the reference."""
     if car.dataset == "stanford_tts":
         for file in sorted((Path(root) / "stanford_tts").glob("*.mat")):
-            held = {name: np.ravel(values).astype(float) for name, values in scipy.io.loadmat(file).items() if not name.startswith("_")}
+            held = {
+                name: np.ravel(values).astype(float)
+                for name, values in scipy.io.loadmat(file).items()
+                if not name.startswith("_")
+            }
             speed, yaw_rate = held["Speed_mps"], held["YawRate_radps"]
-            ay = held["LateralAcceleration_mps2"] + 1.43 * np.gradient(yaw_rate, 0.005)  # from behind to the point of the sideslip
-            channels = {"yaw_rate": yaw_rate, "vx": speed, "ay": ay, "vy_ref": speed * np.tan(held["Sideslip_rad"])}
+            ay = held["LateralAcceleration_mps2"] + 1.43 * np.gradient(
+                yaw_rate, 0.005
+            )  # from behind to the point of the sideslip
+            channels = {
+                "yaw_rate": yaw_rate,
+                "vx": speed,
+                "ay": ay,
+                "vy_ref": speed * np.tan(held["Sideslip_rad"]),
+            }
             yield resampled(Recording(file.stem, "audi_tts", 200.0, 0.0, channels), RATE, PLAIN)
         return
     if car.dataset == "autorally":
         for file in sorted((Path(root) / "autorally").glob("mppi_states_controls*.mat")):
-            states, accelerations = scipy.io.loadmat(file)["states"], scipy.io.loadmat(str(file).replace("states_controls", "accels"))["a"]
-            found = {"yaw_rate": states[2], "vx": states[0], "ay": -accelerations[1], "ax": accelerations[0], "vy_ref": states[1]}
+            states, accelerations = (
+                scipy.io.loadmat(file)["states"],
+                scipy.io.loadmat(str(file).replace("states_controls", "accels"))["a"],
+            )
+            found = {
+                "yaw_rate": states[2],
+                "vx": states[0],
+                "ay": -accelerations[1],
+                "ax": accelerations[0],
+                "vy_ref": states[1],
+            }
             # poses, from which the states were made, blow up at both ends
-            channels = {name: np.ascontiguousarray(values[2000:-2000], dtype=float) for name, values in found.items()}
+            channels = {
+                name: np.ascontiguousarray(values[2000:-2000], dtype=float)
+                for name, values in found.items()
+            }
             yield resampled(Recording(file.stem, "autorally", 1000.0, 0.0, channels), RATE, PLAIN)
         return
     for recording in ingested(runner, root, f"dataset={car.dataset}", *car.overrides):
@@ -166,13 +220,19 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
 
 def ingested(runner: Runner, root: str, *overrides: str) -> Iterator[Recording]:
     """Recordings of a data set as they are."""
-    made = runner.ingest(compose_config("ingest", [f"root={root}", f"output={runner.output}", *overrides]))
+    made = runner.ingest(
+        compose_config("ingest", [f"root={root}", f"output={runner.output}", *overrides])
+    )
     return (read_recording(made.folder / name) for name in made.outputs)
 
 
 def unlabelled_of(car: Car, runner: Runner, root: str) -> list[Recording]:
     """Its drives without a reference."""
-    return [one for one in ingested(runner, root, *car.unlabelled) if one.id != HELD_BACK] if car.unlabelled else []
+    return (
+        [one for one in ingested(runner, root, *car.unlabelled) if one.id != HELD_BACK]
+        if car.unlabelled
+        else []
+    )
 
 
 def filter_of(car: Car, rate_hz: float, **changed: Any) -> SelfCalibrating:
@@ -185,18 +245,32 @@ def filter_of(car: Car, rate_hz: float, **changed: Any) -> SelfCalibrating:
 
 def identified_on(car: Car, drives: Sequence[Recording]) -> dict[str, dict[str, Normal]]:
     """What `vehest identify` finds on each drive."""
-    return {drive.id: posterior_of(filter_of(car, min(RATE, drive.rate_hz), measured_ax="ax" in drive), drive) for drive in drives}
+    return {
+        drive.id: posterior_of(
+            filter_of(car, min(RATE, drive.rate_hz), measured_ax="ax" in drive), drive
+        )
+        for drive in drives
+    }
 
 
 def models_of(car: Car, rate_hz: float, has_ax: bool) -> dict[str, Estimator]:
     """The methods that are compared, by title."""
-    sheet = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase, "rate_hz": rate_hz}
+    sheet = {
+        "wheelbase": car.wheelbase,
+        "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase,
+        "rate_hz": rate_hz,
+    }
     variants = ABLATIONS | {"smoothed": {"smoothed": True}}
-    filters = {name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed)) for name, changed in variants.items()}
+    filters = {
+        name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed))
+        for name, changed in variants.items()
+    }
     return {"data sheet": DataSheet.from_config(sheet), **filters}
 
 
-def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mapping[str, Mapping[str, Normal]]) -> Errors:
+def errors_of(
+    car: Car, recording: Recording, shipped: Estimator, others: Mapping[str, Mapping[str, Normal]]
+) -> Errors:
     """Squared errors of every method where the car moves; the map is v = r (b - k u²), fitted to this drive's own reference.
 
     ``others`` are the numbers found on the car's other drives, from which "carried over" starts; NaN without any.
@@ -207,19 +281,31 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mappin
     plain = Recording(recording.id, recording.vehicle, recording.rate_hz, 0.0, inputs)
     moving = (speed > car.slowest) & np.isfinite(truth) & (np.arange(len(speed)) >= WARM_UP)
     columns = np.column_stack([inputs["yaw_rate"], -inputs["yaw_rate"] * speed**2])
-    found = {"v = 0": np.zeros(len(speed)), "map": columns @ np.linalg.lstsq(columns[moving], truth[moving], rcond=None)[0]}
-    found["shipped"] = np.nan_to_num(shipped.estimate([plain])[0]["vy"]) if abs(plain.rate_hz - RATE) < 1e-9 else found["v = 0"] * np.nan
+    found = {
+        "v = 0": np.zeros(len(speed)),
+        "map": columns @ np.linalg.lstsq(columns[moving], truth[moving], rcond=None)[0],
+    }
+    found["shipped"] = (
+        np.nan_to_num(shipped.estimate([plain])[0]["vy"])
+        if abs(plain.rate_hz - RATE) < 1e-9
+        else found["v = 0"] * np.nan
+    )
     variance = np.zeros(len(speed))
     models, found["carried over"] = models_of(car, plain.rate_hz, has_ax), found["v = 0"] * np.nan
     if others:
         with suppress(DataError):  # numbers that are not of a car
-            models["carried over"] = calibrated(models["cold"], record_of(with_settings(models["cold"], {}), others))
+            models["carried over"] = calibrated(
+                models["cold"], record_of(with_settings(models["cold"], {}), others)
+            )
     for name, model in models.items():
         estimate = model.estimate([plain.select(model.channels)])[0]
         found[name] = estimate["vy"]
         if name == "cold" and estimate.covariance is not None:
             variance = estimate.covariance[:, 0, 0]
-    angle = {name: np.degrees(np.arctan2(vy, speed) - np.arctan2(truth, speed))[moving] ** 2 for name, vy in found.items()}
+    angle = {
+        name: np.degrees(np.arctan2(vy, speed) - np.arctan2(truth, speed))[moving] ** 2
+        for name, vy in found.items()
+    }
     within = (np.abs(found["cold"] - truth) < 1.645 * np.sqrt(variance))[moving]
     time = np.arange(len(speed))[moving] / plain.rate_hz
     return Errors(
@@ -236,26 +322,57 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mappin
 def scored(car: Car, runner: Runner, root: str, shipped: Estimator) -> list[Errors]:
     """Of its drives, each also from a record of the others."""
     drives = list(drives_of(car, runner, root))
-    own = identified_on(car, drives) | identified_on(car, unlabelled_of(car, runner, root) if car.development else [])
-    return [errors_of(car, drive, shipped, {name: one for name, one in own.items() if name != drive.id}) for drive in drives]
+    own = identified_on(car, drives) | identified_on(
+        car, unlabelled_of(car, runner, root) if car.development else []
+    )
+    return [
+        errors_of(car, drive, shipped, {name: one for name, one in own.items() if name != drive.id})
+        for drive in drives
+    ]
 
 
 def under_change(car: Car, runner: Runner, root: str) -> list[str]:
     """Lines on drives without a reference: numbers that are found from the priors, the median band and the share that is not valid."""
     _, shipped, trust = open_model(SELF_CALIBRATING, runner.output, print)
-    model, rows = with_settings(shipped, {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle}), []
+    model, rows = (
+        with_settings(
+            shipped, {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle}
+        ),
+        [],
+    )
     labelled = {"its labelled drives": list(drives_of(car, runner, root))}
-    for title, drives in (labelled | {drive.id: [drive] for drive in unlabelled_of(car, runner, root)}).items():
+    for title, drives in (
+        labelled | {drive.id: [drive] for drive in unlabelled_of(car, runner, root)}
+    ).items():
         record = record_of(model, identified_on(car, drives))
         estimates = [estimate_recording(model, drive, trust) for drive in drives]
-        band, health = (np.concatenate([estimate[name] for estimate in estimates]) for name in ("band_sideslip", "health"))
+        band, health = (
+            np.concatenate([estimate[name] for estimate in estimates])
+            for name in ("band_sideslip", "health")
+        )
         found = [getattr(record, name) for name in LIMITS]
-        numbers = [f"{one.value:.3g} ± {one.deviation:.2g}" if one.identified_on else "–" for one in found]
-        rows.append([title, *numbers, fixed(float(np.degrees(np.nanmedian(band))), 2), fixed(float(np.mean(health > 0)), 2)])
+        numbers = [
+            f"{one.value:.3g} ± {one.deviation:.2g}" if one.identified_on else "–" for one in found
+        ]
+        rows.append(
+            [
+                title,
+                *numbers,
+                fixed(float(np.degrees(np.nanmedian(band))), 2),
+                fixed(float(np.mean(health > 0)), 2),
+            ]
+        )
     about = "what `vehest identify` finds from the filter's priors (leakage [1], rear axle [m], compliance [rad s²/m], grip [m/s²])"
     shown = table(["drive", *LIMITS, "band of β, median [deg]", "not valid"], rows)
     heading = f"## {car.title} ({car.origin}) under other masses and tyres"
-    return [heading, "", f"No reference: {about}, – not identified; bands and health.", "", *shown, ""]
+    return [
+        heading,
+        "",
+        f"No reference: {about}, – not identified; bands and health.",
+        "",
+        *shown,
+        "",
+    ]
 
 
 def rmse(drives: Sequence[Errors], name: str) -> float:
@@ -263,11 +380,17 @@ def rmse(drives: Sequence[Errors], name: str) -> float:
     return float(np.sqrt(np.mean(np.concatenate([drive.sideslip[name] for drive in drives]))))
 
 
-def ratio_interval(drives: Sequence[Errors], name: str = "cold", rounds: int = 4000) -> tuple[float, float]:
+def ratio_interval(
+    drives: Sequence[Errors], name: str = "cold", rounds: int = 4000
+) -> tuple[float, float]:
     """95 % interval of RMSE(β) over that of the shipped model, by a bootstrap over blocks of 10 s."""
 
     def sums(title: str) -> FloatArray:
-        parts = [part for d in drives for part in np.array_split(d.sideslip[title], max(1, len(d.time) // BLOCK))]
+        parts = [
+            part
+            for d in drives
+            for part in np.array_split(d.sideslip[title], max(1, len(d.time) // BLOCK))
+        ]
         return np.array([part.sum() for part in parts])
 
     own, shipped = sums(name), sums("shipped")
@@ -283,18 +406,32 @@ def fvu(drive: Errors, name: str) -> float:
 
 def git(*words: str) -> str:
     """What git answers, without the last line break."""
-    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.strip()
 
 
 def open_cars(cars: Sequence[str], note: str) -> None:
     """Append what is scored to openings.csv, with a note; raises SystemExit where the choices are not committed."""
     if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators", "src/vehest/run"):
-        raise SystemExit(f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars")
+        raise SystemExit(
+            f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars"
+        )
     file, commit = TARGET / "openings.csv", git("rev-parse", "HEAD")
     rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
-    changed = git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
-    names = sorted({line[1:].split(":")[0].strip() for line in changed if line[:1] == "+" and line[1:2] == " "})
-    rows.append({"commit": commit, "cars": "; ".join(cars), "chosen_since": " ".join([*names, note]).strip() if rows else "everything"})
+    changed = (
+        git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
+    )
+    names = sorted(
+        {line[1:].split(":")[0].strip() for line in changed if line[:1] == "+" and line[1:2] == " "}
+    )
+    rows.append(
+        {
+            "commit": commit,
+            "cars": "; ".join(cars),
+            "chosen_since": " ".join([*names, note]).strip() if rows else "everything",
+        }
+    )
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.DictWriter(out, list(rows[-1]), lineterminator="\n")
         writer.writeheader()
@@ -303,20 +440,44 @@ def open_cars(cars: Sequence[str], note: str) -> None:
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A Markdown table."""
-    return [f"| {' | '.join(row)} |" for row in (heads, [":--", *["--:"] * (len(heads) - 1)], *rows)]
+    return [
+        f"| {' | '.join(row)} |" for row in (heads, [":--", *["--:"] * (len(heads) - 1)], *rows)
+    ]
 
 
 def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str:
     """The page."""
-    ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
-    limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in ratios if car.title in SHIPS_ON}
+    ratios = {
+        car: ratio_interval(drives)
+        for car, drives in found.items()
+        if np.isfinite(rmse(drives, "shipped"))
+    }
+    limits = {
+        car.title: ratio_interval(found[car], "car not given")[1]
+        for car in ratios
+        if car.title in SHIPS_ON
+    }
     ships = len(limits) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
     rows, drives_below, by_time, ablated = [], [], [], []
     worse: list[tuple[str, float, float, float, float]] = []
     for car, drives in found.items():
         title, shares = f"{car.title} ({car.origin})", [fvu(drive, "cold") for drive in drives]
         drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
-        over, errors = "–", [rmse(drives, name) for name in ("v = 0", "data sheet", "shipped", "cold", "carried over", "smoothed", "map")]
+        over, errors = (
+            "–",
+            [
+                rmse(drives, name)
+                for name in (
+                    "v = 0",
+                    "data sheet",
+                    "shipped",
+                    "cold",
+                    "carried over",
+                    "smoothed",
+                    "map",
+                )
+            ],
+        )
         if car in ratios:
             over = f"{fixed(errors[3] / errors[2], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
         figures = [fixed(error, 2) if np.isfinite(error) else "–" for error in errors]
@@ -331,13 +492,34 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
             if own > 1.1 * shipped:
                 worse.append((f"{title}, {drive.title}", drive.speed, zero, shipped, own))
         counts = [str(len(drives)), str(above[0]), str(above[1]) if car in ratios else "–"]
-        rows.append([*about, f"{fixed(float(np.median(shares)), 3)} ({fixed(max(shares), 2)})", band, *counts])
+        rows.append(
+            [
+                *about,
+                f"{fixed(float(np.median(shares)), 3)} ({fixed(max(shares), 2)})",
+                band,
+                *counts,
+            ]
+        )
         early = ((0.0, 10.0), (10.0, 30.0), (30.0, 60.0), (60.0, 300.0), (300.0, 1e9))
-        parts = [np.concatenate([d.sideslip["cold"][(d.time >= low) & (d.time < high)] for d in drives]) for low, high in early]
-        by_time.append([title, *[fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–" for part in parts]])
+        parts = [
+            np.concatenate([d.sideslip["cold"][(d.time >= low) & (d.time < high)] for d in drives])
+            for low, high in early
+        ]
+        by_time.append(
+            [
+                title,
+                *[
+                    fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–"
+                    for part in parts
+                ],
+            ]
+        )
         ablated.append([title, *[fixed(rmse(drives, name), 2) for name in ABLATIONS]])
     heads = ("drive", "median speed [m/s]", "v = 0", "shipped", "self-calibrating")
-    of_drive = max((drive for drives in found.values() for drive in drives), key=lambda drive: fvu(drive, "cold"))
+    of_drive = max(
+        (drive for drives in found.values() for drive in drives),
+        key=lambda drive: fvu(drive, "cold"),
+    )
     return PAGE.format(
         choices=CHOICES,
         verdict="meets" if ships else "does not meet",
@@ -346,9 +528,19 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
         below=sum(drives_below),
         drives=len(drives_below),
         errors="\n".join(table(HEADS, rows)),
-        by_time="\n".join(table(["car", "0 to 10 s", "10 to 30 s", "30 to 60 s", "60 to 300 s", "later"], by_time)),
+        by_time="\n".join(
+            table(["car", "0 to 10 s", "10 to 30 s", "30 to 60 s", "60 to 300 s", "later"], by_time)
+        ),
         ablated="\n".join(table(["car", *ABLATIONS], ablated)),
-        worse="\n".join(table(heads, [[name, fixed(speed, 1), *(fixed(one, 2) for one in own)] for name, speed, *own in worse])),
+        worse="\n".join(
+            table(
+                heads,
+                [
+                    [name, fixed(speed, 1), *(fixed(one, 2) for one in own)]
+                    for name, speed, *own in worse
+                ],
+            )
+        ),
         behind=len(worse),
         least_zero=fixed(min((row[2] for row in worse), default=0.0), 2),
         most_zero=fixed(max((row[2] for row in worse), default=0.0), 2),
@@ -366,10 +558,21 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root, for ingested drives"
+        "--output",
+        type=Path,
+        default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")),
+        help="output root, for ingested drives",
     )
-    parser.add_argument("--development", action="store_true", help="development cars alone, printed and not published")
-    parser.add_argument("--note", default="", help="what else was chosen since the cars were last opened, and on what")
+    parser.add_argument(
+        "--development",
+        action="store_true",
+        help="development cars alone, printed and not published",
+    )
+    parser.add_argument(
+        "--note",
+        default="",
+        help="what else was chosen since the cars were last opened, and on what",
+    )
     given, root = parser.parse_args(), os.environ.get("VEHEST_DATA", "")
     if not root:
         raise SystemExit("set VEHEST_DATA to the folder of the recordings")
@@ -377,7 +580,10 @@ def main() -> None:
     if not given.development:
         TARGET.mkdir(parents=True, exist_ok=True)
         open_cars([car.title for car in cars if not car.development], given.note)
-    runner, (_, shipped, _) = Runner(given.output, Messages(), StopSignals()), open_model("pretrained", given.output, print)
+    runner, (_, shipped, _) = (
+        Runner(given.output, Messages(), StopSignals()),
+        open_model("pretrained", given.output, print),
+    )
     found: dict[Car, list[Errors]] = {}
     changed: list[str] = []
     for car in cars:
@@ -387,7 +593,14 @@ def main() -> None:
                 changed += under_change(car, runner, root)
         except MissingError as error:
             print(f"left out: {car.title}: {error}")
-    page = report({car: [drive for drive in drives if len(drive.time)] for car, drives in found.items() if drives}, changed)
+    page = report(
+        {
+            car: [drive for drive in drives if len(drive.time)]
+            for car, drives in found.items()
+            if drives
+        },
+        changed,
+    )
     if given.development:
         print(page)
     else:

@@ -7,7 +7,14 @@ from importlib.resources import files
 import pytest
 
 WIDTHS = (1280, 390)
-FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+)
 FLAGS += ("--disable-component-update", "--disable-sync")
 READY_SECONDS = 60.0
 
@@ -15,12 +22,16 @@ READY_SECONDS = 60.0
 @contextmanager
 def browser(profile):
     """A browser with a profile of its own, in an empty folder; the test is skipped where there is none."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install 'vehest[dev]'")
+    webdriver = pytest.importorskip(
+        "selenium.webdriver", reason="selenium is not installed: pip install 'vehest[dev]'"
+    )
     from selenium.webdriver.chrome.service import Service
 
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
-        pytest.skip("no chromium with its chromedriver here: apt-get install chromium chromium-driver")
+        pytest.skip(
+            "no chromium with its chromedriver here: apt-get install chromium chromium-driver"
+        )
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
@@ -39,10 +50,15 @@ def opened(driver, path, *, width=1280, scheme="light"):
 
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
+    driver.execute_cdp_cmd(
+        "Emulation.setEmulatedMedia",
+        {"features": [{"name": "prefers-color-scheme", "value": scheme}]},
+    )
     driver.get_log("browser")
     driver.get(path.as_uri())
-    drawn = "return [...document.querySelectorAll('figure.live')].every(figure => figure.dataset.ready)"
+    drawn = (
+        "return [...document.querySelectorAll('figure.live')].every(figure => figure.dataset.ready)"
+    )
     WebDriverWait(driver, READY_SECONDS, 0.1).until(lambda own: own.execute_script(drawn))
 
 
@@ -53,7 +69,14 @@ def complaints(driver):
 
 def axe_violations(driver, within="html"):
     """What axe finds on the page that is open, or in a part of it, a line each: rule, and the first element."""
-    pytest.importorskip("axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'")
+    pytest.importorskip(
+        "axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'"
+    )
     driver.execute_script((files("axe_core_python") / "axe.min.js").read_text(encoding="utf-8"))
-    found = driver.execute_async_script("const done = arguments[arguments.length - 1]; axe.run(arguments[0]).then(done)", within)
-    return [f"{own['id']}: {own['help']}, {own['nodes'][0]['html'][:200]}" for own in found["violations"]]
+    found = driver.execute_async_script(
+        "const done = arguments[arguments.length - 1]; axe.run(arguments[0]).then(done)", within
+    )
+    return [
+        f"{own['id']}: {own['help']}, {own['nodes'][0]['html'][:200]}"
+        for own in found["violations"]
+    ]

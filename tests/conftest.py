@@ -36,9 +36,18 @@ def _composed_once():
 
     def kept(command, overrides):
         *local, packaged, _ = config.conf_folders()
-        found = {file: file.read_bytes() for folder in local for file in sorted(folder.rglob("*.yaml")) if file.is_file()}
+        found = {
+            file: file.read_bytes()
+            for folder in local
+            for file in sorted(folder.rglob("*.yaml"))
+            if file.is_file()
+        }
         all_count, words = any(b"defaults" in text for text in found.values()), " ".join(overrides)
-        counts = [file for file in found if all_count or file.stem in words or (packaged / file.relative_to("conf")).exists()]
+        counts = [
+            file
+            for file in found
+            if all_count or file.stem in words or (packaged / file.relative_to("conf")).exists()
+        ]
         key = (command, *overrides, *((str(file), found[file]) for file in counts))
         if key not in composed:
             composed[key] = compose(command, overrides=overrides)
@@ -78,14 +87,19 @@ def planar_drive(seconds=60.0, rate_hz=20.0, seed=0, noise=0.0, name="drive"):
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     phases = generator.uniform(0, 2 * np.pi, 6)
     yaw_rate = 0.35 * np.sin(0.5 * time + phases[0]) + 0.15 * np.sin(1.3 * time + phases[1])
-    yaw_rate_dot = 0.35 * 0.5 * np.cos(0.5 * time + phases[0]) + 0.15 * 1.3 * np.cos(1.3 * time + phases[1])
+    yaw_rate_dot = 0.35 * 0.5 * np.cos(0.5 * time + phases[0]) + 0.15 * 1.3 * np.cos(
+        1.3 * time + phases[1]
+    )
     vx = 25.0 + 4.0 * np.sin(0.2 * time + phases[2])
     vx_dot = 0.8 * np.cos(0.2 * time + phases[2])
     vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + phases[3])
     vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + phases[3])
     ay, ax = vy_dot + vx * yaw_rate, vx_dot - vy * yaw_rate
     measured = {"vx": vx, "yaw_rate": yaw_rate, "ay": ay, "ax": ax}
-    noisy = {key: values + noise * generator.standard_normal(len(time)) for key, values in measured.items()}
+    noisy = {
+        key: values + noise * generator.standard_normal(len(time))
+        for key, values in measured.items()
+    }
     references = {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
     return Recording(name, "test car", rate_hz, 0.0, {**noisy, **references}, "simulated")
 

@@ -8,7 +8,11 @@ from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
 
 FRONT, REAR = DugoffAxle(1.2e5, 1.0, 0.005), DugoffAxle(1.7e5, 1.05, 0.004)
-TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", REAR)) for name, value in own._asdict().items()}
+TYRES = {
+    f"{name}_{axle}": value
+    for axle, own in (("front", FRONT), ("rear", REAR))
+    for name, value in own._asdict().items()
+}
 NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 
@@ -31,9 +35,13 @@ def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0)
     phases = generator.uniform(0, 6, 3)
     vx = 24.0 + 6.0 * np.sin(0.4 * time + phases[0])
     ax = 2.4 * np.cos(0.4 * time + phases[0])
-    steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.2 * time) + 0.01 * np.sin(2.9 * time + phases[2])
+    steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.2 * time) + 0.01 * np.sin(
+        2.9 * time + phases[2]
+    )
     if straight:  # the wheel is turned back smoothly before
-        steer *= np.cos(0.5 * np.pi * np.clip(1.0 - (seconds - straight - time) / 4.0, 0.0, 1.0)) ** 2
+        steer *= (
+            np.cos(0.5 * np.pi * np.clip(1.0 - (seconds - straight - time) / 4.0, 0.0, 1.0)) ** 2
+        )
     vy, true_yaw_rate, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
 
     def shown(values, level):

@@ -34,13 +34,17 @@ CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurren
     "sideslip_ffnn": SMALL,
     "ensemble_ukf": {"members": 2, **SMALL, **DUGOFF},
     "cnn_ukf": {**SMALL, **DUGOFF},
-    "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
+    "rational_ekf": {
+        "curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
+    },
 }
 ONCE, GIVEN = PhaseSettings(max_epochs=1), IdentificationSettings(method="data")
 SAMPLED = {
     SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
     EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
-    EndToEndSettings: lambda dtype: EndToEndSettings(ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype),
+    EndToEndSettings: lambda dtype: EndToEndSettings(
+        ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype
+    ),
 }
 _FITTED = {}
 
@@ -60,15 +64,33 @@ def _fit(name, dtype, config):
         estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), NoTraining())
     elif estimator.training_type is SequenceSettings:
         training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
-        estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
+        estimator.fit(
+            FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]),
+            training,
+        )
     elif estimator.training_type is ThroughFilterSettings:
         once = PhaseSettings(learning_rate=5e-3, max_epochs=1)
-        training = ThroughFilterSettings(once, 100, once, once, steps=50, validation_steps=100, validation_drop_steps=20, dtype=dtype)
+        training = ThroughFilterSettings(
+            once,
+            100,
+            once,
+            once,
+            steps=50,
+            validation_steps=100,
+            validation_drop_steps=20,
+            dtype=dtype,
+        )
         estimator.fit(FitData([small_car_drive(2.0)], [small_car_drive(1.5, 1)]), training)
     elif estimator.training_type is NoiseTuningSettings:
-        estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
+        estimator.fit(
+            FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]),
+            NoiseTuningSettings(method="data"),
+        )
     elif estimator.training_type is IdentificationSettings:
-        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), IdentificationSettings(method="data"))
+        estimator.fit(
+            FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]),
+            IdentificationSettings(method="data"),
+        )
     elif estimator.training_type in SAMPLED:
         training = SAMPLED[estimator.training_type](dtype)
         estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0, seed=1)[0]]), training)

@@ -32,4 +32,6 @@ def write_laps():
     for number in (1, 2, 3):
         drive = planar_drive(25.0, 100.0, seed=number, noise=0.02)
         channels = ("vx", "yaw_rate", "ay", "ax", "vy_ref")
-        pd.DataFrame({"time": drive.time, **{name: drive[name] for name in channels}}).to_csv(f"lap{number}.csv", index=False)
+        pd.DataFrame({"time": drive.time, **{name: drive[name] for name in channels}}).to_csv(
+            f"lap{number}.csv", index=False
+        )

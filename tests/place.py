@@ -78,12 +78,21 @@ DATASET = {
 def undrawn(patch):
     """Save figures without their content: laying out those of a small study takes longer than all the rest of it."""
     save = Figure.savefig
-    patch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
+    patch.setattr(
+        Figure,
+        "savefig",
+        lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options),
+    )
 
 
 STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
-SPLIT = {"name": "mine", "dataset": "mine", "train": [{"recording": "one"}], "validation": [{"recording": "two"}]}
+SPLIT = {
+    "name": "mine",
+    "dataset": "mine",
+    "train": [{"recording": "one"}],
+    "validation": [{"recording": "two"}],
+}
 SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
 
 
@@ -107,7 +116,12 @@ def write_steered(folder, names):
         table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
         table.to_csv(folder / "raw" / "steered" / f"{name}.csv", index=False)
     channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
-    own = {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+    own = {
+        "name": "steered",
+        "path": "${root}/steered",
+        "time": {"column": "t", "unit": "s"},
+        "channels": channels,
+    }
     write_yaml(folder / "conf" / "dataset" / "steered.yaml", DATASET | own)
 
 
@@ -160,14 +174,26 @@ class Place:
     def change(self, name, /, **changes):
         """Write a YAML file, or change keys of one that is there; what it holds then."""
         file = self.folder / name
-        content = (yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}) | changes
+        content = (
+            yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        ) | changes
         write_yaml(file, content)
         return content
 
     def once(self, *arguments):
         """Output and errors of a command that must succeed: it runs once, later places like this one get a copy of what it made."""
-        files = [file for file in sorted(self.folder.rglob("*")) if file.is_file() and not file.is_symlink()]
-        key = (*arguments, *((file.relative_to(self.folder), sha256(file.read_bytes()).digest()) for file in files))
+        files = [
+            file
+            for file in sorted(self.folder.rglob("*"))
+            if file.is_file() and not file.is_symlink()
+        ]
+        key = (
+            *arguments,
+            *(
+                (file.relative_to(self.folder), sha256(file.read_bytes()).digest())
+                for file in files
+            ),
+        )
         if key not in _DONE:
             said, kept = self.done(*arguments), Path(_KEPT.name) / str(len(_DONE))
             _DONE[key] = said, shutil.copytree(self.folder, kept)
@@ -180,17 +206,29 @@ class Place:
         before = self.files()
         found, _, err = self(*arguments)
         assert found != 0
-        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped", "once"))]
+        lines = [
+            line for line in err.splitlines() if not line.startswith(("done", "skipped", "once"))
+        ]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
-        assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
+        assert {
+            name
+            for name in self.files() - before
+            if "/ingest/" not in name and "/downsample/" not in name
+        } == set()
         assert not any(ASIDE_PREFIX in name for name in self.files())
         assert code in (None, found), lines[0]
         assert found == 1 or "defect" not in lines[0]
-        assert [words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]] == [], lines[0]
+        assert [
+            words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]
+        ] == [], lines[0]
         return found, lines[0]
 
     def files(self):
         """Every file in the output root but the locks, which stay where they are and are empty."""
         outputs = self.folder / "outputs"
-        return {str(file) for file in outputs.rglob("*") if file.is_file() and outputs / "locks" not in file.parents}
+        return {
+            str(file)
+            for file in outputs.rglob("*")
+            if file.is_file() and outputs / "locks" not in file.parents
+        }

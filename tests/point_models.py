@@ -13,7 +13,9 @@ def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     if upstream is not None:
         given, learnt = [_beside(upstream)], [model.learnt(gradients)]
         u = _beside(np.pad(inputs, ((0, 0), (0, model.kept * points.shape[1]))))
-        model.entries[entry - 2](x, u, model.car, np.empty_like(given[0]), 0, len(points))  # leaves what its adjoint takes
+        model.entries[entry - 2](
+            x, u, model.car, np.empty_like(given[0]), 0, len(points)
+        )  # leaves what its adjoint takes
     model.entries[entry](x, u, model.car, *given, out, *learnt, 0, len(points))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))
 
@@ -22,7 +24,9 @@ def noise_by(function):
     """Noise that a function of states (B, n) and inputs (B, p) says, (B, k, k)."""
 
     def write(states, inputs, _, out, first, end):
-        out[..., first:end] = _beside(function(_apart(states, first, end), _apart(inputs, first, end)))
+        out[..., first:end] = _beside(
+            function(_apart(states, first, end), _apart(inputs, first, end))
+        )
 
     return CompiledNoise(write, ())
 

@@ -21,7 +21,9 @@ _started = []
 
 def start(command, **options):
     """Start a process that leads a session of its own; see `end_all`."""
-    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=die_with_parent, **options)
+    process = subprocess.Popen(
+        list(map(str, command)), start_new_session=True, preexec_fn=die_with_parent, **options
+    )
     _started.append(process)
     return process
 
@@ -37,7 +39,9 @@ def wait_for(event, process=None, said=None):
     """Wait for an event and return what it says; a process that ends before it fails the test with what it ``said``."""
     limit = time.monotonic() + HANGS
     while not (found := event()):
-        assert process is None or process.poll() is None, f"it ended before the event: {(said or process.communicate)()}"
+        assert process is None or process.poll() is None, (
+            f"it ended before the event: {(said or process.communicate)()}"
+        )
         assert time.monotonic() < limit, f"the event did not come: {said() if said else ''}"
         time.sleep(MOMENT)
     return found
@@ -113,7 +117,10 @@ def _read_order(order, answers):
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - as long as the process lives
         with os.fdopen(order, "rb") as told, os.fdopen(answers, "wb") as stream:
             request = json.load(told)
-            _send(stream, *_answer(request | {"memory": request["memory"] + 1024 * status_kb("VmData")}))
+            _send(
+                stream,
+                *_answer(request | {"memory": request["memory"] + 1024 * status_kb("VmData")}),
+            )
     finally:
         os._exit(0)
 
@@ -122,7 +129,11 @@ def _reading_process(command, **options):
     """As `subprocess.Popen`, which it is where memory is limited, since this process has taken more than a new one would."""
     from vehest.data.limits import Limits, current_limits
 
-    return ForkedReader() if current_limits().memory == Limits().memory else subprocess.Popen(command, **options)
+    return (
+        ForkedReader()
+        if current_limits().memory == Limits().memory
+        else subprocess.Popen(command, **options)
+    )
 
 
 READING = SimpleNamespace(Popen=_reading_process, PIPE=subprocess.PIPE, DEVNULL=subprocess.DEVNULL)

@@ -24,12 +24,22 @@ def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20
     for k, (u, angle) in enumerate(zip(speed.tolist(), steer.tolist(), strict=True)):
         turn = yaw_rate / u
         front = rational_axle(
-            angle - sideslip - CAR.cg_to_front_axle * turn, CURVES["c1_front"], stiffness * CURVES["c2_front"], friction
+            angle - sideslip - CAR.cg_to_front_axle * turn,
+            CURVES["c1_front"],
+            stiffness * CURVES["c2_front"],
+            friction,
         ).force
-        rear = rational_axle(CAR.cg_to_rear_axle * turn - sideslip, CURVES["c1_rear"], stiffness * CURVES["c2_rear"], friction).force
+        rear = rational_axle(
+            CAR.cg_to_rear_axle * turn - sideslip,
+            CURVES["c1_rear"],
+            stiffness * CURVES["c2_rear"],
+            friction,
+        ).force
         rows[k] = sideslip, yaw_rate, (front + rear) / CAR.mass
         sideslip += step * (rows[k, 2] / u - yaw_rate)
-        yaw_rate += step * (CAR.cg_to_front_axle * front - CAR.cg_to_rear_axle * rear) / CAR.yaw_inertia
+        yaw_rate += (
+            step * (CAR.cg_to_front_axle * front - CAR.cg_to_rear_axle * rear) / CAR.yaw_inertia
+        )
     rows, speed, steer = rows[::FINER], speed[::FINER], steer[::FINER]
     channels = {
         "vx": speed,
@@ -40,11 +50,19 @@ def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20
         "vy_ref": speed * np.tan(rows[:, 0]),
         "sideslip_ref": rows[:, 0],
     }
-    return Recording(f"rational{seed}", "rational single track", rate_hz, 0.0, channels, "simulated")
+    return Recording(
+        f"rational{seed}", "rational single track", rate_hz, 0.0, channels, "simulated"
+    )
 
 
 def changed(drive, channels):
     """The same drive with other samples of some channels; NaN is not measured."""
     return Recording(
-        drive.id, drive.vehicle, drive.rate_hz, drive.start_time, {**drive.channels, **channels}, drive.kind, frozenset(("ay", "yaw_rate"))
+        drive.id,
+        drive.vehicle,
+        drive.rate_hz,
+        drive.start_time,
+        {**drive.channels, **channels},
+        drive.kind,
+        frozenset(("ay", "yaw_rate")),
     )

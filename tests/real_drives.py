@@ -10,7 +10,9 @@ FERRARI = "20140222_01_01_03_250lm"
 
 @cache
 def source_of(data_root, dataset="ferrari_250lm"):
-    return open_source(compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"])
+    return open_source(
+        compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
+    )
 
 
 @cache

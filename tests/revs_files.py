@@ -15,8 +15,20 @@ from vehest.constants import FloatArray
 
 CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
 PREAMBLE = (
-    *("Event: 2014 Targa 66", "Venue: Palm Beach International Raceway", "Date: 2014-02-22", "Time (UTC): 14:29:02"),
-    *("Driver: Participant 3", "Vehicle: 1965 Ferrari 250 LM Berlinetta GT", "Run: 01", "Outing: 01", "Remark: made for tests, 25 °C", ""),
+    *(
+        "Event: 2014 Targa 66",
+        "Venue: Palm Beach International Raceway",
+        "Date: 2014-02-22",
+        "Time (UTC): 14:29:02",
+    ),
+    *(
+        "Driver: Participant 3",
+        "Vehicle: 1965 Ferrari 250 LM Berlinetta GT",
+        "Run: 01",
+        "Outing: 01",
+        "Remark: made for tests, 25 °C",
+        "",
+    ),
 )
 PARAMETERS = {
     "mass": ("kg", [982.0]),
@@ -28,28 +40,55 @@ PARAMETERS = {
     "roadWheelAngleFR": ("°", [-6.9, 0.0, 6.7]),
 }
 INS = {"vx": "vxCG", "ax": "axCG", "ay": "ayCG", "vy_ref": "vyCG"}
-INS_DEGREES = {"yaw_rate": "yawRate", "roll": "rollAngle", "pitch": "pitchAngle", "roll_rate": "rollRate"}
+INS_DEGREES = {
+    "yaw_rate": "yawRate",
+    "roll": "rollAngle",
+    "pitch": "pitchAngle",
+    "roll_rate": "rollRate",
+}
 INS_DEGREES |= {"pitch_rate": "pitchRate", "sideslip_ref": "sideSlip"}
 
 
 def _columns():
     """The 55 columns in order: name -> (unit, rate of its sensor [Hz])."""
     columns = {"time": ("s", CSV_RATE_HZ)}
-    for name, unit in {"handwheelAngle": "°", "throttle": "%", "brake": "%", "clutch": "%", "engineSpeed": "rpm", "PPS": "-"}.items():
+    for name, unit in {
+        "handwheelAngle": "°",
+        "throttle": "%",
+        "brake": "%",
+        "clutch": "%",
+        "engineSpeed": "rpm",
+        "PPS": "-",
+    }.items():
         columns[name] = (unit, CSV_RATE_HZ)
     for name, unit in {"gpsTime": "s", "latitude": "°", "longitude": "°", "altitude": "m"}.items():
         columns[name] = (unit, GPS_RATE_HZ)
-    ins = dict.fromkeys(("vNorth", "vEast", "vUp", "horizontalSpeed", "vxCG", "vyCG", "vzCG"), "m/s")
-    ins |= dict.fromkeys(("axCG", "ayCG", "azCG"), "m/s²") | dict.fromkeys(("yawAngle", "pitchAngle", "rollAngle"), "°")
-    ins |= dict.fromkeys(("rollRate", "pitchRate", "yawRate"), "°/s") | {"sideSlip": "°", "distance": "m"}
+    ins = dict.fromkeys(
+        ("vNorth", "vEast", "vUp", "horizontalSpeed", "vxCG", "vyCG", "vzCG"), "m/s"
+    )
+    ins |= dict.fromkeys(("axCG", "ayCG", "azCG"), "m/s²") | dict.fromkeys(
+        ("yawAngle", "pitchAngle", "rollAngle"), "°"
+    )
+    ins |= dict.fromkeys(("rollRate", "pitchRate", "yawRate"), "°/s") | {
+        "sideSlip": "°",
+        "distance": "m",
+    }
     for name, unit in ins.items():
         columns[name] = (unit, INS_RATE_HZ)
     for name in ("numSVsTracked", "gpsPosMode", "gpsVelMode", "gpsOrientMode", "HDOP", "PDOP"):
         columns[name] = ("-", GPS_RATE_HZ)
-    for what, unit, axes in (("pos", "m", "north east down"), ("vel", "m/s", "north east down"), ("orient", "°", "heading pitch roll")):
+    for what, unit, axes in (
+        ("pos", "m", "north east down"),
+        ("vel", "m/s", "north east down"),
+        ("orient", "°", "heading pitch roll"),
+    ):
         for axis in axes.split():
             columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ)
-    for what, unit, corners in (("chassisAccel", "g", "FL FR RL RR"), ("deflection", "mm", "FL FR RR"), ("wheelAccel", "g", "FL FR RL RR")):
+    for what, unit, corners in (
+        ("chassisAccel", "g", "FL FR RL RR"),
+        ("deflection", "mm", "FL FR RR"),
+        ("wheelAccel", "g", "FL FR RL RR"),
+    ):
         for corner in corners.split():
             columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ)
     return columns
@@ -79,9 +118,17 @@ def smooth_drive(seconds, start_time=0.0, decimals=None):
     vx, vx_dot = 30.0 + 8.0 * np.sin(0.2 * time), 1.6 * np.cos(0.2 * time)
     vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + 2.0)
     vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + 2.0)
-    truth = {"vx": vx, "yaw_rate": yaw_rate, "ax": vx_dot - vy * yaw_rate, "ay": vy_dot + vx * yaw_rate}
+    truth = {
+        "vx": vx,
+        "yaw_rate": yaw_rate,
+        "ax": vx_dot - vy * yaw_rate,
+        "ay": vy_dot + vx * yaw_rate,
+    }
     truth |= {"roll": 0.03 * np.sin(0.5 * time + 0.4), "pitch": 0.01 * np.cos(0.9 * time)}
-    truth |= {"roll_rate": 0.015 * np.cos(0.5 * time + 0.4), "pitch_rate": -0.009 * np.sin(0.9 * time)}
+    truth |= {
+        "roll_rate": 0.015 * np.cos(0.5 * time + 0.4),
+        "pitch_rate": -0.009 * np.sin(0.9 * time),
+    }
     truth |= {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
     truth["handwheel"] = 1.2 * np.sin(0.5 * time + 0.5) + 0.01 * np.sin(40.0 * time)
     truth["steer"] = truth["handwheel"] / 13.3
@@ -102,7 +149,11 @@ def write_csv(path, drive, *, blank_rows=37):
     arrays = []
     for name, (_, rate) in COLUMNS.items():
         values = _held(drive, name, rate)
-        blank = blank_rows.get(name, 0) if isinstance(blank_rows, Mapping) else (blank_rows if rate < CSV_RATE_HZ else 0)
+        blank = (
+            blank_rows.get(name, 0)
+            if isinstance(blank_rows, Mapping)
+            else (blank_rows if rate < CSV_RATE_HZ else 0)
+        )
         arrays.append(pa.array(values, mask=np.arange(drive.rows()) < blank if blank else None))
     with open(path, "wb") as stream:
         header = [*PREAMBLE, ",".join(COLUMNS), ",".join(unit for unit, _ in COLUMNS.values()), ""]
@@ -125,5 +176,9 @@ def _held(drive, name, rate):
     values = drive.signals.get(name)
     if values is None:
         phase = list(COLUMNS).index(name)
-        values = np.round(10.0 * np.sin(0.37 * np.arange(-(-drive.rows() * rate // CSV_RATE_HZ)) * 10 / rate + phase), 5)
+        values = np.round(
+            10.0
+            * np.sin(0.37 * np.arange(-(-drive.rows() * rate // CSV_RATE_HZ)) * 10 / rate + phase),
+            5,
+        )
     return np.repeat(values, CSV_RATE_HZ // rate)[: drive.rows()]

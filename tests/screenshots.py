@@ -19,7 +19,9 @@ SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"
 def picture(driver, top, width, path):
     """A part of the page that is open, from ``top`` down, in few colours."""
     clip = {"x": 0, "y": top, "width": width, "height": HEIGHTS[width], "scale": LOOKS[width]}
-    shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})["data"]
+    shot = driver.execute_cdp_cmd(
+        "Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip}
+    )["data"]
     with Image.open(io.BytesIO(base64.b64decode(shot))) as image:
         image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
@@ -33,7 +35,12 @@ def main(report, site, out):
                 opened(driver, report.resolve(), width=width, scheme=scheme)
                 for name, selector in {"report": "h1", "traces": "figure.live"}.items():
                     script = f"return document.querySelector('{selector}').getBoundingClientRect().top + scrollY"
-                    picture(driver, driver.execute_script(script), width, out / f"{name}_{width}_{scheme}.png")
+                    picture(
+                        driver,
+                        driver.execute_script(script),
+                        width,
+                        out / f"{name}_{width}_{scheme}.png",
+                    )
                 for name, page in SITE.items():
                     opened(driver, (site / page).resolve(), width=width, scheme=scheme)
                     picture(driver, 0, width, out / f"{name}_{width}_{scheme}.png")

@@ -26,7 +26,9 @@ def linear_drive(seconds=20.0, rate_hz=100.0, seed=0, noise=NOISE):
     channels = {
         "vx": vx,
         "yaw_rate": states[:, 1] + noise["yaw_rate"] * generator.standard_normal(len(time)),
-        "ay": np.einsum("ti,ti->t", model.C, states) + model.D * steer + noise["ay"] * generator.standard_normal(len(time)),
+        "ay": np.einsum("ti,ti->t", model.C, states)
+        + model.D * steer
+        + noise["ay"] * generator.standard_normal(len(time)),
         "steer": steer,
         "ax": np.gradient(vx, 1.0 / rate_hz),
         "vx_ref": vx,
@@ -42,4 +44,12 @@ def with_gaps(drive, gaps):
     channels = {name: samples.copy() for name, samples in drive.channels.items()}
     for name, where in gaps.items():
         channels[name][where] = np.nan
-    return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, drive.kind, frozenset(gaps))
+    return Recording(
+        drive.id,
+        drive.vehicle,
+        drive.rate_hz,
+        drive.start_time,
+        channels,
+        drive.kind,
+        frozenset(gaps),
+    )

@@ -26,14 +26,27 @@ def small_car_drive(seconds=4.0, seed=0, noise=1.0):
         states.append(state)
         accelerations.append(_motion(state, delta, ampere)[1])
         for _ in range(5):
-            state = tuple(x + rate / RATE / 5 for x, rate in zip(state, _motion(state, delta, ampere)[0], strict=True))
+            state = tuple(
+                x + rate / RATE / 5
+                for x, rate in zip(state, _motion(state, delta, ampere)[0], strict=True)
+            )
     vx, vy, turning, rim = np.array(states).T
     ax, ay = np.array(accelerations).T
     true = {"ax": ax, "ay": ay, "yaw_rate": turning, "motor_speed": rim / WHEEL_RADIUS}
-    measured = {name: values + noise * NOISE[name] * generator.standard_normal(len(time)) for name, values in true.items()}
-    channels = {**measured, "vx": measured["motor_speed"] * WHEEL_RADIUS, "steer": steer, "motor_current": current}
+    measured = {
+        name: values + noise * NOISE[name] * generator.standard_normal(len(time))
+        for name, values in true.items()
+    }
+    channels = {
+        **measured,
+        "vx": measured["motor_speed"] * WHEEL_RADIUS,
+        "steer": steer,
+        "motor_current": current,
+    }
     references = {"vx_ref": vx.copy(), "vy_ref": vy.copy(), "yaw_rate_ref": turning.copy()}
-    return Recording(f"small car {seed}", "small car", RATE, 0.0, {**channels, **references}, "simulated")
+    return Recording(
+        f"small car {seed}", "small car", RATE, 0.0, {**channels, **references}, "simulated"
+    )
 
 
 def _motion(state, steer, current):

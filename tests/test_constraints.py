@@ -18,12 +18,22 @@ PINNED = dict(line.split("==") for line in LOCK.read_text(encoding="utf-8").spli
 
 def test_what_pyproject_asks_for_is_pinned_to_one_version_that_it_allows_and_no_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    asked = [Requirement(line) for line in chain(project["dependencies"], *project["optional-dependencies"].values())]
+    asked = [
+        Requirement(line)
+        for line in chain(project["dependencies"], *project["optional-dependencies"].values())
+    ]
     pinned = {name.lower().replace("_", "-"): version for name, version in PINNED.items()}
     others = [own for own in asked if own.name != "vehest"]
     assert len(others) > 40
-    assert not [str(own) for own in others if not own.specifier.contains(pinned[own.name.lower().replace("_", "-")])]
-    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line) for line in LOCK.read_text(encoding="utf-8").split())
+    assert not [
+        str(own)
+        for own in others
+        if not own.specifier.contains(pinned[own.name.lower().replace("_", "-")])
+    ]
+    assert all(
+        re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line)
+        for line in LOCK.read_text(encoding="utf-8").split()
+    )
     assert not [name for name in PINNED if name.startswith(("nvidia", "cuda", "triton"))]
 
 

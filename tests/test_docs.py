@@ -59,38 +59,54 @@ def without_fences(text):
 
 def of_pages(found):
     """Parameters from all pages, each named by its page."""
-    return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
+    return [
+        pytest.param(file, item, id=f"{file.name}: {item}")
+        for file in PAGES
+        for item in found(file)
+    ]
 
 
 def test_generated_pages_are_up_to_date():
     for path, text in make_reference.pages().items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name} is not what the code says; run 'make docs'"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name} is not what the code says; run 'make docs'"
+        )
 
 
 def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     source = tmp_path / "leaderboard.csv"
-    columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
+    columns = (
+        "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
+    )
     rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
     (made,) = make_reference.leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
-    assert made.endswith(f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |")
+    assert made.endswith(
+        f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |"
+    )
 
 
 def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(make_reference, "RESULTS", tmp_path)
-    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page("docs/results.md")
+    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page(
+        "docs/results.md"
+    )
 
 
 def links(file):
     text = without_fences(file.read_text(encoding="utf-8"))
     found = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
-    return [target for target in dict.fromkeys(found) if not target.startswith(("https://", "http://"))]
+    return [
+        target for target in dict.fromkeys(found) if not target.startswith(("https://", "http://"))
+    ]
 
 
 def anchors(file):
     """Anchors of a page's headings, as they are made from their text."""
-    headings = re.findall(r"^#+ (.*)$", without_fences(file.read_text(encoding="utf-8")), re.MULTILINE)
+    headings = re.findall(
+        r"^#+ (.*)$", without_fences(file.read_text(encoding="utf-8")), re.MULTILINE
+    )
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -122,12 +138,19 @@ def workplace(tmp_path, monkeypatch):
 
 def test_example_files_are_valid(workplace):
     shown = {file.relative_to(workplace).as_posix() for file in workplace.rglob("*.yaml")}
-    assert {"conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_study.yaml"} <= shown
+    assert {
+        "conf/dataset/my_car.yaml",
+        "conf/split/my_car.yaml",
+        "pipelines/my_study.yaml",
+    } <= shown
     for file in sorted((workplace / "conf" / "dataset").glob("*.yaml")):
         open_source(compose_config("ingest", [f"dataset={file.stem}"])["dataset"])
     lap = Recording("lap", "car", 20.0, 0.0, {"vx": np.full(400, 20.0)})
     for file in sorted((workplace / "conf" / "split").glob("*.yaml")):
-        split = split_from_config(compose_config("train", [f"split={file.stem}"])["split"], lambda _: {"lap": lambda _: lap})
+        split = split_from_config(
+            compose_config("train", [f"split={file.stem}"])["split"],
+            lambda _: {"lap": lambda _: lap},
+        )
         assert set(split.datasets) <= set(choices("dataset"))
     for file in sorted((workplace / "pipelines").glob("*.yaml")):
         assert jobs_of(read_study(str(file)), [])
@@ -145,7 +168,9 @@ def test_python_examples_run(workplace, drive, monkeypatch, request):
     columns = {"time": drive.time, **{name: drive[name] for name in observer.channels}}
     rows = np.stack(list(columns.values()), axis=1)
     np.savetxt(workplace / "lap.csv", rows, delimiter=",", header=",".join(columns), comments="")
-    blocks = [block for file in PAGES for block in fences(file.read_text(encoding="utf-8"), "python")]
+    blocks = [
+        block for file in PAGES for block in fences(file.read_text(encoding="utf-8"), "python")
+    ]
     assert len(blocks) >= 2
     for block in blocks:
         exec(compile(block, "example", "exec", dont_inherit=True), {"__name__": "example"})
@@ -158,7 +183,12 @@ Given = namedtuple("Given", "command arguments overrides")  # a command line, ta
 def command_lines(file):
     """Every line of a shell block that calls vehest, and every such call in running text."""
     text = file.read_text(encoding="utf-8")
-    lines = [line.strip() for block in fences(text, "sh") for line in block.splitlines() if line.strip().startswith("vehest ")]
+    lines = [
+        line.strip()
+        for block in fences(text, "sh")
+        for line in block.splitlines()
+        if line.strip().startswith("vehest ")
+    ]
     lines += re.findall(r"`(vehest [^`\n]+)`", without_fences(text))
     return list(dict.fromkeys(lines))
 
@@ -178,13 +208,24 @@ def taken_apart(line):
         assert words[0] in command.commands, f"vehest has no command {words[0]}"
         path.append(words[0])
         command, words = command.commands[path[-1]], words[1:]
-    options = {option: parameter for parameter in command.params for option in parameter.opts if parameter.param_type_name == "option"}
-    fixed = [parameter for parameter in command.params if parameter.param_type_name == "argument" and parameter.nargs == 1]
+    options = {
+        option: parameter
+        for parameter in command.params
+        for option in parameter.opts
+        if parameter.param_type_name == "option"
+    }
+    fixed = [
+        parameter
+        for parameter in command.params
+        if parameter.param_type_name == "argument" and parameter.nargs == 1
+    ]
     positional = []
     waiting = iter(words)
     for word in waiting:
         if word.startswith("-") and word != "-":
-            assert word in {*options, "-h", "--help"}, f"vehest {' '.join(path)} has no option {word}"
+            assert word in {*options, "-h", "--help"}, (
+                f"vehest {' '.join(path)} has no option {word}"
+            )
             if word in options and not options[word].is_flag:
                 next(waiting, None)
         else:
@@ -192,11 +233,19 @@ def taken_apart(line):
     if not positional:
         return None
     needed = [parameter for parameter in fixed if parameter.required]
-    assert len(positional) >= len(needed), f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in needed)}"
-    if len(positional) > len(needed) and any("=" in word for word in positional[len(needed) : len(fixed)]):
+    assert len(positional) >= len(needed), (
+        f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in needed)}"
+    )
+    if len(positional) > len(needed) and any(
+        "=" in word for word in positional[len(needed) : len(fixed)]
+    ):
         fixed = needed  # what may be left out is left out
-    takes_overrides = any(parameter.name == "overrides" or parameter.nargs == -1 for parameter in command.params)
-    assert takes_overrides or len(needed) <= len(positional) <= len(fixed), f"vehest {' '.join(path)} takes no overrides"
+    takes_overrides = any(
+        parameter.name == "overrides" or parameter.nargs == -1 for parameter in command.params
+    )
+    assert takes_overrides or len(needed) <= len(positional) <= len(fixed), (
+        f"vehest {' '.join(path)} takes no overrides"
+    )
     return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
 
 
@@ -230,7 +279,9 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
             assert PLACEHOLDER.search(name) or read_study(name).publish
     elif given.command[0] in {"run", "report"}:
         if not PLACEHOLDER.search(" ".join([*given.arguments, *given.overrides])):
-            pipeline = read_study(given.arguments[0])  # what composes without overrides is known from test_config
+            pipeline = read_study(
+                given.arguments[0]
+            )  # what composes without overrides is known from test_config
             assert not given.overrides or jobs_of(pipeline, given.overrides)
     else:
         for root, overrides in overrides_of(given):
@@ -242,42 +293,80 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
 
 
 def test_make_targets_exist():
-    targets = {target for rule in re.findall(r"^([\w -]+):", page("Makefile"), re.MULTILINE) for target in rule.split()}
+    targets = {
+        target
+        for rule in re.findall(r"^([\w -]+):", page("Makefile"), re.MULTILINE)
+        for target in rule.split()
+    }
     named = {
-        target for file in PAGES for target in re.findall(r"(?:`|^)make ([a-z0-9_-]+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+        target
+        for file in PAGES
+        for target in re.findall(
+            r"(?:`|^)make ([a-z0-9_-]+)", file.read_text(encoding="utf-8"), re.MULTILINE
+        )
     }
     assert {"run", "test", "ui"} <= named <= targets
 
 
 def test_command_lines_are_found_and_wrong_ones_would_be_noticed():
     assert len(of_pages(command_lines)) > 60
-    for line in ("vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"):
+    for line in (
+        "vehest trian",
+        "vehest train --fast",
+        "vehest doctor now",
+        "vehest data look",
+        "vehest --quick",
+    ):
         with pytest.raises(AssertionError):
             taken_apart(line)
 
 
 def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers():
-    assert all("PCT/IT2023/050058" in page(name) for name in ("README.md", "docs/estimators/ksnn.md"))
+    assert all(
+        "PCT/IT2023/050058" in page(name) for name in ("README.md", "docs/estimators/ksnn.md")
+    )
     assert "(LICENSE)" in page("README.md")
     citation = yaml.safe_load(page("CITATION.cff"))
     assert (citation["cff-version"], citation["version"]) == ("1.2.0", vehest.__version__)
     papers = citation["references"]
     assert len({paper["title"] for paper in papers}) == 7
     assert all(paper["authors"] and paper["year"] for paper in papers)
-    known = {"10.1109/TITS.2023.3303776", "10.1109/ACCESS.2020.3012770", "10.1109/TVT.2024.3389493", "10.3390/s21165409"}
+    known = {
+        "10.1109/TITS.2023.3303776",
+        "10.1109/ACCESS.2020.3012770",
+        "10.1109/TVT.2024.3389493",
+        "10.3390/s21165409",
+    }
     assert {paper["doi"] for paper in papers if "doi" in paper} == known
 
 
 def test_pages_know_every_name():
     data, evaluation, cli = page("docs/data.md"), page("docs/evaluation.md"), page("docs/cli.md")
     overview = page("docs/estimators.md")
-    families = "".join(page(f"docs/estimators/{name}.md") for name in re.findall(r"\(estimators/(\w+)\.md\)", overview))
+    families = "".join(
+        page(f"docs/estimators/{name}.md")
+        for name in re.findall(r"\(estimators/(\w+)\.md\)", overview)
+    )
     for source in source_names():
         own = page(f"docs/sources/{source}.md")
         assert f"(sources/{source}.md)" in data
         for option in fields(source_class({"source": source}).options_type):
-            assert f"`{option.name}`" in own, f"docs/sources/{source}.md does not explain {option.name}"
-    named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated", "offset", "dropout", "reverse"}
+            assert f"`{option.name}`" in own, (
+                f"docs/sources/{source}.md does not explain {option.name}"
+            )
+    named_checks = {
+        "read",
+        "impossible",
+        "unit",
+        "sign",
+        "kinematics",
+        "nan",
+        "stuck",
+        "saturated",
+        "offset",
+        "dropout",
+        "reverse",
+    }
     for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
         assert f"`{name}`" in data, f"docs/data.md does not explain {name}"
     for name in estimator_names():
@@ -285,16 +374,25 @@ def test_pages_know_every_name():
         assert f"`{name}`" in families, f"no page of docs/estimators explains {name}"
     for name in UNITS:
         assert f"`{name}`" in evaluation, f"docs/evaluation.md does not explain {name}"
-    assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(evaluation.split())
+    assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(
+        evaluation.split()
+    )
     for name in {*(field.name for kind in (PipelineFile, Part) for field in fields(kind)), *GROUPS}:
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 
 def test_page_of_the_python_interface_has_every_public_name_and_that_of_commands_the_exit_codes_of_the_errors():
-    documented = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE))
+    documented = set(
+        re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE)
+    )
     assert documented == set(vehest.__all__) - {"__version__"}
     table = dict(re.findall(r"^\| (\d+) \| ([^|]+) \|", page("docs/cli.md"), re.MULTILINE))
-    stated = {"configuration": ConfigurationError, "unusable data": DataError, "missing": MissingError, "some jobs": JobsFailedError}
+    stated = {
+        "configuration": ConfigurationError,
+        "unusable data": DataError,
+        "missing": MissingError,
+        "some jobs": JobsFailedError,
+    }
     for words, error in stated.items():
         assert words in table[str(error.exit_code)]
 
@@ -305,7 +403,10 @@ def test_stated_filter_is_the_one_that_resamples():
     assert f"is at {Resample.cutoff:g} of the slower Nyquist frequency" in text
     frequencies, response = signal.freqz(Resample(20.0)._taps(1, 5), worN=1 << 14, fs=100.0)
     decibels = 20.0 * np.log10(np.abs(response) + 1e-12)
-    assert "flat within 0.1 dB up to 7.5 Hz, -3 dB at 8.3 Hz, and at least 71 dB down from 10 Hz on" in text
+    assert (
+        "flat within 0.1 dB up to 7.5 Hz, -3 dB at 8.3 Hz, and at least 71 dB down from 10 Hz on"
+        in text
+    )
     assert np.abs(decibels[frequencies <= 7.5]).max() < 0.1
     assert round(float(frequencies[np.argmax(decibels < -3.0)]), 1) == 8.3
     assert decibels[frequencies >= 10.0].max() < -71.0
@@ -315,18 +416,33 @@ def test_stated_limits_of_checks_are_those_of_the_code():
     text = " ".join(page("docs/data.md").split())
     assert f"more than {100 * checks.SATURATED_FRACTION:g} % of the samples" in text
     assert f"exactly the same for {checks.STUCK_SECONDS:g} s or more" in text
-    assert f"lies below -{checks.REVERSE_SPEED:g} m/s for {checks.REVERSE_SECONDS:g} s or more" in text
+    assert (
+        f"lies below -{checks.REVERSE_SPEED:g} m/s for {checks.REVERSE_SECONDS:g} s or more" in text
+    )
     low, high = checks.KINEMATIC_BAND_HZ
     assert f"correlation below {checks.SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
 
 
 def test_stated_parameter_counts_of_recurrent_networks_and_the_ksnn():
     for name in ("gru", "lstm"):
-        counts = [estimator_class(name).from_config({"n_states": states}).n_parameters for states in range(2, 7)]
-        row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators/recurrent.md"), re.MULTILINE)
+        counts = [
+            estimator_class(name).from_config({"n_states": states}).n_parameters
+            for states in range(2, 7)
+        ]
+        row = re.search(
+            rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$",
+            page("docs/estimators/recurrent.md"),
+            re.MULTILINE,
+        )
         assert [int(cell) for cell in row[1].split("|")] == counts
-    rows = re.findall(r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)", page("docs/estimators/ksnn.md"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)",
+        page("docs/estimators/ksnn.md"),
+        re.MULTILINE,
+    )
     assert len(rows) == 4
     for overrides, count in rows:
         (job,) = expand(["estimator=ksnn", *overrides.split()])
-        assert estimator_class("ksnn").from_config(compose_config("train", job)["estimator"]).n_parameters == int(count)
+        assert estimator_class("ksnn").from_config(
+            compose_config("train", job)["estimator"]
+        ).n_parameters == int(count)

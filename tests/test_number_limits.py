@@ -20,11 +20,20 @@ from vehest.trust.record import read_trust
 
 
 def test_settings_and_rates_have_upper_limits():
-    with pytest.raises(ConfigurationError, match=r"training\.learning_rate must be a number of at most 1e\+12, not 1e\+300"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"training\.learning_rate must be a number of at most 1e\+12, not 1e\+300",
+    ):
         SupervisedSettings(learning_rate=1e300)
-    with pytest.raises(ConfigurationError, match=r"estimator\.rate_hz must be at most 100000, not 1000000\.0"):
+    with pytest.raises(
+        ConfigurationError, match=r"estimator\.rate_hz must be at most 100000, not 1000000\.0"
+    ):
         Luenberger.from_config({"rate_hz": 1e6})
-    for rate, reason in ((1e9, "beyond any bus"), (float("inf"), "beyond any bus"), (float("nan"), "too slow")):
+    for rate, reason in (
+        (1e9, "beyond any bus"),
+        (float("inf"), "beyond any bus"),
+        (float("nan"), "too slow"),
+    ):
         with pytest.raises(ConfigurationError, match=reason):
             GuardedStepper(fitted("luenberger"), None, rate)
 
@@ -40,12 +49,18 @@ def test_a_time_that_is_no_number_counts_as_unknown():
 def test_two_rows_a_minute_apart_are_no_drive():
     channels = {"vx": np.full(2, 20.0), "vy_ref": np.zeros(2)}
     recording = Recording("two", "a car", 1.0 / 60.0, 0.0, channels)
-    with pytest.raises(DataError, match=r"'two' is sampled at 0\.0167 Hz; scores need 1 Hz or more"):
-        compare_estimates(recording, {"mine": Luenberger.from_config({})._wrapped(recording, np.zeros(2))})
+    with pytest.raises(
+        DataError, match=r"'two' is sampled at 0\.0167 Hz; scores need 1 Hz or more"
+    ):
+        compare_estimates(
+            recording, {"mine": Luenberger.from_config({})._wrapped(recording, np.zeros(2))}
+        )
 
 
 def test_a_damaged_calibration_names_its_file(tmp_path):
-    text = (Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml").read_text(encoding="utf-8")
+    text = (
+        Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml"
+    ).read_text(encoding="utf-8")
     (tmp_path / "trust.yaml").write_text(text.replace("yaw_rate", "foreign"), encoding="utf-8")
     assert "trust.yaml'" in refusal(lambda: read_trust(tmp_path))
 
@@ -63,5 +78,7 @@ def test_a_spreadsheet_and_a_measurement_are_refused_with_what_to_do(tmp_path):
     for read in (survey, lambda file: read_single({"name": "mine", "source": "tabular"}, file)):
         with pytest.raises(DataError, match=r"lap\.xlsx' is a spreadsheet; save it as CSV"):
             read(tmp_path / "lap.xlsx")
-    with pytest.raises(ConfigurationError, match=r"describe its signals once by 'vehest new NAME drive\.mf4'"):
+    with pytest.raises(
+        ConfigurationError, match=r"describe its signals once by 'vehest new NAME drive\.mf4'"
+    ):
         read_single({"name": "mine", "source": "tabular"}, tmp_path / "drive.mf4")

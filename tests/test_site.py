@@ -10,15 +10,36 @@ from check_site import broken_links
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 
 ROOT = Path(__file__).resolve().parents[1]
-SHOWN = ("docs/index.html", "docs/api.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
+SHOWN = (
+    "docs/index.html",
+    "docs/api.html",
+    "docs/estimators.html",
+    "docs/estimators/ksnn.html",
+    "results/ferrari_drive/report.html",
+)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    pytest.importorskip("furo", reason="the site's tools are not installed: pip install 'vehest[docs]'")
+    pytest.importorskip(
+        "furo", reason="the site's tools are not installed: pip install 'vehest[docs]'"
+    )
     folder = tmp_path_factory.mktemp("site")
-    strict = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-c", str(ROOT / "docs")]
-    done = subprocess.run([*strict, str(ROOT), str(folder)], capture_output=True, text=True, check=False)
+    strict = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        "-c",
+        str(ROOT / "docs"),
+    ]
+    done = subprocess.run(
+        [*strict, str(ROOT), str(folder)], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -34,9 +55,20 @@ def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path):
     folder.mkdir()
     (tmp_path / "outside.html").write_text("", encoding="utf-8")
     (folder / "other.html").write_text('<h1 id="there">x</h1>', encoding="utf-8")
-    links = ("other.html", "other.html#there", "#here", "https://example.org/x", "gone.html", "other.html#gone", "../outside.html", "#gone")
+    links = (
+        "other.html",
+        "other.html#there",
+        "#here",
+        "https://example.org/x",
+        "gone.html",
+        "other.html#gone",
+        "../outside.html",
+        "#gone",
+    )
     text = "".join(f'<a href="{link}">x</a>' for link in links)
-    (folder / "index.html").write_text(f'<p id="here">{text}</p><img src="gone.png">', encoding="utf-8")
+    (folder / "index.html").write_text(
+        f'<p id="here">{text}</p><img src="gone.png">', encoding="utf-8"
+    )
     assert [line.split(": ")[1] for line in broken_links(folder)] == [*links[4:], "gone.png"]
 
 

@@ -28,9 +28,14 @@ def model(state, inputs, p):
     front_slip = inputs[1] - np.arctan((state[0] + front_arm * state[1]) / speed)
     rear_slip = -np.arctan((state[0] - rear_arm * state[1]) / speed)
     front, rear = load * rear_arm, load * front_arm  # the most that each axle can bear
-    front, rear = front * np.tanh(front_stiffness * front_slip / front), rear * np.tanh(rear_stiffness * rear_slip / rear)
+    front, rear = (
+        front * np.tanh(front_stiffness * front_slip / front),
+        rear * np.tanh(rear_stiffness * rear_slip / rear),
+    )
     ay, angular = (front + rear) / mass, (front_arm * front - rear_arm * rear) / inertia
-    return np.array([state[0] + step * (ay - inputs[0] * state[1]), state[1] + step * angular, ay, state[1]])
+    return np.array(
+        [state[0] + step * (ay - inputs[0] * state[1]), state[1] + step * angular, ay, state[1]]
+    )
 
 
 @njit
@@ -70,7 +75,9 @@ class SaturatingEkf(Recursive):
     variance_yaw_rate: float = fitted("variance of a step of the yaw rate", unit="rad²/s²")
     car: SingleTrackParameters = setting(FERRARI_250LM, "the car")
     friction: float = setting(1.0, "friction of its tyres", positive=True)
-    deviations: tuple[float, float] = setting((0.3, 0.01), "of the accelerometer's and the gyro's noise", unit="m/s², rad/s")
+    deviations: tuple[float, float] = setting(
+        (0.3, 0.01), "of the accelerometer's and the gyro's noise", unit="m/s², rad/s"
+    )
 
     @property
     def parameters(self):
@@ -79,12 +86,19 @@ class SaturatingEkf(Recursive):
 
     def first_state(self, sample, given):
         """No sample before, and (v, ω), 0 where a protocol hands over nothing."""
-        return np.empty((0, 4)), np.array([given.get("vy", 0.0), given.get("yaw_rate", 0.0)]), np.diag([1.0, 0.5])
+        return (
+            np.empty((0, 4)),
+            np.array([given.get("vy", 0.0), given.get("yaw_rate", 0.0)]),
+            np.diag([1.0, 0.5]),
+        )
 
     def run(self, samples, state):
         """Filter on from the state at the last sample, whose measurements are part of it already."""
         rows = np.vstack([state[0], samples])
-        means, noises = np.empty((len(rows), 2)), (np.diag(list(self.values.values())), np.diag(np.square(self.deviations)))
+        means, noises = (
+            np.empty((len(rows), 2)),
+            (np.diag(list(self.values.values())), np.diag(np.square(self.deviations))),
+        )
         last = scan(rows, self.parameters, *noises, *state[1:], means)
         vy, yaw_rate = means[-len(samples) :].T
         return {"vy": vy, "yaw_rate": yaw_rate}, (rows[-1:] * [1.0, 1.0, np.nan, np.nan], *last)
@@ -92,5 +106,11 @@ class SaturatingEkf(Recursive):
     def find_numbers(self, data, training, context):
         """Mean squares of what the model leaves unexplained of a step."""
         drives = [(r.stack(("vy_ref", "yaw_rate")), r.stack(("vx", "steer"))) for r in data.train]
-        left = [x[k + 1] - model(x[k], u[k], self.parameters)[:2] for x, u in drives for k in range(len(x) - 1)]
-        return dict(zip(self.values, np.nanmean(np.square(left), axis=0).tolist(), strict=True)), FitRecord()
+        left = [
+            x[k + 1] - model(x[k], u[k], self.parameters)[:2]
+            for x, u in drives
+            for k in range(len(x) - 1)
+        ]
+        return dict(
+            zip(self.values, np.nanmean(np.square(left), axis=0).tolist(), strict=True)
+        ), FitRecord()

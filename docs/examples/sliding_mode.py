@@ -24,14 +24,22 @@ class SlidingMode(Recursive):
     training_type = DirectSearchSettings
     template = "sliding_mode"
     gain: float = fitted("correction gain λ", start=(1.0, 10.0), box=(0.0, 20.0))
-    threshold: float = fitted("yaw rate ω_th of a reset", unit="rad/s", start=(0.0, 0.3), box=(0.0, 0.5), of_largest="yaw_rate")
+    threshold: float = fitted(
+        "yaw rate ω_th of a reset",
+        unit="rad/s",
+        start=(0.0, 0.3),
+        box=(0.0, 0.5),
+        of_largest="yaw_rate",
+    )
     injection: float = setting(5.0, "injection ρ, more than |ω(v - v̂)|", unit="m/s²", positive=True)
     layer: float = setting(0.2, "width φ of the boundary layer", unit="m/s", positive=True)
 
     def check(self):
         """The injection must not cross the boundary layer within a sample."""
         if not self.injection < self.layer * self.rate_hz:
-            raise ConfigurationError(f"estimator.injection must be less than layer * rate_hz, not {self.injection}")
+            raise ConfigurationError(
+                f"estimator.injection must be less than layer * rate_hz, not {self.injection}"
+            )
 
     @compiled
     def step(numbers, state, sample):

@@ -21,7 +21,10 @@ class TransformerNetwork(StandardisedNetwork):
         self.embed = nn.Linear(n_channels, width)
         self.position = nn.Parameter(0.02 * torch.randn(settings.window, width))
         self.encoder = nn.Sequential(
-            *(nn.TransformerEncoderLayer(width, heads, 2 * width, dropout, batch_first=True) for _ in range(settings.layers))
+            *(
+                nn.TransformerEncoderLayer(width, heads, 2 * width, dropout, batch_first=True)
+                for _ in range(settings.layers)
+            )
         )
         self.output = nn.Linear(width, 1)
 

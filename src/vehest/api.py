@@ -44,7 +44,9 @@ from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
 
-_TRUST: WeakKeyDictionary[Estimator, Trust] = WeakKeyDictionary()  # what was learnt with the estimators that were trained or loaded here
+_TRUST: WeakKeyDictionary[Estimator, Trust] = (
+    WeakKeyDictionary()
+)  # what was learnt with the estimators that were trained or loaded here
 
 
 def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:
@@ -67,7 +69,12 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
 
 
 def train(
-    estimator: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str] = (), *, seed: int = 0
+    estimator: str,
+    train: Sequence[Recording],
+    validation: Sequence[Recording],
+    overrides: Sequence[str] = (),
+    *,
+    seed: int = 0,
 ) -> Estimator:
     """Fit an estimator to recordings, which are brought to its rate first.
 
@@ -85,11 +92,19 @@ def train(
     config = compose_config("train", [f"estimator={estimator}", *overrides])
     model, training = new_estimator(config["estimator"]), config["training"]
     if training.get("start_from") is not None:
-        training["start_from"] = str(find_model(str(training["start_from"]), Path(config["output"]), warnings.warn))
+        training["start_from"] = str(
+            find_model(str(training["start_from"]), Path(config["output"]), warnings.warn)
+        )
     settings: Any = settings_from_config(model.training_type, training, "training")
-    model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
+    model.preparation = {
+        "method": config["downsample"]["method"],
+        "transforms": list(config["downsample"]["transforms"] or []),
+    }
     model.seed(seed)
-    parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
+    parts = [
+        [resampled(recording, model.settings.rate_hz, model.preparation) for recording in part]
+        for part in (train, validation)
+    ]
     model.fit(FitData(*parts), settings)
     learnt, stopped = ([Stretch(own, own.start_time, "", own.id) for own in part] for part in parts)
     _TRUST[model] = learn_trust(model, learnt, stopped)
@@ -109,12 +124,21 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     from vehest.run.evaluate import protocol_from_config
 
     evaluation = compose_config("eval")["evaluation"]
-    protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
+    protocol = protocol_from_config(
+        {**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False}
+    )
     parts = []
     for recording in recordings:
         needed = prepared_recording(model, recording.without_references())
         own = require_estimate(model, recording, model.estimate([needed])[0])
-        parts.append(metrics.score(own, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
+        parts.append(
+            metrics.score(
+                own,
+                resampled(recording, protocol.rate_hz, model.preparation),
+                Span("", recording.id),
+                protocol,
+            )
+        )
     return metrics.accuracy(parts)
 
 
@@ -126,12 +150,18 @@ def save_model(model: Estimator, folder: str | Path) -> None:
     """
     with written_aside(Path(folder)) as aside:
         aside.mkdir()
-        _save_model(model, aside, {"n_parameters": model.n_parameters, "downsample": dict(model.preparation)})
+        _save_model(
+            model,
+            aside,
+            {"n_parameters": model.n_parameters, "downsample": dict(model.preparation)},
+        )
         if model in _TRUST:
             write_trust(_TRUST[model], aside)
 
 
-def read_recording(path: str | Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
+def read_recording(
+    path: str | Path, overrides: Sequence[str] = (), *, references: bool = False
+) -> Recording:
     """Read a CSV or Parquet file as a recording.
 
     Args:
@@ -161,7 +191,9 @@ def estimate(model: Estimator, recording: Recording) -> Estimate:
     return estimate_recording(model, recording, _TRUST.get(model))
 
 
-def online(model: Estimator, bus_rate_hz: float | None = None, *, elsewhere: bool = False) -> GuardedStepper:
+def online(
+    model: Estimator, bus_rate_hz: float | None = None, *, elsewhere: bool = False
+) -> GuardedStepper:
     """A model that runs along with a drive: ``online(model).step({"vx": 21.3, …})`` a sample.
 
     Args:

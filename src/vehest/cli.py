@@ -17,7 +17,18 @@ import typer
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.run.config_files import GROUPS, choices, is_file_name, pipeline_names
 from vehest.run.launchers.base import LAUNCHERS, RunOptions
-from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
+from vehest.run.printing import (
+    OutputClosed,
+    TerminalTable,
+    as_json_text,
+    complain,
+    counted,
+    echo,
+    emit,
+    note,
+    open_streams,
+    silence,
+)
 from vehest.version import __version__
 
 if TYPE_CHECKING:
@@ -55,20 +66,39 @@ def _offer(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
 
 
 DATASETS = _offer(lambda: choices("dataset"))
-MODELS = _offer(lambda: ["pretrained", "self_calibrating", *(own.name for own in Path(OUTPUT, "train").glob("[!.]*"))])
+MODELS = _offer(
+    lambda: [
+        "pretrained",
+        "self_calibrating",
+        *(own.name for own in Path(OUTPUT, "train").glob("[!.]*")),
+    ]
+)
 OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
 PIPELINES = _offer(pipeline_names)
 
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing.")]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
 DatasetOrFile = Annotated[
     str,
-    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=DATASETS),
+    typer.Argument(
+        help="A data set, or a file: a table, or with dataset=NAME one of its format.",
+        autocompletion=DATASETS,
+    ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes that run side by side; by default one a core.")]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs", "-j", min=1, help="Processes that run side by side; by default one a core."
+    ),
+]
 LauncherName = Annotated[
     str,
     typer.Option(
@@ -98,16 +128,25 @@ Slurm = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
-Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)]
+Dataset = Annotated[
+    str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)
+]
 
 
 Overrides = Annotated[
-    list[str] | None, typer.Argument(help="key=value …, in Hydra's grammar.", autocompletion=OVERRIDES, show_default=False)
+    list[str] | None,
+    typer.Argument(
+        help="key=value …, in Hydra's grammar.", autocompletion=OVERRIDES, show_default=False
+    ),
 ]
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False) -> None:
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)
+    ] = False,
+) -> None:
     if version:
         echo(f"vehest {__version__}")
         raise typer.Exit
@@ -115,21 +154,50 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command("new")
 def new_car(
-    name: Annotated[str, typer.Argument(help="Name of the data set to be, such as my_car.", show_default=False)],
-    files: Annotated[list[Path], typer.Argument(help="Logs of one car with the same columns, a recording each.", show_default=False)],
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Accept all proposals, ask nothing, and list open questions.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write files anew that are there already.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files that would be written; write nothing.")] = False,
+    name: Annotated[
+        str, typer.Argument(help="Name of the data set to be, such as my_car.", show_default=False)
+    ],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Logs of one car with the same columns, a recording each.", show_default=False
+        ),
+    ],
+    yes: Annotated[
+        bool,
+        typer.Option(
+            "--yes", "-y", help="Accept all proposals, ask nothing, and list open questions."
+        ),
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write files anew that are there already.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the files that would be written; write nothing.")
+    ] = False,
     answer: Annotated[
         list[str] | None,
-        typer.Option("--answer", "-a", help="KEY=ANSWER beforehand, with a KEY that --json lists as open; repeatable."),
+        typer.Option(
+            "--answer",
+            "-a",
+            help="KEY=ANSWER beforehand, with a KEY that --json lists as open; repeatable.",
+        ),
     ] = None,
-    wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")] = None,
+    wheelbase: Annotated[
+        float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")
+    ] = None,
     mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
-    steering_ratio: Annotated[float | None, typer.Option("--steering-ratio", help="Steering wheel's angle to the road wheels'.")] = None,
+    steering_ratio: Annotated[
+        float | None,
+        typer.Option("--steering-ratio", help="Steering wheel's angle to the road wheels'."),
+    ] = None,
     own: Annotated[
         list[str] | None,
-        typer.Option("--with", metavar="PACKAGE.MODULE:CLASS", help="Compare also an installed estimator of your own; repeatable."),
+        typer.Option(
+            "--with",
+            metavar="PACKAGE.MODULE:CLASS",
+            help="Compare also an installed estimator of your own; repeatable.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -145,7 +213,11 @@ def new_car(
     examined = inspect(name, files, vehicle, force=force or dry_run)
     emit(False, None, [] if as_json else examined.in_words())
     from vehest.run.own_car.questions import ask
-    from vehest.run.own_car.write import found_in, registered, write  # with torch: a file that is refused is so without it
+    from vehest.run.own_car.write import (
+        found_in,
+        registered,
+        write,
+    )  # with torch: a file that is refused is so without it
 
     try:
         further = [registered(word) for word in own or []]
@@ -162,7 +234,11 @@ def ingest(
     dataset: Dataset,
     overrides: Overrides = None,
     download: Annotated[
-        bool, typer.Option("--download", help="First fetch missing files, and compare checksums; resumes an interrupted download.")
+        bool,
+        typer.Option(
+            "--download",
+            help="First fetch missing files, and compare checksums; resumes an interrupted download.",
+        ),
     ] = False,
     dry_run: DryRun = False,
     force: Force = False,
@@ -175,16 +251,30 @@ def ingest(
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
-    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
+    with open_runner(
+        config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})
+    ) as runner:
         if download:
             download_files(config, runner.messages, dry_run=dry_run)
         made = runner.ingest(config)
-    emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
+    emit(
+        as_json,
+        {
+            "folder": str(made.folder),
+            "recordings": sorted(Path(n).stem for n in made.outputs),
+            "skipped": made.skipped,
+        },
+    )
 
 
 @app.command(rich_help_panel=STAGES)
 def simulate(
-    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=DATASETS)],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a simulated data set in conf/dataset.", autocompletion=DATASETS
+        ),
+    ],
     overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -201,11 +291,15 @@ def simulate(
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
-    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
+    with open_runner(
+        config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})
+    ) as runner:
         artefact = runner.ingest(config)
     outcome = outcome_of(artefact)
     if not as_json:
-        outcome |= {name: counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
+        outcome |= {
+            name: counted(drives) for name, drives in outcome.items() if isinstance(drives, list)
+        }
     emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
 
 
@@ -224,7 +318,9 @@ def downsample(
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
     rate = positive_rate(config["rate_hz"], "rate_hz")
-    with open_runner(config, RunOptions(force, dry_run, quiet), frozenset({"downsample"})) as runner:
+    with open_runner(
+        config, RunOptions(force, dry_run, quiet), frozenset({"downsample"})
+    ) as runner:
         artefact = runner.downsample(runner.ingest(config), rate, config["downsample"])
     emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
 
@@ -270,7 +366,10 @@ def evaluate(
     """
     from vehest.run.study_run import evaluate_one
 
-    emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
+    emit(
+        as_json,
+        evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note),
+    )
 
 
 @app.command()
@@ -293,13 +392,27 @@ def estimate(
     ] = None,
     overrides: Overrides = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.")
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.",
+        ),
     ] = Path("estimate.parquet"),
     car: Annotated[
-        Path | None, typer.Option("--car", help="A car's record by `vehest identify`, which the filter starts from.", show_default=False)
+        Path | None,
+        typer.Option(
+            "--car",
+            help="A car's record by `vehest identify`, which the filter starts from.",
+            show_default=False,
+        ),
     ] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit code 3 and no file where a check finds something in the channels read.")
+        bool,
+        typer.Option(
+            "--strict",
+            help="Exit code 3 and no file where a check finds something in the channels read.",
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -328,7 +441,9 @@ def identify(
             help="Drives of a car; then estimator.wheelbase=2.7 and the like.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")] = Path("my_car.yaml"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")
+    ] = Path("my_car.yaml"),
     as_json: AsJson = False,
 ) -> None:
     """Find a car's numbers on its drives, without a reference: `vehest identify lap*.csv estimator.wheelbase=2.7 -o my_car.yaml`.
@@ -344,7 +459,9 @@ def identify(
 
 @app.command()
 def replay(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames of a bus: .asc, .blf, or .log of candump.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Frames of a bus: .asc, .blf, or .log of candump.")
+    ],
     overrides: Overrides = None,
     model: Annotated[
         str,
@@ -355,10 +472,17 @@ def replay(
             autocompletion=MODELS,
         ),
     ] = "pretrained",
-    dbc: Annotated[Path | None, typer.Option("--dbc", help="What describes the bus; by default the data set's.")] = None,
+    dbc: Annotated[
+        Path | None,
+        typer.Option("--dbc", help="What describes the bus; by default the data set's."),
+    ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=DATASETS),
+        typer.Option(
+            "--dataset",
+            help="A data set of the source can, which maps signals to channels.",
+            autocompletion=DATASETS,
+        ),
     ] = None,
     signals: Annotated[
         str,
@@ -368,20 +492,40 @@ def replay(
             "where it counts the other way than ISO 8855, :UNIT behind it where the DBC says none.",
         ),
     ] = "",
-    speed: Annotated[str, typer.Option("--speed", help="Times real time, or max: as fast as it goes.")] = "1",
+    speed: Annotated[
+        str, typer.Option("--speed", help="Times real time, or max: as fast as it goes.")
+    ] = "1",
     bus_rate: Annotated[
-        float | None, typer.Option("--bus-rate", help="Samples a second [Hz]; by default as many as the fastest message has frames.")
+        float | None,
+        typer.Option(
+            "--bus-rate",
+            help="Samples a second [Hz]; by default as many as the fastest message has frames.",
+        ),
     ] = None,
-    interface: Annotated[str, typer.Option("--interface", help="Of python-can: virtual, socketcan, …")] = "virtual",
-    channel: Annotated[str, typer.Option("--channel", help="Of the interface, for example vcan0.")] = "vehest",
+    interface: Annotated[
+        str, typer.Option("--interface", help="Of python-can: virtual, socketcan, …")
+    ] = "virtual",
+    channel: Annotated[
+        str, typer.Option("--channel", help="Of the interface, for example vcan0.")
+    ] = "vehest",
     identifier: Annotated[
-        str, typer.Option("--id", help="Identifier of the estimates' frames; that of their bands is the next one.")
+        str,
+        typer.Option(
+            "--id", help="Identifier of the estimates' frames; that of their bands is the next one."
+        ),
     ] = "0x6F0",
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Where estimates go: .csv, or .asc for their frames, with the DBC that describes them beside it."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="Where estimates go: .csv, or .asc for their frames, with the DBC that describes them beside it.",
+        ),
     ] = None,
-    write_dbc: Annotated[Path | None, typer.Option("--write-dbc", help="Write the DBC of the estimates' frames here.")] = None,
+    write_dbc: Annotated[
+        Path | None,
+        typer.Option("--write-dbc", help="Write the DBC of the estimates' frames here."),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -390,7 +534,11 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; written files stay.
     """
-    options: dict[str, Any] = {name: value for name, value in locals().items() if name not in ("log", "overrides", "as_json")}
+    options: dict[str, Any] = {
+        name: value
+        for name, value in locals().items()
+        if name not in ("log", "overrides", "as_json")
+    }
     from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
@@ -412,23 +560,47 @@ def export(
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; an earlier export there is replaced.")] = Path("export"),
-    precision: Annotated[str, typer.Option("--precision", help="Of all numbers: double or float.")] = "double",
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="The folder to write; an earlier export there is replaced."
+        ),
+    ] = Path("export"),
+    precision: Annotated[
+        str, typer.Option("--precision", help="Of all numbers: double or float.")
+    ] = "double",
     bus_rate: Annotated[
         float | None,
-        typer.Option("--bus-rate", metavar="HZ", help="Rate at which samples come, if it is above the model's [Hz].", show_default=False),
+        typer.Option(
+            "--bus-rate",
+            metavar="HZ",
+            help="Rate at which samples come, if it is above the model's [Hz].",
+            show_default=False,
+        ),
     ] = None,
     elsewhere: Annotated[
-        bool, typer.Option("--elsewhere", help="For a car or tyres that the model was not calibrated on: bands twice as wide.")
+        bool,
+        typer.Option(
+            "--elsewhere",
+            help="For a car or tyres that the model was not calibrated on: bands twice as wide.",
+        ),
     ] = False,
     vectors: Annotated[
         Path | None,
-        typer.Option("--vectors", metavar="LOG", help="Recording for the test vectors, read as by `vehest estimate`.", show_default=False),
+        typer.Option(
+            "--vectors",
+            metavar="LOG",
+            help="Recording for the test vectors, read as by `vehest estimate`.",
+            show_default=False,
+        ),
     ] = None,
     overrides: Overrides = None,
     onnx: Annotated[
         bool,
-        typer.Option("--onnx", help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file."),
+        typer.Option(
+            "--onnx",
+            help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file.",
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -444,7 +616,11 @@ def export(
     folder, fitted, trust = open_model(model, output, note)
     if onnx and vectors is not None:
         raise ConfigurationError("--vectors are of C, --onnx writes none; leave one out")
-    drive = None if vectors is None else prepared_recording(fitted, read_table(vectors, overrides or []), bus_rate)
+    drive = (
+        None
+        if vectors is None
+        else prepared_recording(fitted, read_table(vectors, overrides or []), bus_rate)
+    )
     if onnx:
         from vehest.export.onnx_model import write_onnx
 
@@ -456,7 +632,13 @@ def export(
 
 @app.command()
 def compare(
-    recording: Annotated[Path, typer.Argument(metavar="FILE", help="A recording with its reference: a table, or with dataset=NAME any.")],
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A recording with its reference: a table, or with dataset=NAME any.",
+        ),
+    ],
     words: Annotated[
         list[str] | None,
         typer.Argument(
@@ -467,7 +649,12 @@ def compare(
     ] = None,
     models: Annotated[
         list[str] | None,
-        typer.Option("--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=MODELS),
+        typer.Option(
+            "--model",
+            "-m",
+            help="A model to run on the recording and compare too; may be repeated.",
+            autocompletion=MODELS,
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -483,7 +670,9 @@ def compare(
 
 @app.command()
 def run(
-    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=PIPELINES)],
+    pipeline: Annotated[
+        str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=PIPELINES)
+    ],
     overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -492,9 +681,13 @@ def run(
     jobs: Jobs = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Stop after this time, report included; unfinished jobs are listed, and the same command goes on with them."),
+        typer.Option(
+            help="Stop after this time, report included; unfinished jobs are listed, and the same command goes on with them."
+        ),
     ] = None,
-    retrain: Annotated[bool, typer.Option("--retrain", help="Train also what is published with weights.")] = False,
+    retrain: Annotated[
+        bool, typer.Option("--retrain", help="Train also what is published with weights.")
+    ] = False,
     launcher: LauncherName = "local",
     address: Address = None,
     slurm: Slurm = None,
@@ -505,7 +698,15 @@ def run(
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
     options = RunOptions(
-        force, dry_run, quiet, jobs, minutes=minutes, retrain=retrain, launcher=launcher, address=address, slurm=slurm or ()
+        force,
+        dry_run,
+        quiet,
+        jobs,
+        minutes=minutes,
+        retrain=retrain,
+        launcher=launcher,
+        address=address,
+        slurm=slurm or (),
     )
     _run_study(pipeline, overrides or [], options, as_json)
 
@@ -543,19 +744,31 @@ def report(
         from vehest.run.published import check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
-        verdicts = check_published([word for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)])
+        verdicts = check_published(
+            [word for word in words if is_file_name(word)],
+            [word for word in words if not is_file_name(word)],
+        )
         emit(as_json, verdicts, map(in_words, verdicts))
         raise typer.Exit(3 if any(verdict["state"] != "up to date" for verdict in verdicts) else 0)
     if pipeline is None:
-        raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
-    _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
+        raise ConfigurationError(
+            f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check"
+        )
+    _run_study(
+        pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True
+    )
 
 
 @app.command(epilog=_offered("split", "estimator", "training", "fault", "tracking"))
 def sweep(
     overrides: Overrides = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Start of the folder's name; by default the estimators and the split.", show_default=False)
+        str | None,
+        typer.Option(
+            "--name",
+            help="Start of the folder's name; by default the estimators and the split.",
+            show_default=False,
+        ),
     ] = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -571,13 +784,21 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    options = RunOptions(force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ())
+    options = RunOptions(
+        force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ()
+    )
     _run_study(name, overrides or [], options, as_json, sweep=True)
 
 
 @app.command("config", rich_help_panel=STAGES)
 def show_config(
-    command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_offer(lambda: COMMANDS))],
+    command: Annotated[
+        str,
+        typer.Argument(
+            help="ingest, downsample, train, eval or estimate.",
+            autocompletion=_offer(lambda: COMMANDS),
+        ),
+    ],
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -586,7 +807,9 @@ def show_config(
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
     from vehest.run.config import GIVEN, as_yaml
 
-    config = {key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN}
+    config = {
+        key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN
+    }
     echo(as_json_text(config) if as_json else as_yaml(config).rstrip(), keep="\n")
 
 
@@ -594,7 +817,9 @@ def show_config(
 def prune(
     overrides: Overrides = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be removed; remove nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List what would be removed; remove nothing.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """List artefacts that no current configuration can reuse, ask, and remove them: `vehest prune output=FOLDER`.
@@ -609,16 +834,39 @@ def prune(
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
     found = unused_artefacts(Path(str(config["output"])))
     total = sum(one["bytes"] for one in found)
-    rows = [[one["path"], f"{one['bytes'] / 1e6:.3f} MB", str(timedelta(seconds=one["seconds"])), one["reason"]] for one in found]
+    rows = [
+        [
+            one["path"],
+            f"{one['bytes'] / 1e6:.3f} MB",
+            str(timedelta(seconds=one["seconds"])),
+            one["reason"],
+        ]
+        for one in found
+    ]
     shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if found else []
-    emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove"])
+    emit(
+        False,
+        None,
+        []
+        if as_json
+        else [
+            *shown,
+            f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove",
+        ],
+    )
     removed: list[str] = []
     if found and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("no terminal for questions; use --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
-            remove_unused([Path(one["path"]) for one in found], lambda path: removed.append(str(path)))
-    emit(as_json, {"found": found, "bytes": total, "removed": removed}, [f"{len(removed)} removed"] if removed else [])
+            remove_unused(
+                [Path(one["path"]) for one in found], lambda path: removed.append(str(path))
+            )
+    emit(
+        as_json,
+        {"found": found, "bytes": total, "removed": removed},
+        [f"{len(removed)} removed"] if removed else [],
+    )
 
 
 @app.command()
@@ -627,7 +875,11 @@ def doctor(as_json: AsJson = False) -> None:
     from vehest.run.doctor import examine
 
     items = list(examine())
-    emit(as_json, [asdict(item) for item in items], [f"{item.level:<7} {item.name}: {item.message}" for item in items])
+    emit(
+        as_json,
+        [asdict(item) for item in items],
+        [f"{item.level:<7} {item.name}: {item.message}" for item in items],
+    )
     if any(item.level == "error" for item in items):
         raise typer.Exit(4)
 
@@ -645,13 +897,21 @@ def data_channels(as_json: AsJson = False) -> None:
     """List the channels that vehest knows, with units and signs."""
     from vehest.data.channels import CHANNELS
 
-    table = TerminalTable("", ("channel", "unit", "meaning"), [[c.name, c.unit, c.meaning] for c in CHANNELS.values()])
-    emit(as_json, {name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}, [table])
+    table = TerminalTable(
+        "", ("channel", "unit", "meaning"), [[c.name, c.unit, c.meaning] for c in CHANNELS.values()]
+    )
+    emit(
+        as_json,
+        {name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()},
+        [table],
+    )
 
 
 @data_app.command("show")
 def data_show(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    source: Annotated[
+        str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)
+    ],
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -690,29 +950,60 @@ def data_usable(
 
 @data_app.command("align")
 def data_align(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    source: Annotated[
+        str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)
+    ],
     overrides: Overrides = None,
     estimate: Annotated[
         str,
         typer.Option(
-            "--estimate", "-e", help="What to estimate, separated by commas: lever_arm, mounting, delay, offsets, steering_ratio."
+            "--estimate",
+            "-e",
+            help="What to estimate, separated by commas: lever_arm, mounting, delay, offsets, steering_ratio.",
         ),
     ] = "",
-    recording: Annotated[str | None, typer.Option("--recording", "-r", help="Which recording of the data set.")] = None,
-    wheelbase: Annotated[float | None, typer.Option("--wheelbase", help="For the steering ratio [m].")] = None,
-    steering_channel: Annotated[
-        str | None, typer.Option("--steering-channel", help="What to find the steering ratio of; by default handwheel, or else steer.")
+    recording: Annotated[
+        str | None, typer.Option("--recording", "-r", help="Which recording of the data set.")
     ] = None,
-    cutoff: Annotated[float, typer.Option("--cutoff", help="Low-pass that both sides go through [Hz].")] = 2.0,
-    max_delay: Annotated[float, typer.Option("--max-delay", help="Largest delay to look for, either way [s].")] = 0.5,
+    wheelbase: Annotated[
+        float | None, typer.Option("--wheelbase", help="For the steering ratio [m].")
+    ] = None,
+    steering_channel: Annotated[
+        str | None,
+        typer.Option(
+            "--steering-channel",
+            help="What to find the steering ratio of; by default handwheel, or else steer.",
+        ),
+    ] = None,
+    cutoff: Annotated[
+        float, typer.Option("--cutoff", help="Low-pass that both sides go through [Hz].")
+    ] = 2.0,
+    max_delay: Annotated[
+        float, typer.Option("--max-delay", help="Largest delay to look for, either way [s].")
+    ] = 0.5,
     tilt: Annotated[
-        float, typer.Option("--tilt", help="Roll and pitch of the body beyond what follows the accelerations [rad]; 0: free of gravity.")
+        float,
+        typer.Option(
+            "--tilt",
+            help="Roll and pitch of the body beyond what follows the accelerations [rad]; 0: free of gravity.",
+        ),
     ] = 0.001,
     max_ay: Annotated[
-        float, typer.Option("--max-ay", help="For the steering ratio: lateral acceleration up to which it is used [m/s²].")
+        float,
+        typer.Option(
+            "--max-ay",
+            help="For the steering ratio: lateral acceleration up to which it is used [m/s²].",
+        ),
     ] = 3.0,
-    min_speed: Annotated[float, typer.Option("--min-speed", help="For the steering ratio: speed from which it is used [m/s].")] = 5.0,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table and transforms.")] = None,
+    min_speed: Annotated[
+        float,
+        typer.Option(
+            "--min-speed", help="For the steering ratio: speed from which it is used [m/s]."
+        ),
+    ] = 5.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for report, table and transforms.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.
@@ -723,18 +1014,24 @@ def data_align(
     from vehest.run.align import align_recording, as_plain, in_words, write_alignment
 
     asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
-    settings = AlignmentSettings(asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed)
+    settings = AlignmentSettings(
+        asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed
+    )
     found = align_recording(source, overrides or [], recording, settings)
     if out is not None:
         write_alignment(found, out)
-    emit(as_json, {**as_plain(found), "out": None if out is None else str(out)}, in_words(found, out))
+    emit(
+        as_json, {**as_plain(found), "out": None if out is None else str(out)}, in_words(found, out)
+    )
 
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
     from vehest.run.signals import DryRunStop, Stopped
 
-    gc.set_threshold(10_000)  # new objects, after which cycles are looked for; at 700, libraries and compilers spend 8 % of a run on it
+    gc.set_threshold(
+        10_000
+    )  # new objects, after which cycles are looked for; at 700, libraries and compilers spend 8 % of a run on it
     open_streams()
     try:
         code = app(prog_name="vehest", standalone_mode=False)
@@ -746,7 +1043,10 @@ def main() -> None:
         silence(sys.stdout)
         sys.exit(141)
     except Stopped as stopped:
-        _fail(f"stopped by {stopped}; finished artefacts are kept, the same command goes on", stopped.exit_code)
+        _fail(
+            f"stopped by {stopped}; finished artefacts are kept, the same command goes on",
+            stopped.exit_code,
+        )
     except (KeyboardInterrupt, typer.Abort):
         _fail("stopped", 130)
     except Exception as error:
@@ -776,8 +1076,13 @@ def _fail_usage(error: Any) -> None:
     if key in GROUPS or key in ROOT_KEYS or "." in key:
         hint = f"keys of the configuration are written without dashes: {key}=…"
     else:
-        hint = f"'{context.command_path if context else 'vehest'} --help' lists commands and options"
-    _fail(f"{words[:1].lower()}{words[1:]}{'' if words.endswith('?') else ';'} {hint}", error.exit_code)
+        hint = (
+            f"'{context.command_path if context else 'vehest'} --help' lists commands and options"
+        )
+    _fail(
+        f"{words[:1].lower()}{words[1:]}{'' if words.endswith('?') else ';'} {hint}",
+        error.exit_code,
+    )
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
@@ -791,7 +1096,13 @@ def _fail(message: str, exit_code: int) -> NoReturn:
 
 
 def _run_study(
-    name: str | None, overrides: list[str], options: RunOptions, as_json: bool, *, sweep: bool = False, only_report: bool = False
+    name: str | None,
+    overrides: list[str],
+    options: RunOptions,
+    as_json: bool,
+    *,
+    sweep: bool = False,
+    only_report: bool = False,
 ) -> None:
     """Run a study or sweep, or repeat its record; prints tables and the report's path; raises `JobsFailedError` where some jobs failed."""
     from vehest.run.run_cache import RunCache
@@ -806,8 +1117,16 @@ def _run_study(
     own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:
         own = {"report": str(page), "published": str(ran.published) if ran.published else None}
-    shown: list[str | TerminalTable] = [*summary.tables, *(summary.note.split("\n") if summary.note else []), f"report: {page}"]
-    emit(as_json, {**own, **json.loads(summary.figures)}, [*shown, *([f"published: {ran.published}"] if ran.published else [])])
+    shown: list[str | TerminalTable] = [
+        *summary.tables,
+        *(summary.note.split("\n") if summary.note else []),
+        f"report: {page}",
+    ]
+    emit(
+        as_json,
+        {**own, **json.loads(summary.figures)},
+        [*shown, *([f"published: {ran.published}"] if ran.published else [])],
+    )
     if ran.failed is not None:
         raise ran.failed
 

@@ -8,7 +8,9 @@ from typing import Any, ClassVar
 
 from vehest.data.errors import ConfigurationError
 
-LARGEST = 1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
+LARGEST = (
+    1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
+)
 
 
 @dataclass(frozen=True)
@@ -22,9 +24,13 @@ class Declaration:
     most: float | None = None  # largest value
     above: float | None = None  # value that it has to exceed
     below: float | None = None  # value that it has to stay under
-    start: tuple[float, ...] = ()  # values that the search for a fitted number starts from; empty where it has a closed form
+    start: tuple[
+        float, ...
+    ] = ()  # values that the search for a fitted number starts from; empty where it has a closed form
     box: tuple[float, float] = (0.0, 0.0)  # range that the search stays within
-    of_largest: str = ""  # channel whose largest absolute value in training multiplies start and box; empty: none
+    of_largest: str = (
+        ""  # channel whose largest absolute value in training multiplies start and box; empty: none
+    )
     is_fitted: bool = False  # whether the fit determines it unless it is given
 
     def problem(self, value: Any) -> str:
@@ -35,7 +41,10 @@ class Declaration:
             return f"must be a number of at most {LARGEST:g}, not {value}"
         if self.positive and not value > 0:
             return f"must be positive, not {value}"
-        low, high = (one if one is not None else other for one, other in ((self.least, self.above), (self.most, self.below)))
+        low, high = (
+            one if one is not None else other
+            for one, other in ((self.least, self.above), (self.most, self.below))
+        )
         fits_low = low is None or (value >= low if self.least is not None else value > low)
         fits_high = high is None or (value <= high if self.most is not None else value < high)
         if fits_low and fits_high:
@@ -44,7 +53,9 @@ class Declaration:
             return f"must lie between {low:g} and {high:g}{self.unit and f' {self.unit}'}, not at {value}"
         if low is not None:
             return f"must be {'at least' if self.least is not None else 'more than'} {low:g}, not {value}"
-        return f"must be {'at most' if self.most is not None else 'less than'} {high:g}, not {value}"
+        return (
+            f"must be {'at most' if self.most is not None else 'less than'} {high:g}, not {value}"
+        )
 
 
 def setting(default: Any, doc: str, **declared: Any) -> Any:

@@ -33,7 +33,11 @@ class Lanes(types.Type):  # type: ignore[misc]
 @register_model(Lanes)
 class _Model(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Lanes) -> None:
-        bits = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.boolean: ir.IntType(1)}
+        bits = {
+            types.float32: ir.FloatType(),
+            types.float64: ir.DoubleType(),
+            types.boolean: ir.IntType(1),
+        }
         super().__init__(manager, kind, ir.VectorType(bits[kind.dtype], kind.count))
 
 
@@ -100,7 +104,11 @@ def _vector(context: Any, builder: Any, value: Any, kind: Any, wanted: Any) -> A
     if isinstance(kind, Lanes):
         return value
     number = context.cast(builder, value, kind, wanted.dtype)
-    first = builder.insert_element(ir.Constant(context.get_value_type(wanted), ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    first = builder.insert_element(
+        ir.Constant(context.get_value_type(wanted), ir.Undefined),
+        number,
+        ir.Constant(ir.IntType(32), 0),
+    )
     mask = ir.Constant(ir.VectorType(ir.IntType(32), wanted.count), [0] * wanted.count)
     return builder.shuffle_vector(first, first, mask)
 
@@ -123,22 +131,60 @@ def _between(function: Any, write: Any, truth: bool = False) -> None:
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = _pair(*sig.args)
-        one, other = (_vector(context, builder, value, own, kind) for value, own in zip(args, sig.args, strict=True))
+        one, other = (
+            _vector(context, builder, value, own, kind)
+            for value, own in zip(args, sig.args, strict=True)
+        )
         return write(builder, one, other, _FUSED if kind and kind.fused else ())
 
     for one, other in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
         lower_builtin(function, one, other)(lower)
 
 
-for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _between(_function, lambda builder, one, other, flags, name=_name: getattr(builder, name)(one, other, flags=flags))
+for _function, _name in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _between(
+        _function,
+        lambda builder, one, other, flags, name=_name: getattr(builder, name)(
+            one, other, flags=flags
+        ),
+    )
 for _function, _name in ((operator.iadd, "fadd"), (operator.isub, "fsub"), (operator.imul, "fmul")):
-    _between(_function, lambda builder, one, other, flags, name=_name: getattr(builder, name)(one, other, flags=flags))
-for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "==")):
-    _between(_function, lambda builder, one, other, flags, sign=_sign: builder.fcmp_ordered(sign, one, other), truth=True)
+    _between(
+        _function,
+        lambda builder, one, other, flags, name=_name: getattr(builder, name)(
+            one, other, flags=flags
+        ),
+    )
+for _function, _sign in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
+    _between(
+        _function,
+        lambda builder, one, other, flags, sign=_sign: builder.fcmp_ordered(sign, one, other),
+        truth=True,
+    )
 # `one` where the two are not ordered, so that a NaN stays
-_between(least, lambda builder, one, other, flags: builder.select(builder.fcmp_ordered(">", one, other), other, one))
-_between(most, lambda builder, one, other, flags: builder.select(builder.fcmp_ordered("<", one, other), other, one))
+_between(
+    least,
+    lambda builder, one, other, flags: builder.select(
+        builder.fcmp_ordered(">", one, other), other, one
+    ),
+)
+_between(
+    most,
+    lambda builder, one, other, flags: builder.select(
+        builder.fcmp_ordered("<", one, other), other, one
+    ),
+)
 
 
 @infer_global(abs)
@@ -152,7 +198,12 @@ class _Own(AbstractTemplate):  # type: ignore[misc]
 def _by_llvm(name: str) -> Any:
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         own = args[0].type
-        return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.{_name_of(sig.args[0])}", (), ir.FunctionType(own, [own])), args)
+        return builder.call(
+            builder.module.declare_intrinsic(
+                f"llvm.{name}.{_name_of(sig.args[0])}", (), ir.FunctionType(own, [own])
+            ),
+            args,
+        )
 
     return lower
 
@@ -168,7 +219,9 @@ def _neg(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 def _pointer(context: Any, builder: Any, kind: Any, place: Any, vector: Lanes) -> Any:
     data = context.make_array(kind)(context, builder, place[0]).data
-    return builder.bitcast(builder.gep(data, [place[1]]), context.get_value_type(vector).as_pointer())
+    return builder.bitcast(
+        builder.gep(data, [place[1]]), context.get_value_type(vector).as_pointer()
+    )
 
 
 def _name_of(vector: Lanes) -> str:
@@ -197,7 +250,9 @@ def _width(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 def _load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     array, vector = sig.args[0], sig.return_type
-    return builder.load(_pointer(context, builder, array, args, vector), align=array.dtype.bitwidth // 8)
+    return builder.load(
+        _pointer(context, builder, array, args, vector), align=array.dtype.bitwidth // 8
+    )
 
 
 _compiled(load, lambda array, at: _of(array)(array, types.intp))(_load)
@@ -208,35 +263,64 @@ _compiled(load_unfused, lambda array, at: _of(array, False)(array, types.intp))(
 def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     array, own = sig.args[0], _of(sig.args[0])
     value = _vector(context, builder, args[2], sig.args[2], own)
-    builder.store(value, _pointer(context, builder, array, args, own), align=array.dtype.bitwidth // 8)
+    builder.store(
+        value, _pointer(context, builder, array, args, own), align=array.dtype.bitwidth // 8
+    )
     return context.get_dummy_value()
 
 
-@_compiled(store_some, lambda array, at, vector, count: types.none(array, types.intp, vector, types.intp))
+@_compiled(
+    store_some, lambda array, at, vector, count: types.none(array, types.intp, vector, types.intp)
+)
 def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     array, _, vector, _ = sig.args
-    place, lane, lanes = _pointer(context, builder, array, args, _of(array)), ir.IntType(64), vector.count
-    splat = builder.insert_element(ir.Constant(ir.VectorType(lane, lanes), ir.Undefined), args[3], ir.Constant(ir.IntType(32), 0))
-    splat = builder.shuffle_vector(splat, splat, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
+    place, lane, lanes = (
+        _pointer(context, builder, array, args, _of(array)),
+        ir.IntType(64),
+        vector.count,
+    )
+    splat = builder.insert_element(
+        ir.Constant(ir.VectorType(lane, lanes), ir.Undefined),
+        args[3],
+        ir.Constant(ir.IntType(32), 0),
+    )
+    splat = builder.shuffle_vector(
+        splat, splat, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+    )
     wanted = builder.icmp_signed("<", ir.Constant(splat.type, list(range(lanes))), splat)
     kinds = [args[2].type, place.type, ir.IntType(32), wanted.type]
     name = f"llvm.masked.store.{_name_of(vector)}.p0"
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
-    builder.call(function, [args[2], place, ir.Constant(ir.IntType(32), array.dtype.bitwidth // 8), wanted])
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(ir.VoidType(), kinds), name
+    )
+    builder.call(
+        function, [args[2], place, ir.Constant(ir.IntType(32), array.dtype.bitwidth // 8), wanted]
+    )
     return context.get_dummy_value()
 
 
-@_compiled(choose, lambda condition, one, other: (kind := _pair(one, other)) and kind(condition, one, other))
+@_compiled(
+    choose,
+    lambda condition, one, other: (kind := _pair(one, other)) and kind(condition, one, other),
+)
 def _choose(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kinds = sig.args[1:]
-    return builder.select(args[0], *(_vector(context, builder, v, own, _pair(*kinds)) for v, own in zip(args[1:], kinds, strict=True)))
+    return builder.select(
+        args[0],
+        *(
+            _vector(context, builder, v, own, _pair(*kinds))
+            for v, own in zip(args[1:], kinds, strict=True)
+        ),
+    )
 
 
 @_compiled(total, lambda vector: vector.dtype(vector))
 def _total(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     number = context.get_value_type(sig.return_type)
     function = ir.FunctionType(number, [number, args[0].type])
-    add = builder.module.declare_intrinsic(f"llvm.vector.reduce.fadd.{_name_of(sig.args[0])}", (), function)
+    add = builder.module.declare_intrinsic(
+        f"llvm.vector.reduce.fadd.{_name_of(sig.args[0])}", (), function
+    )
     return builder.call(add, [ir.Constant(number, -0.0), args[0]], fastmath=("reassoc",))
 
 
@@ -248,12 +332,18 @@ def _each(typing: Any, function: Any, vector: Any) -> Any:
         compute, result = context.get_function(function, own), args[1]
         for lane in range(vector.count):
             at = ir.Constant(ir.IntType(32), lane)
-            result = builder.insert_element(result, compute(builder, [builder.extract_element(args[1], at)]), at)
+            result = builder.insert_element(
+                result, compute(builder, [builder.extract_element(args[1], at)]), at
+            )
         return result
 
     return vector(function, vector), lower
 
 
-overload(least)(lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other))
+overload(least)(
+    lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other)
+)
 overload(most)(lambda one, other: None if _pair(one, other) else lambda one, other: max(one, other))
-overload(each, inline="always")(lambda function, vector: lambda function, vector: _each(function, vector))
+overload(each, inline="always")(
+    lambda function, vector: lambda function, vector: _each(function, vector)
+)

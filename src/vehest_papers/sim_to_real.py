@@ -23,8 +23,25 @@ from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.ranking import BASELINES
 from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, MatplotlibFigure, fixed, line_of, new_figure
+from vehest.report.document import (
+    PATENT_NOTE,
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    Table,
+    as_code,
+)
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    REFERENCE,
+    Line,
+    MatplotlibFigure,
+    fixed,
+    line_of,
+    new_figure,
+)
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.methods import bullets, scoring
 from vehest_papers.kit.reading import metric_values
@@ -35,7 +52,9 @@ RACE_CARS = "race_cars"  # test set of simulated race cars, which make the secon
 OTHER_SIMULATOR = "other_simulator"
 """Test set of a car of another simulation, which makes the third choice; parts that learn on that car have none."""
 
-ADDED = ("level",)  # parts that were added after the real recording had been looked at; the first choice leaves them out
+ADDED = (
+    "level",
+)  # parts that were added after the real recording had been looked at; the first choice leaves them out
 
 SHIPPED = "third"  # the choice whose model comes with vehest
 
@@ -43,7 +62,10 @@ LOGARITHMIC_FROM = 20.0
 WANTED_FVU = 0.10
 GOAL_FVU = 0.06
 
-PUBLISHED = (("KS-NN that learnt on another real car", 0.145), ("KS-NN that learnt on the same real car", 0.06))
+PUBLISHED = (
+    ("KS-NN that learnt on another real car", 0.145),
+    ("KS-NN that learnt on the same real car", 0.06),
+)
 """FVU on a real Ferrari 250 LM in Da Lio et al. 2023, on two recordings of it, one of which is ours."""
 
 REASONS = {
@@ -130,7 +152,11 @@ def choices_of(steps: Sequence[Step]) -> dict[str, Choice]:
     """The first choice, among the steps laid down beforehand; the second and the third, among all that the cars can judge."""
     choices = {}
     for position, name in enumerate(("first", "second", "third")):
-        judged = [step for step in steps if np.isfinite(step.errors[position]) and not (name == "first" and step.part in ADDED)]
+        judged = [
+            step
+            for step in steps
+            if np.isfinite(step.errors[position]) and not (name == "first" and step.part in ADDED)
+        ]
         step = min(judged, key=lambda step: step.errors[position])
         choices[name] = Choice(step, int(np.argmin(step.chosen_by[position])))
     return choices
@@ -143,7 +169,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         DataError: the steps were not validated on the same ranges, or not on simulated cars alone.
     """
     every = steps_of(artefacts)
-    steps, baselines = ([step for step in every if (step.models[0].estimator in BASELINES) is found] for found in (False, True))
+    steps, baselines = (
+        [step for step in every if (step.models[0].estimator in BASELINES) is found]
+        for found in (False, True)
+    )
     choices = choices_of(steps)
     blocks: list[Block] = [
         _headline(steps, choices),
@@ -165,18 +194,44 @@ def steps_of(artefacts: StudyArtefacts) -> list[Step]:
     """All steps in the order of the pipeline, baselines too; raises `DataError` where validation differs, or a step learns on real data."""
     parts = artefacts.parts
     if len({(part.split.validation, part.split.tests[RACE_CARS]) for part in parts.values()}) > 1:
-        raise DataError(f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them")
+        raise DataError(
+            f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them"
+        )
     for name, part in parts.items():
-        simulated = (*part.split.train, *part.split.validation, *part.split.tests[RACE_CARS], *part.split.tests.get(OTHER_SIMULATOR, ()))
+        simulated = (
+            *part.split.train,
+            *part.split.validation,
+            *part.split.tests[RACE_CARS],
+            *part.split.tests.get(OTHER_SIMULATOR, ()),
+        )
         real = {span.dataset for span in simulated if part.kinds[span.dataset] != "simulated"}
         if real:
-            raise DataError(f"study '{artefacts.study}': part '{name}' learns or chooses on '{min(real)}', which is not simulated")
+            raise DataError(
+                f"study '{artefacts.study}': part '{name}' learns or chooses on '{min(real)}', which is not simulated"
+            )
     steps = []
     for name, part in parts.items():
         for key in dict.fromkeys((model.estimator, model.variant) for model in part.models):
-            models = tuple(model for model in part.models if (model.estimator, model.variant) == key)
-            validation, race_cars, other, test = (_values(part, models, on) for on in (VALIDATION, RACE_CARS, OTHER_SIMULATOR, _real(part)))
-            steps.append(Step(name, artefacts.titles[name], part, models, validation, race_cars, other, test, _weights_at_zero(models)))
+            models = tuple(
+                model for model in part.models if (model.estimator, model.variant) == key
+            )
+            validation, race_cars, other, test = (
+                _values(part, models, on)
+                for on in (VALIDATION, RACE_CARS, OTHER_SIMULATOR, _real(part))
+            )
+            steps.append(
+                Step(
+                    name,
+                    artefacts.titles[name],
+                    part,
+                    models,
+                    validation,
+                    race_cars,
+                    other,
+                    test,
+                    _weights_at_zero(models),
+                )
+            )
     return steps
 
 
@@ -189,14 +244,25 @@ def _weights_at_zero(models: Sequence[EvaluatedModel]) -> FloatArray:
     """β₁ of the local model at zero yaw rate (Da Lio et al. 2023, Eq. 7a)."""
     if models[0].estimator != "ksnn":
         return np.full(len(models), np.nan)
-    return np.array([load_model(model.model_folder).weights()["beta"][0, 0] for model in models], dtype=np.float64)
+    return np.array(
+        [load_model(model.model_folder).weights()["beta"][0, 0] for model in models],
+        dtype=np.float64,
+    )
 
 
-def _values(part: PartArtefacts, models: tuple[EvaluatedModel, ...], test_set: str) -> dict[str, FloatArray]:
+def _values(
+    part: PartArtefacts, models: tuple[EvaluatedModel, ...], test_set: str
+) -> dict[str, FloatArray]:
     """Metric -> values, one a seed; NaN where the part has no such test set."""
-    known = metric_values(part) if test_set in (VALIDATION, *part.split.tests) else defaultdict(lambda: math.nan)
+    known = (
+        metric_values(part)
+        if test_set in (VALIDATION, *part.split.tests)
+        else defaultdict(lambda: math.nan)
+    )
     return {
-        metric: np.array([known[own.estimator, own.variant, own.seed, test_set, metric] for own in models])
+        metric: np.array(
+            [known[own.estimator, own.variant, own.seed, test_set, metric] for own in models]
+        )
         for metric in ("fvu", "rmse_vy", "rmse_sideslip")
     }
 
@@ -206,7 +272,10 @@ def _headline(steps: Sequence[Step], choices: Mapping[str, Choice]) -> str:
     best = min(beforehand, key=lambda step: step.fvu)
     within = sum(step.fvu <= WANTED_FVU for step in beforehand)
     shipped = choices[SHIPPED]
-    error = {name: fixed(shipped.step.test[name][shipped.seed], 3) for name in ("fvu", "rmse_vy", "rmse_sideslip")}
+    error = {
+        name: fixed(shipped.step.test[name][shipped.seed], 3)
+        for name in ("fvu", "rmse_vy", "rmse_sideslip")
+    }
     return (
         f"**Learnt on simulated cars, tested on a real one.** Asked for was a median FVU of {WANTED_FVU:.2f} over the seeds on the whole "
         f"recording of a **real** Ferrari 250 LM, which serves neither for training nor for stopping, with the goal of {GOAL_FVU:.2f}.\n\n"
@@ -245,7 +314,9 @@ def _named(choice: Choice) -> str:
 
 def _result(choice: Choice) -> str:
     fvu = choice.step.test["fvu"]
-    rmse_vy, rmse_sideslip = (fixed(float(np.median(choice.step.test[name])), 3) for name in ("rmse_vy", "rmse_sideslip"))
+    rmse_vy, rmse_sideslip = (
+        fixed(float(np.median(choice.step.test[name])), 3) for name in ("rmse_vy", "rmse_sideslip")
+    )
     return (
         f"On the real car it leaves a median over {len(fvu)} seeds of **FVU {fixed(choice.step.fvu, 3)}** unexplained "
         f"({fixed(fvu.min(), 3)} to {fixed(fvu.max(), 3)}), RMSE(v) {rmse_vy} m/s and RMSE(β) {rmse_sideslip}°. {_verdict(choice.step)}"
@@ -255,7 +326,11 @@ def _result(choice: Choice) -> str:
 def _verdict(step: Step) -> str:
     if step.fvu <= GOAL_FVU:
         return "That reaches the goal."
-    return "That is within what was asked for, short of the goal." if step.fvu <= WANTED_FVU else "**That misses what was asked for.**"
+    return (
+        "That is within what was asked for, short of the goal."
+        if step.fvu <= WANTED_FVU
+        else "**That misses what was asked for.**"
+    )
 
 
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
@@ -283,10 +358,15 @@ def _facts(artefacts: StudyArtefacts) -> list[str]:
     for name, part in artefacts.parts.items():
         for fact in part.facts:
             of_parts.setdefault(fact, []).append(f"`{name}`")
-    return [fact if len(names) == len(artefacts.parts) else f"{', '.join(names)}: {fact}" for fact, names in of_parts.items()]
+    return [
+        fact if len(names) == len(artefacts.parts) else f"{', '.join(names)}: {fact}"
+        for fact, names in of_parts.items()
+    ]
 
 
-def _overview(steps: Sequence[Step], choices: Mapping[str, Choice], baselines: Sequence[Step]) -> Table:
+def _overview(
+    steps: Sequence[Step], choices: Mapping[str, Choice], baselines: Sequence[Step]
+) -> Table:
     shipped = choices[SHIPPED]
     rows: list[dict[str, object]] = []
     for step in (*steps, *baselines):
@@ -295,7 +375,9 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice], baselines: S
             "step": step.label,
             "chosen": ", ".join(name for name, choice in choices.items() if choice.step is step),
             "added": step.part in ADDED,
-            "recordings": len({(span.dataset, span.recording) for span in step.artefacts.split.train}),
+            "recordings": len(
+                {(span.dataset, span.recording) for span in step.artefacts.split.train}
+            ),
             "seeds": len(step.models),
             "validation_rmse_vy": step.errors[0],
             "race_cars_rmse_vy": step.errors[1],
@@ -309,10 +391,16 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice], baselines: S
             "rmse_sideslip": float(np.median(step.test["rmse_sideslip"])),
         }
         if step is shipped.step:
-            row |= {f"model_{name}": step.test[name][shipped.seed] for name in ("fvu", "rmse_vy", "rmse_sideslip")}
+            row |= {
+                f"model_{name}": step.test[name][shipped.seed]
+                for name in ("fvu", "rmse_vy", "rmse_sideslip")
+            }
             row |= {"model_seed": shipped.model.seed, "model": shipped.model.model_folder.name}
         rows.append(row)
-    rows += [{"part": "paper", "step": f"paper: {title}", "chosen": "", "fvu_median": fvu} for title, fvu in PUBLISHED]
+    rows += [
+        {"part": "paper", "step": f"paper: {title}", "chosen": "", "fvu_median": fvu}
+        for title, fvu in PUBLISHED
+    ]
     return Table(
         "overview",
         "Steps, their errors on simulated cars, and on the whole recording of the real Ferrari: medians over the seeds, for "
@@ -339,7 +427,11 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice], baselines: S
 
 
 def _reasons(artefacts: StudyArtefacts) -> str:
-    known = [f"- **{artefacts.titles[name]}** (`{name}`): {REASONS[name]}." for name in artefacts.parts if name in REASONS]
+    known = [
+        f"- **{artefacts.titles[name]}** (`{name}`): {REASONS[name]}."
+        for name in artefacts.parts
+        if name in REASONS
+    ]
     return "Why each step is there:\n\n" + "\n".join(known)
 
 
@@ -347,9 +439,14 @@ def _spread(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Figure:
     rows = []
     for step in steps:
         words = [name for name, choice in choices.items() if choice.step is step]
-        seed = next((choice.seed for choice in choices.values() if choice.step is step), int(np.argmin(step.validation["rmse_vy"])))
+        seed = next(
+            (choice.seed for choice in choices.values() if choice.step is step),
+            int(np.argmin(step.validation["rmse_vy"])),
+        )
         line = line_of(step.models[0].estimator, step.models[0].variant)
-        short = f"{step.part}, {step.models[0].title.removeprefix('KS-NN ').replace(' no bias', '')}"
+        short = (
+            f"{step.part}, {step.models[0].title.removeprefix('KS-NN ').replace(' no bias', '')}"
+        )
         label = f"{short} ({', '.join(words)})" if words else short
         rows.append(Spread(label, line, step.test["fvu"], float(step.test["fvu"][seed])))
     return Figure(
@@ -366,8 +463,14 @@ def _why(steps: Sequence[Step]) -> str:
     of = {step.part: step for step in steps if step.models[0].variant == size}
     if not {"wide", "fast", "rough", "more", "level"} <= set(of):
         return ""
-    errors, real = pd.DataFrame([step.errors for step in steps]), pd.Series([step.fvu for step in steps])
-    ranks = [fixed(float(errors[place].rank().corr(real.where(errors[place].notna()).rank())), 2) for place in errors]
+    errors, real = (
+        pd.DataFrame([step.errors for step in steps]),
+        pd.Series([step.fvu for step in steps]),
+    )
+    ranks = [
+        fixed(float(errors[place].rank().corr(real.where(errors[place].notna()).rank())), 2)
+        for place in errors
+    ]
     return (
         "## Why simulated cars choose badly\n\n"
         "Simulated cars do not rank the steps as the real one does: the rank correlation between RMSE(v) on simulated cars and FVU on the "
@@ -386,22 +489,33 @@ def _why(steps: Sequence[Step]) -> str:
 
 
 def _moves(of: Mapping[str, Step], before: str, after: str, choice: int | None = None) -> str:
-    values = [of[name].fvu if choice is None else of[name].errors[choice] for name in (before, after)]
+    values = [
+        of[name].fvu if choice is None else of[name].errors[choice] for name in (before, after)
+    ]
     return f"{'falls' if values[1] < values[0] else 'rises'} from {fixed(values[0], 3)} to {fixed(values[1], 3)}"
 
 
 def _traces(choice: Choice) -> Figure:
     model, artefacts = choice.model, choice.step.artefacts
     (scored,) = artefacts.scored(model, _real(artefacts))
-    reference = figures.Traces("measured", REFERENCE, scored.vy_ref, np.degrees(scored.sideslip_ref))
-    estimate = figures.Traces(model.title, line_of(model.estimator, model.variant), scored.vy, np.degrees(scored.sideslip))
+    reference = figures.Traces(
+        "measured", REFERENCE, scored.vy_ref, np.degrees(scored.sideslip_ref)
+    )
+    estimate = figures.Traces(
+        model.title, line_of(model.estimator, model.variant), scored.vy, np.degrees(scored.sideslip)
+    )
     window = _busiest(scored, 60.0 * artefacts.protocol.rate_hz)
-    shown = [figures.Traces(t.label, t.line, t.vy[window], t.sideslip[window]) for t in (reference, estimate)]
+    shown = [
+        figures.Traces(t.label, t.line, t.vy[window], t.sideslip[window])
+        for t in (reference, estimate)
+    ]
     return Figure(
         "traces",
         f"Lateral velocity and sideslip angle of the real Ferrari: measured (black) and estimated by seed {model.seed}, which learnt on "
         "simulated cars alone; the 60 s with the largest mean square of the measured sideslip.",
-        figures.zoom_figure(scored.time[window], scored.ay[window], shown[0], shown[1:], "time [s]"),
+        figures.zoom_figure(
+            scored.time[window], scored.ay[window], shown[0], shown[1:], "time [s]"
+        ),
     )
 
 
@@ -420,11 +534,41 @@ def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
             values = row.values[np.isfinite(row.values)]
             others = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
             offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(others))
-            axes.scatter(others, position + offsets, s=11, color=row.line.colour, alpha=0.65, linewidths=0, zorder=3)
+            axes.scatter(
+                others,
+                position + offsets,
+                s=11,
+                color=row.line.colour,
+                alpha=0.65,
+                linewidths=0,
+                zorder=3,
+            )
             if len(values) > 1:
-                axes.plot([values.min(), values.max()], [position] * 2, color=row.line.colour, linewidth=0.8, alpha=0.5, zorder=2)
-                axes.plot([np.median(values)] * 2, [position - 0.36, position + 0.36], color=row.line.colour, linewidth=1.6, zorder=2)
-            axes.scatter(row.chosen, position, s=30, marker="D", color=row.line.colour, edgecolors="black", linewidths=0.8, zorder=4)
+                axes.plot(
+                    [values.min(), values.max()],
+                    [position] * 2,
+                    color=row.line.colour,
+                    linewidth=0.8,
+                    alpha=0.5,
+                    zorder=2,
+                )
+                axes.plot(
+                    [np.median(values)] * 2,
+                    [position - 0.36, position + 0.36],
+                    color=row.line.colour,
+                    linewidth=1.6,
+                    zorder=2,
+                )
+            axes.scatter(
+                row.chosen,
+                position,
+                s=30,
+                marker="D",
+                color=row.line.colour,
+                edgecolors="black",
+                linewidths=0.8,
+                zorder=4,
+            )
         axes.set_yticks(range(len(rows)), [row.label for row in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.grid(axis="x")
@@ -450,7 +594,27 @@ def _key_of_spread(axes: Any) -> None:
     grey = "#666666"
     handles = [
         Line2D([], [], linestyle="none", marker="o", color=grey, markersize=3.5, label="a seed"),
-        Line2D([], [], linestyle="none", marker="|", color=grey, markersize=9, markeredgewidth=1.6, label="median"),
-        Line2D([], [], linestyle="none", marker="D", color=grey, markeredgecolor="black", markersize=5, label="seed chosen on validation"),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="|",
+            color=grey,
+            markersize=9,
+            markeredgewidth=1.6,
+            label="median",
+        ),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="D",
+            color=grey,
+            markeredgecolor="black",
+            markersize=5,
+            label="seed chosen on validation",
+        ),
     ]
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+    axes.legend(
+        handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2
+    )

@@ -20,27 +20,40 @@ class Wave:
     def random(cls, generator, size, low, high, number=120, level=0.0, corner=0.5):
         frequencies = generator.uniform(low, high, number)
         amplitudes = size * np.sqrt(2.0 / number) / (1.0 + np.square(frequencies / corner))
-        return cls(amplitudes, 2 * np.pi * frequencies, generator.uniform(0, 2 * np.pi, number), level)
+        return cls(
+            amplitudes, 2 * np.pi * frequencies, generator.uniform(0, 2 * np.pi, number), level
+        )
 
     def __call__(self, time, order=0):
         key = time[0], time[-1], len(time), order
         if key not in self._known:
             angle = np.multiply.outer(time, self.omegas) + self.phases + order * np.pi / 2
-            self._known[key] = np.sin(angle) @ (self.amplitudes * self.omegas**order) + (self.level if order == 0 else 0.0)
+            self._known[key] = np.sin(angle) @ (self.amplitudes * self.omegas**order) + (
+                self.level if order == 0 else 0.0
+            )
         return self._known[key]
 
     def low_passed(self, time_constant):
         """1 / (1 + iωT), in closed form."""
         response = 1.0 / (1.0 + 1j * self.omegas * time_constant)
-        return Wave(self.amplitudes * np.abs(response), self.omegas, self.phases + np.angle(response), self.level)
+        return Wave(
+            self.amplitudes * np.abs(response),
+            self.omegas,
+            self.phases + np.angle(response),
+            self.level,
+        )
 
 
-def broadband_drive(seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0):
+def broadband_drive(
+    seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0
+):
     """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for noise and what is asked for.
 
     Channels are ``late`` by so many seconds; ``lever`` is how far ahead the inertial unit sits [m], ``slow_yaw_rate`` a time constant [s].
     """
-    return _made(seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise)
+    return _made(
+        seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise
+    )
 
 
 @cache
@@ -59,7 +72,9 @@ def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
         "vx": speed,
         "yaw_rate": shown,
         "ax": lambda time: speed(time, 1) - vy(time) * turn(time),
-        "ay": lambda time: -0.9 * turn(time, 1) + slide(time, 1) + speed(time) * turn(time) + lever * turn(time, 1),
+        "ay": lambda time: (
+            -0.9 * turn(time, 1) + slide(time, 1) + speed(time) * turn(time) + lever * turn(time, 1)
+        ),
         "steer": lambda time: 0.1 * turn(time),
         "vx_ref": speed,
         "vy_ref": vy,
@@ -69,7 +84,9 @@ def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
     channels = {}
     for name, quantity in exact.items():
         samples = quantity(clock - dict(late).get(name, 0.0))
-        channels[name] = samples + noise * NOISE.get(name, 0.0) * generator.standard_normal(len(clock))
+        channels[name] = samples + noise * NOISE.get(name, 0.0) * generator.standard_normal(
+            len(clock)
+        )
     return Recording("broadband", "car", rate_hz, 5.0, channels)
 
 

@@ -60,12 +60,30 @@ def motion():
     plant = MultiBodyPlant(vehicle)
     state, states, inputs = plant.initial_state(0.0, 0.0, 0.0, 20.0), [], []
     for time in 0.01 * np.arange(15_000):
-        ay = sum(size * math.sin(2.0 * math.pi * f * time) for size, f in ((3.0, 0.07), (2.5, 0.31), (1.0, 0.83)))
-        steer = (plant.wheelbase / state.vx**2 + 0.002) * ay  # [rad], with understeer as such cars have
-        pace, period = 20.0 + 8.0 * math.sin(2.0 * math.pi * time / 19.0), 8.0 * 2.0 * math.pi / 19.0
+        ay = sum(
+            size * math.sin(2.0 * math.pi * f * time)
+            for size, f in ((3.0, 0.07), (2.5, 0.31), (1.0, 0.83))
+        )
+        steer = (
+            plant.wheelbase / state.vx**2 + 0.002
+        ) * ay  # [rad], with understeer as such cars have
+        pace, period = (
+            20.0 + 8.0 * math.sin(2.0 * math.pi * time / 19.0),
+            8.0 * 2.0 * math.pi / 19.0,
+        )
         acceleration = period * math.cos(2.0 * math.pi * time / 19.0) + 1.5 * (pace - state.vx)
         states.append(state)
-        inputs.append(np.array([np.clip((steer - state.steer) / 0.1, -0.4, 0.4), np.clip(acceleration, -6.0, 3.0), 0.0, 0.0, 0.0]))
+        inputs.append(
+            np.array(
+                [
+                    np.clip((steer - state.steer) / 0.1, -0.4, 0.4),
+                    np.clip(acceleration, -6.0, 3.0),
+                    0.0,
+                    0.0,
+                    0.0,
+                ]
+            )
+        )
         state = plant.advance(state, inputs[-1], 10)
     return plant.motion(states, np.array(inputs), 100.0)
 
@@ -80,19 +98,36 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
     time = np.arange(len(motion)) / 100.0
     force = specific_force(motion, Tilt())[:2] if leaning else np.stack([motion.ax, motion.ay])
     spin = np.stack([np.zeros(len(time)), np.zeros(len(time)), motion.yaw_rate])
-    spin_dot = np.stack([np.zeros(len(time)), np.zeros(len(time)), CubicSpline(time, motion.yaw_rate)(time, 1)])
+    spin_dot = np.stack(
+        [np.zeros(len(time)), np.zeros(len(time)), CubicSpline(time, motion.yaw_rate)(time, 1)]
+    )
     lever = np.broadcast_to(np.array([[p["lever_x"]], [p["lever_y"]], [0.0]]), spin.shape)
-    there = force + (np.cross(spin_dot, lever, axis=0) + np.cross(spin, np.cross(spin, lever, axis=0), axis=0))[:2]
-    axes = np.array([[math.cos(p["yaw"]), -math.sin(p["yaw"])], [math.sin(p["yaw"]), math.cos(p["yaw"])]])  # the sensor's, as columns
+    there = (
+        force
+        + (
+            np.cross(spin_dot, lever, axis=0)
+            + np.cross(spin, np.cross(spin, lever, axis=0), axis=0)
+        )[:2]
+    )
+    axes = np.array(
+        [[math.cos(p["yaw"]), -math.sin(p["yaw"])], [math.sin(p["yaw"]), math.cos(p["yaw"])]]
+    )  # the sensor's, as columns
     shown = [*(axes.T @ there), motion.yaw_rate]
     late = [CubicSpline(time, samples)(np.maximum(time - p["delay"], 0.0)) for samples in shown]
-    ax, ay, yaw_rate = (samples + p[f"offset_{name}"] for samples, name in zip(late, ("ax", "ay", "yaw_rate"), strict=True))
+    ax, ay, yaw_rate = (
+        samples + p[f"offset_{name}"]
+        for samples, name in zip(late, ("ax", "ay", "yaw_rate"), strict=True)
+    )
     level = {"roll": np.zeros(len(time)), "pitch": np.zeros(len(time))}
     imu = measure(replace(motion, ax=ax, ay=ay, yaw_rate=yaw_rate, **level), NOISE, seed=7)
-    channels = measure(motion, NOISE, seed=7) | {name: imu[name] for name in ("ax", "ay", "yaw_rate")}
+    channels = measure(motion, NOISE, seed=7) | {
+        name: imu[name] for name in ("ax", "ay", "yaw_rate")
+    }
     del channels["yaw_rate_ref"]
     if reference_rate:
-        channels["yaw_rate_ref"] = motion.yaw_rate + 0.0005 * np.random.default_rng(11).standard_normal(len(time))
+        channels["yaw_rate_ref"] = motion.yaw_rate + 0.0005 * np.random.default_rng(
+            11
+        ).standard_normal(len(time))
     return Recording("planted", "car", 100.0, 5.0, channels, "simulated")
 
 
@@ -106,7 +141,10 @@ def assert_recovered(found, truth, names):
 
 @pytest.mark.parametrize("reference_rate", [False, True])
 def test_cross_correlation_finds_a_delay_alone(motion, reference_rate):
-    found = align(recorded(motion, {"delay": 0.040}, reference_rate=reference_rate), AlignmentSettings(("delay",)))
+    found = align(
+        recorded(motion, {"delay": 0.040}, reference_rate=reference_rate),
+        AlignmentSettings(("delay",)),
+    )
     assert found.correlation.peak == pytest.approx(0.040, abs=0.010)
 
 
@@ -116,9 +154,13 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, ref
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=reference_rate)
     found = align(recording, AlignmentSettings(IMU))
     assert_recovered(found, PLANTED, tuple(PLANTED))
-    assert any(re.search(r"3\.[567] % of it in ax and 5\.[789] % in ay", note) for note in found.notes)
+    assert any(
+        re.search(r"3\.[567] % of it in ax and 5\.[789] % in ay", note) for note in found.notes
+    )
     for residual in found.residuals[:2]:
-        assert residual.rms["rest"] < 0.045 < residual.rms["after"]  # the tilt of the body is not corrected, and the table says so
+        assert (
+            residual.rms["rest"] < 0.045 < residual.rms["after"]
+        )  # the tilt of the body is not corrected, and the table says so
     if not reference_rate:
         level = align(recording, AlignmentSettings(IMU, tilt=0.0))
         assert level["yaw"].value > PLANTED["yaw"] + 0.003
@@ -127,7 +169,9 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, ref
 
 def test_measured_roll_and_pitch_take_gravity_off_and_a_sensor_mounted_crosswise_is_found(motion):
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=True)
-    recording = replace(recording, channels={**recording.channels, "roll": motion.roll, "pitch": motion.pitch})
+    recording = replace(
+        recording, channels={**recording.channels, "roll": motion.roll, "pitch": motion.pitch}
+    )
     found = align(recording, AlignmentSettings(IMU))
     assert_recovered(found, PLANTED, tuple(PLANTED))
     assert found["offset_ax"].value == pytest.approx(0.15, abs=0.003)  # without the mean pitch
@@ -143,7 +187,11 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
     for aligned, residual in zip(clean.residuals, found.residuals, strict=True):
         assert residual.rms["before"] > 5 * aligned.rms["before"]
         assert residual.rms["after"] == pytest.approx(aligned.rms["before"], rel=0.1)
-    assert [transform["name"] for transform in found.transforms] == ["delay_correction", "offset_correction", "mounting_correction"]
+    assert [transform["name"] for transform in found.transforms] == [
+        "delay_correction",
+        "offset_correction",
+        "mounting_correction",
+    ]
 
 
 @pytest.mark.parametrize("quantity", IMU)
@@ -153,18 +201,27 @@ def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     assert tuple(parameter.name for parameter in found.parameters) == QUANTITIES[quantity]
     assert_recovered(found, truth, QUANTITIES[quantity])
     (transform,) = found.transforms
-    names = {"lever_arm": "mounting_correction", "mounting": "mounting_correction", "delay": "delay_correction"}
+    names = {
+        "lever_arm": "mounting_correction",
+        "mounting": "mounting_correction",
+        "delay": "delay_correction",
+    }
     assert transform["name"] == names.get(quantity, "offset_correction")
     assert "yaw" not in transform or quantity == "mounting"
     assert not any("residuals suggest" in note for note in found.notes)
 
 
 def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion):
-    found = align(recorded(motion, PLANTED, reference_rate=True), AlignmentSettings(("lever_arm", "offsets")))
+    found = align(
+        recorded(motion, PLANTED, reference_rate=True), AlignmentSettings(("lever_arm", "offsets"))
+    )
     (note,) = [note for note in found.notes if "residuals suggest" in note]
     assert re.search(r"yaw (2\.9|3\.0|3)\d* deg ±", note)
     assert re.search(r"delay (3[89]|40)[.\d]* ms ±", note)
-    assert {parameter.name for parameter in found.parameters} == {*QUANTITIES["lever_arm"], *QUANTITIES["offsets"]}
+    assert {parameter.name for parameter in found.parameters} == {
+        *QUANTITIES["lever_arm"],
+        *QUANTITIES["offsets"],
+    }
     assert "Not asked for and taken as zero: mounting, delay." in found.notes
 
 
@@ -181,14 +238,27 @@ def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
     def wave(row, at, order, mean, amplitudes, frequencies):
         omega = 2.0 * np.pi * np.array(frequencies)
         angles = np.outer(at, omega) + phases[row] + order * np.pi / 2.0
-        return np.sin(angles) @ (np.array(amplitudes) * omega**order) + (mean if order == 0 else 0.0)
+        return np.sin(angles) @ (np.array(amplitudes) * omega**order) + (
+            mean if order == 0 else 0.0
+        )
 
     def turn(at, order=0):
-        return wave(0, at, order, 0.05 if turning else 0.4, tuple(turning * a for a in (0.3, 0.15, 0.05)), (0.07, 0.23, 0.6))
+        return wave(
+            0,
+            at,
+            order,
+            0.05 if turning else 0.4,
+            tuple(turning * a for a in (0.3, 0.15, 0.05)),
+            (0.07, 0.23, 0.6),
+        )
 
     def velocity(at, order=0):
-        ahead = wave(1, at, order, 25.0, tuple(varying * a for a in (4.0, 1.5, 0.4)), (0.02, 0.09, 0.21))
-        return ahead + 1j * wave(2, at, order, 0.0, tuple(turning * a for a in (0.5, 0.2, 0.05)), (0.05, 0.19, 0.7))
+        ahead = wave(
+            1, at, order, 25.0, tuple(varying * a for a in (4.0, 1.5, 0.4)), (0.02, 0.09, 0.21)
+        )
+        return ahead + 1j * wave(
+            2, at, order, 0.0, tuple(turning * a for a in (0.5, 0.2, 0.05)), (0.05, 0.19, 0.7)
+        )
 
     at = time - PLANTED["delay"]
     r, lever = turn(at), PLANTED["lever_x"] + 1j * PLANTED["lever_y"]
@@ -197,7 +267,9 @@ def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
 
     def coloured(size):
         memory = math.exp(-1.0 / (correlated * RATE))
-        return lfilter([size * math.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(6000))[1000:]
+        return lfilter(
+            [size * math.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(6000)
+        )[1000:]
 
     channels = {
         "ax": force.real + coloured(noise),
@@ -214,10 +286,15 @@ def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
 def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
     """Thirty drives, whose noise remembers for 0.05 s and for 2 s: by a binomial law of 95 % fewer than 25 of 30 have a chance of 0.3 %."""
     found = [align(weaving(seed, correlated=correlated), COVERED) for seed in range(30)]
-    inside = np.array([[p.low <= PLANTED[p.name] <= p.high for p in each.parameters] for each in found])
+    inside = np.array(
+        [[p.low <= PLANTED[p.name] <= p.high for p in each.parameters] for each in found]
+    )
     assert inside.sum(axis=0).min() >= 25
     assert 0.91 <= inside.mean() <= 0.99
-    values, stated = (np.array([[getattr(p, what) for p in each.parameters] for each in found]) for what in ("value", "uncertainty"))
+    values, stated = (
+        np.array([[getattr(p, what) for p in each.parameters] for each in found])
+        for what in ("value", "uncertainty")
+    )
     ratio = values.std(axis=0, ddof=1) / np.sqrt(np.square(stated).mean(axis=0))
     assert ratio.min() > 0.7  # intervals are not merely wide
     assert ratio.max() < 1.4  # the standard deviation of 30 values is itself known to 13 %
@@ -233,22 +310,33 @@ def test_unmeasured_tilt_adds_to_the_uncertainty():
 
 def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
     circle = weaving(0, turning=False, varying=False, noise=0.02)
-    with pytest.raises(DataError, match=r"cannot tell lever_y and offset_ay apart \(condition number"):
+    with pytest.raises(
+        DataError, match=r"cannot tell lever_y and offset_ay apart \(condition number"
+    ):
         align(circle, AlignmentSettings(("lever_arm", "offsets")))
     constant = weaving(0, varying=False)
     constant = constant.select([name for name in constant.channels if name != "yaw_rate_ref"])
-    with pytest.raises(DataError, match=r"cannot tell offset_ay and offset_yaw_rate apart \(condition number"):
+    with pytest.raises(
+        DataError, match=r"cannot tell offset_ay and offset_yaw_rate apart \(condition number"
+    ):
         align(constant, AlignmentSettings(("offsets",)))
-    still = replace(motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion)))
+    still = replace(
+        motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion))
+    )
     straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
-    with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"):
+    with pytest.raises(
+        DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"
+    ):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
     ours, other = weaving(0), weaving(1)
     mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
     with pytest.raises(DataError, match=r"correlate by .* at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
     with pytest.raises(DataError, match="raise max_delay"):
-        align(recorded(motion, {"delay": 0.3}, reference_rate=True), AlignmentSettings(("delay",), max_delay=0.1))
+        align(
+            recorded(motion, {"delay": 0.3}, reference_rate=True),
+            AlignmentSettings(("delay",), max_delay=0.1),
+        )
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -258,19 +346,31 @@ def test_low_pass_differentiates_and_keeps_the_right_samples(order):
     out = smoothing(np.sin(omega * time), order, margin=50)
     gain = 2.0 ** (-0.5 * (0.8 / 2.0) ** 2)  # a Gaussian, -3 dB at 2 Hz
     assert smoothing.step == 4
-    np.testing.assert_allclose(out, gain * omega**order * np.sin(omega * time[50:-50:4] + order * np.pi / 2.0), atol=1e-5 * omega**order)
+    np.testing.assert_allclose(
+        out,
+        gain * omega**order * np.sin(omega * time[50:-50:4] + order * np.pi / 2.0),
+        atol=1e-5 * omega**order,
+    )
 
 
 @pytest.mark.parametrize("missing", ["vy_ref", "ax", "ay", "yaw_rate"])
 def test_missing_channel_is_one_clear_line(motion, missing):
     recording = recorded(motion, {})
-    refused = refusal(lambda: align(recording.select([name for name in recording.channels if name != missing]), AlignmentSettings(IMU)))
+    refused = refusal(
+        lambda: align(
+            recording.select([name for name in recording.channels if name != missing]),
+            AlignmentSettings(IMU),
+        )
+    )
     assert re.search(f"no (reference )?channel '{missing}'", refused)
 
 
 def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion):
     recording = recorded(motion, PLANTED)
-    found = align(recording.select([name for name in recording.channels if name != "vx_ref"]), AlignmentSettings(("offsets", "mounting")))
+    found = align(
+        recording.select([name for name in recording.channels if name != "vx_ref"]),
+        AlignmentSettings(("offsets", "mounting")),
+    )
     assert any("no vx_ref" in note for note in found.notes)
 
 
@@ -281,13 +381,18 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
     holed = replace(recording, channels={**recording.channels, "ax": gap}, gappy=frozenset({"ax"}))
     assert "'ax' has gaps" in refusal(lambda: align(holed, COVERED))
     assert "needs at least" in refusal(lambda: align(recording.cut(0.0, 15.0), COVERED))
-    assert "too high for 50 Hz; use at most" in refusal(lambda: align(recording, replace(COVERED, cutoff_hz=10.0)), ConfigurationError)
+    assert "too high for 50 Hz; use at most" in refusal(
+        lambda: align(recording, replace(COVERED, cutoff_hz=10.0)), ConfigurationError
+    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        ({"estimate": ()}, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
+        (
+            {"estimate": ()},
+            "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+        ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("steering_ratio",)}, "needs the wheelbase"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
@@ -300,7 +405,9 @@ def test_settings_that_make_no_sense_are_refused(arguments, what):
 
 WHEELBASE, LF, LR, MASS, INERTIA, FRONT, REAR = 2.6, 1.2, 1.4, 1500.0, 2500.0, 1.0e5, 1.3e5
 """A linear single-track car; stiffnesses of the axles [N/rad]."""
-GRADIENT = MASS * (LR * REAR - LF * FRONT) / (WHEELBASE * FRONT * REAR)  # steady state: δ = L/R + K·ay
+GRADIENT = (
+    MASS * (LR * REAR - LF * FRONT) / (WHEELBASE * FRONT * REAR)
+)  # steady state: δ = L/R + K·ay
 
 
 def single_track(ratio, offset, seed=0):
@@ -308,7 +415,9 @@ def single_track(ratio, offset, seed=0):
     generator, step = np.random.default_rng(seed), 0.01
     time = np.arange(20000) * step
     speed = 20.0 + 8.0 * np.sin(2.0 * np.pi * 0.013 * time)
-    steer = (0.02 * np.sin(2.0 * np.pi * 0.04 * time) + 0.008 * np.sin(2.0 * np.pi * 0.11 * time + 1.0)) * (20.0 / speed)
+    steer = (
+        0.02 * np.sin(2.0 * np.pi * 0.04 * time) + 0.008 * np.sin(2.0 * np.pi * 0.11 * time + 1.0)
+    ) * (20.0 / speed)
     side, rate = np.zeros(len(time)), np.zeros(len(time))
     for k in range(len(time) - 1):
         front = FRONT * (steer[k] - (side[k] + LF * rate[k]) / speed[k])
@@ -316,18 +425,32 @@ def single_track(ratio, offset, seed=0):
         side[k + 1] = side[k] + step * ((front + rear) / MASS - speed[k] * rate[k])
         rate[k + 1] = rate[k] + step * (LF * front - LR * rear) / INERTIA
     ay = np.gradient(side, step) + speed * rate
-    noisy = {"vx": (speed, 0.05), "yaw_rate": (rate, 0.0017), "ay": (ay, 0.035), "handwheel": (ratio * steer + offset, 0.002)}
-    channels = {name: true + size * generator.standard_normal(len(time)) for name, (true, size) in noisy.items()}
+    noisy = {
+        "vx": (speed, 0.05),
+        "yaw_rate": (rate, 0.0017),
+        "ay": (ay, 0.035),
+        "handwheel": (ratio * steer + offset, 0.002),
+    }
+    channels = {
+        name: true + size * generator.standard_normal(len(time))
+        for name, (true, size) in noisy.items()
+    }
     return Recording("road", "car", 100.0, 0.0, channels, "simulated")
 
 
 @pytest.mark.parametrize(("ratio", "offset"), [(15.5, 0.05), (-1.0, -0.01)])
 def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio, offset):
-    found = align(single_track(ratio, offset), AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))
+    found = align(
+        single_track(ratio, offset), AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
+    )
     assert found["steering_ratio"].value == pytest.approx(ratio, rel=0.02)
     assert found["steering_offset"].value == pytest.approx(offset, abs=0.003)
     assert found["understeer_gradient"].value == pytest.approx(GRADIENT, rel=0.1)
-    for name, true in (("steering_ratio", ratio), ("steering_offset", offset), ("understeer_gradient", GRADIENT)):
+    for name, true in (
+        ("steering_ratio", ratio),
+        ("steering_offset", offset),
+        ("understeer_gradient", GRADIENT),
+    ):
         assert found[name].low <= true <= found[name].high, name
     (transform,) = found.transforms
     assert (transform["name"], transform["channel"]) == ("steering_ratio", "handwheel")
@@ -340,9 +463,17 @@ def test_steering_intervals_contain_the_truth():
     generator = np.random.default_rng(0)
     inside = 0
     for _ in range(20):
-        wander = lfilter([0.05 * math.sqrt(1 - 0.998**2)], [1.0, -0.998], generator.standard_normal(len(road) + 5000))[5000:]  # 5 s
-        recording = replace(road, channels={**road.channels, "handwheel": road["handwheel"] + wander})
-        ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))["steering_ratio"]
+        wander = lfilter(
+            [0.05 * math.sqrt(1 - 0.998**2)],
+            [1.0, -0.998],
+            generator.standard_normal(len(road) + 5000),
+        )[5000:]  # 5 s
+        recording = replace(
+            road, channels={**road.channels, "handwheel": road["handwheel"] + wander}
+        )
+        ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))[
+            "steering_ratio"
+        ]
         inside += ratio.low <= 15.5 <= ratio.high
     assert inside >= 16
 
@@ -352,8 +483,12 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
-    assert "no channel 'steer'" in refusal(lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings))
-    assert "no channel 'roll'" in refusal(lambda: align(road, replace(settings, steering_channel="roll")))
+    assert "no channel 'steer'" in refusal(
+        lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings)
+    )
+    assert "no channel 'roll'" in refusal(
+        lambda: align(road, replace(settings, steering_channel="roll"))
+    )
     noise = np.random.default_rng(0).standard_normal(len(road))
     with pytest.raises(DataError, match="does not follow the curvature"):
         align(replace(road, channels={**road.channels, "handwheel": noise}), settings)
@@ -362,7 +497,14 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
 def sine(delay, frequency, rate=100.0):
     time = np.arange(1000) / rate
     return Recording(
-        "sine", "car", rate, 2.0, {"ay": np.sin(2.0 * np.pi * frequency * (time - delay)), "vy_ref": np.sin(2.0 * np.pi * frequency * time)}
+        "sine",
+        "car",
+        rate,
+        2.0,
+        {
+            "ay": np.sin(2.0 * np.pi * frequency * (time - delay)),
+            "vy_ref": np.sin(2.0 * np.pi * frequency * time),
+        },
     )
 
 
@@ -370,7 +512,9 @@ def sine(delay, frequency, rate=100.0):
 @pytest.mark.parametrize("frequency", [0.3, 5.0, 25.0, 40.0])
 def test_delayed_sine_comes_back_between_samples(delay, frequency):
     corrected = DelayCorrection(delay)(sine(delay, frequency))
-    np.testing.assert_allclose(corrected["ay"], corrected["vy_ref"], atol=1e-3)  # up to 0.8 of the Nyquist frequency
+    np.testing.assert_allclose(
+        corrected["ay"], corrected["vy_ref"], atol=1e-3
+    )  # up to 0.8 of the Nyquist frequency
 
 
 @pytest.mark.parametrize("delay", [0.04, -0.04])
@@ -379,32 +523,54 @@ def test_delay_of_whole_samples_is_a_shift_and_the_recording_is_cut(delay):
     corrected = DelayCorrection(delay, ("ay",))(recording)
     assert len(corrected) == len(recording) - 4
     assert corrected.start_time == pytest.approx(recording.start_time + max(-delay, 0.0))
-    np.testing.assert_array_equal(corrected["ay"], recording["ay"][4:] if delay > 0 else recording["ay"][:-4])
-    np.testing.assert_array_equal(corrected["vy_ref"], recording["vy_ref"][:-4] if delay > 0 else recording["vy_ref"][4:])
+    np.testing.assert_array_equal(
+        corrected["ay"], recording["ay"][4:] if delay > 0 else recording["ay"][:-4]
+    )
+    np.testing.assert_array_equal(
+        corrected["vy_ref"], recording["vy_ref"][:-4] if delay > 0 else recording["vy_ref"][4:]
+    )
 
 
 def test_delay_correction_cuts_what_it_cannot_reach_and_keeps_clock_and_constants():
     recording = sine(0.0, 1.0)
     corrected = DelayCorrection(0.037)(recording)
-    assert corrected.start_time == pytest.approx(recording.start_time + 0.12)  # 16 samples of reach less the 4 that the delay gives
+    assert corrected.start_time == pytest.approx(
+        recording.start_time + 0.12
+    )  # 16 samples of reach less the 4 that the delay gives
     assert corrected.end_time == pytest.approx(recording.end_time - 0.20)
     np.testing.assert_array_equal(DelayCorrection(0.0)(recording)["ay"], recording["ay"])
     assert "too short to be shifted by 20 s" in refusal(lambda: DelayCorrection(20.0)(recording))
     assert "no channel 'ax'" in refusal(lambda: DelayCorrection(0.01, ("ax",))(recording))
-    holed = Recording("gap", "car", 100.0, 0.0, {"ay": np.array([0.0, np.nan] * 50)}, gappy=frozenset({"ay"}))
+    holed = Recording(
+        "gap", "car", 100.0, 0.0, {"ay": np.array([0.0, np.nan] * 50)}, gappy=frozenset({"ay"})
+    )
     assert "has gaps" in refusal(lambda: DelayCorrection(0.013)(holed))
     recording = Recording("flat", "car", 100.0, 0.0, {"ay": np.full(100, 9.81)})
     np.testing.assert_allclose(DelayCorrection(0.0137)(recording)["ay"], 9.81, rtol=1e-14)
 
 
 def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
-    recording = Recording("lap", "car", 10.0, 0.0, {"ax": np.array([1.0, np.nan]), "ay": np.array([1.0, 2.0])}, gappy=frozenset({"ax"}))
+    recording = Recording(
+        "lap",
+        "car",
+        10.0,
+        0.0,
+        {"ax": np.array([1.0, np.nan]), "ay": np.array([1.0, 2.0])},
+        gappy=frozenset({"ax"}),
+    )
     corrected = OffsetCorrection({"ax": 0.25, "ay": -1.0})(recording)
     np.testing.assert_array_equal(corrected["ax"], [0.75, np.nan])
     np.testing.assert_array_equal(corrected["ay"], [2.0, 3.0])
-    assert "no channel 'yaw_rate'" in refusal(lambda: OffsetCorrection({"yaw_rate": 0.1})(recording))
+    assert "no channel 'yaw_rate'" in refusal(
+        lambda: OffsetCorrection({"yaw_rate": 0.1})(recording)
+    )
     recording = Recording(
-        "lap", "car", 10.0, 0.0, {"handwheel": np.array([1.6, np.nan]), "steer": np.zeros(2)}, gappy=frozenset({"handwheel"})
+        "lap",
+        "car",
+        10.0,
+        0.0,
+        {"handwheel": np.array([1.6, np.nan]), "steer": np.zeros(2)},
+        gappy=frozenset({"handwheel"}),
     )
     corrected = SteeringRatio(15.0, 0.1)(recording)
     np.testing.assert_allclose(corrected["steer"], [0.1, np.nan])
@@ -444,7 +610,15 @@ def called(elsewhere, capsys):
     return partial(run_vehest, capsys, "data", "align")
 
 
-ASKED = ("weave.parquet", "--estimate", "lever_arm,mounting,delay,offsets", "--cutoff", "1.5", "--max-delay", "0.2")
+ASKED = (
+    "weave.parquet",
+    "--estimate",
+    "lever_arm,mounting,delay,offsets",
+    "--cutoff",
+    "1.5",
+    "--max-delay",
+    "0.2",
+)
 
 
 def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(called):
@@ -454,7 +628,16 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     lines = out.splitlines()
     assert "simulated" in lines[0]
     assert "nothing is applied" in lines[0]
-    assert lines[1].split() == ["quantity", "estimate", "standard", "uncertainty", "95", "%", "interval", "unit"]
+    assert lines[1].split() == [
+        "quantity",
+        "estimate",
+        "standard",
+        "uncertainty",
+        "95",
+        "%",
+        "interval",
+        "unit",
+    ]
     assert any(line.startswith("lever_x") and line.rstrip().endswith(" m") for line in lines)
     assert any(line.startswith("delay ") and "ms" in line for line in lines)
     assert any(line.startswith("yaw ") and "deg" in line for line in lines)
@@ -468,21 +651,35 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     assert (parameters["delay"]["unit"], parameters["yaw"]["unit"]) == ("s", "rad")
     assert parameters["delay"]["low"] <= 0.040 <= parameters["delay"]["high"]
     assert told["kind"] == "simulated"
-    assert [transform["name"] for transform in told["transforms"]] == ["delay_correction", "offset_correction", "mounting_correction"]
+    assert [transform["name"] for transform in told["transforms"]] == [
+        "delay_correction",
+        "offset_correction",
+        "mounting_correction",
+    ]
     assert {residual["channel"] for residual in told["residuals"]} == {"ax", "ay", "yaw_rate"}
 
 
 def test_printed_override_is_one_that_downsample_takes(called):
     _, out, _ = called(*ASKED)
     override = out.splitlines()[-1].removeprefix("to correct it: ").strip("'")
-    composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override])["downsample"]
+    composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override])[
+        "downsample"
+    ]
     found = align(weaving(0), AlignmentSettings(IMU, cutoff_hz=1.5, max_delay=0.2))
     transforms = transforms_of({"rate_hz": 20.0, **composed})
-    assert list(transforms[:-1]) == [transform_from_config(transform) for transform in found.transforms]
+    assert list(transforms[:-1]) == [
+        transform_from_config(transform) for transform in found.transforms
+    ]
     assert override == override_of(found)
-    small = replace(found, transforms=({"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}},))
-    composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override_of(small)])["downsample"]
-    assert composed["transforms"] == [{"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}}]
+    small = replace(
+        found, transforms=({"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}},)
+    )
+    composed = compose_config(
+        "downsample", ["dataset=sim_quickstart", "rate_hz=20", override_of(small)]
+    )["downsample"]
+    assert composed["transforms"] == [
+        {"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}}
+    ]
 
 
 def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
@@ -501,14 +698,19 @@ def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
     before = files()
     code, _, err = called(*ASKED, "-o", "found")
-    assert (code, err) == (2, "error: folder 'found' holds other files ('notes.txt'); name a new one\n")
+    assert (code, err) == (
+        2,
+        "error: folder 'found' holds other files ('notes.txt'); name a new one\n",
+    )
     assert files() == before
 
 
 def test_steering_alone_is_written_too(called):
     write_recording(single_track(15.5, 0.05), Path("road.parquet"))
     for _ in range(2):  # its own files may be replaced
-        code, out, _ = called("road.parquet", "-e", "steering_ratio", "--wheelbase", "2.6", "-o", "found")
+        code, out, _ = called(
+            "road.parquet", "-e", "steering_ratio", "--wheelbase", "2.6", "-o", "found"
+        )
         assert code == 0
     assert "steering_ratio " in out
     assert "{name: steering_ratio, ratio: 15." in out
@@ -518,10 +720,22 @@ def test_steering_alone_is_written_too(called):
 @pytest.mark.parametrize(
     ("arguments", "code", "what"),
     [
-        (("weave.parquet",), 2, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
-        (("sim_quickstart", "-e", "delay"), 2, "3 (drive_1, drive_2, drive_3); choose one by --recording ID"),
+        (
+            ("weave.parquet",),
+            2,
+            "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+        ),
+        (
+            ("sim_quickstart", "-e", "delay"),
+            2,
+            "3 (drive_1, drive_2, drive_3); choose one by --recording ID",
+        ),
         (("sim_quickstart", "-e", "delay", "-r", "drive_9"), 4, "no drive 'drive_9'"),
-        (("weave.parquet", "-e", "delay", "-r", "other"), 2, "holds the recording 'weave', not 'other'"),
+        (
+            ("weave.parquet", "-e", "delay", "-r", "other"),
+            2,
+            "holds the recording 'weave', not 'other'",
+        ),
         (("weave.parquet", "-e", "delay", "-o", "weave.parquet"), 2, "is not a folder"),
     ],
 )
@@ -549,9 +763,14 @@ def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_i
     curvature = np.interp(np.arange(0.0, path[-1], 10.0), path, ferrari["yaw_rate"] / ferrari["vx"])
     curvature -= curvature.mean()
     lags = np.arange(20, len(curvature) - 60)
-    five_laps = 10.0 * lags[np.argmax([np.corrcoef(curvature[:-lag], curvature[lag:])[0, 1] for lag in lags])]
+    five_laps = (
+        10.0
+        * lags[np.argmax([np.corrcoef(curvature[:-lag], curvature[lag:])[0, 1] for lag in lags])]
+    )
     first, last = np.searchsorted(path, [500.0, 500.0 + five_laps])
     turned = ferrari["yaw_rate"][first:last].sum() / ferrari.rate_hz
-    offset = (turned - 2.0 * np.pi * round(turned / (2.0 * np.pi))) / ((last - first) / ferrari.rate_hz)
+    offset = (turned - 2.0 * np.pi * round(turned / (2.0 * np.pi))) / (
+        (last - first) / ferrari.rate_hz
+    )
     assert abs(offset) < 2e-4
     assert found["offset_yaw_rate"].low <= offset <= found["offset_yaw_rate"].high

@@ -14,7 +14,11 @@ from vehest.sources.base import open_source
 
 
 def found_by(check, recording):
-    return {finding.channel: finding for finding in checks_of_recording(recording) if finding.check == check}
+    return {
+        finding.channel: finding
+        for finding in checks_of_recording(recording)
+        if finding.check == check
+    }
 
 
 @pytest.mark.parametrize("time_constant", [0.2, 0.4, 1.0])
@@ -23,7 +27,10 @@ def test_delay_and_time_constant_are_told_apart(time_constant, late):
     generator = np.random.default_rng(1)
     wave, clock = Wave.random(generator, 1.0, 0.05, 4.0), np.arange(12000) / 100.0
     signals = {"source": wave(clock), "follower": wave.low_passed(time_constant)(clock - late)}
-    noisy = {name: samples + 0.2 * samples.std() * generator.standard_normal(len(clock)) for name, samples in signals.items()}
+    noisy = {
+        name: samples + 0.2 * samples.std() * generator.standard_normal(len(clock))
+        for name, samples in signals.items()
+    }
     spectra = cross_spectra(noisy, 100.0)
     lag = lag_of(spectra, "source", "follower", low_pass=True)
     assert lag.time_constant.value == pytest.approx(time_constant, rel=0.1)
@@ -35,7 +42,10 @@ def test_a_low_passed_yaw_rate_is_found_and_is_not_late_besides(missing):
     slow = without(broadband_drive(slow_yaw_rate=0.4), *missing)
     found = [finding for finding in checks_of_recording(slow) if finding.level != "note"]
     assert [(one.check, one.channel) for one in found] == [("bandwidth", "yaw_rate")]
-    assert "time constant of 0.4 s" in found[0].message or "time constant of 0.39 s" in found[0].message
+    assert (
+        "time constant of 0.4 s" in found[0].message
+        or "time constant of 0.39 s" in found[0].message
+    )
 
 
 def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do_and_a_late_channel_is_not_low_passed():
@@ -55,7 +65,9 @@ def test_a_held_channel_changes_at_its_own_rate(step):
 
 def test_held_rates_are_those_of_a_sensors_own_clock_and_none_of_noise_or_slow_steps():
     newest = (np.arange(4000) * 0.4).astype(int)
-    assert held_rate(np.random.default_rng(0).standard_normal(2000)[newest], 100.0) == pytest.approx(45.0, abs=6.0)
+    assert held_rate(
+        np.random.default_rng(0).standard_normal(2000)[newest], 100.0
+    ) == pytest.approx(45.0, abs=6.0)
     time = np.arange(6000) / 100.0
     for resolution in (0.05, 0.2):
         assert held_rate(np.round(np.sin(0.3 * time) / resolution) * resolution, 100.0) is None
@@ -69,7 +81,9 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays():
     drive = broadband_drive()
 
     def held(step):
-        changed = {name: np.repeat(drive[name][::step], step)[: len(drive)] for name in ("ax", "ay")}
+        changed = {
+            name: np.repeat(drive[name][::step], step)[: len(drive)] for name in ("ax", "ay")
+        }
         return replace(drive, channels={**drive.channels, **changed})
 
     (slow,) = found_by("held", held(10)).values()
@@ -83,7 +97,11 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays():
 
 
 def recordings_of(name, data_root):
-    return list(open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]).recordings())
+    return list(
+        open_source(
+            compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]
+        ).recordings()
+    )
 
 
 def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):
@@ -95,5 +113,13 @@ def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):
 
 @pytest.mark.parametrize("name", ["ferrari_250lm", "f1tenth", "ferrari_250lm_unlabelled", "tum"])
 def test_no_other_cars_channels_are_low_passed_held_or_of_another_sign(data_root, name):
-    found = [finding for recording in recordings_of(name, data_root) for finding in checks_of_recording(recording)]
-    assert not [finding for finding in found if finding.check in ("bandwidth", "held", "sign", "unit", "delay")]
+    found = [
+        finding
+        for recording in recordings_of(name, data_root)
+        for finding in checks_of_recording(recording)
+    ]
+    assert not [
+        finding
+        for finding in found
+        if finding.check in ("bandwidth", "held", "sign", "unit", "delay")
+    ]

@@ -23,13 +23,22 @@ def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
     ax = np.gradient(vx, 1 / rate) - vy * yaw_rate
     exact = {"vx": vx, "yaw_rate": yaw_rate, "ax": ax, "ay": ay, "steer": 0.13 * yaw_rate}
     levels = {"vx": 0.02, "yaw_rate": 0.003, "ax": 0.1, "ay": 0.1, "steer": 0.001}
-    channels = {name: samples + noise * levels[name] * generator.standard_normal(len(time)) for name, samples in exact.items()}
+    channels = {
+        name: samples + noise * levels[name] * generator.standard_normal(len(time))
+        for name, samples in exact.items()
+    }
     references = {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
     return Recording("lap", "car", rate, 10.0, {**channels, **references})
 
 
 def changed(recording, **changes):
-    return replace(recording, channels={**recording.channels, **{name: change(recording[name]) for name, change in changes.items()}})
+    return replace(
+        recording,
+        channels={
+            **recording.channels,
+            **{name: change(recording[name]) for name, change in changes.items()},
+        },
+    )
 
 
 def with_standstill(recording, start, stop, **resting):
@@ -39,17 +48,25 @@ def with_standstill(recording, start, stop, **resting):
     generator = np.random.default_rng(7)
     for name, samples in channels.items():
         quiet = {"ax": 0.05, "ay": 0.05, "yaw_rate": 0.003}.get(name, 0.0)
-        samples[inside] = resting.get(name, 0.0) + quiet * generator.standard_normal(len(samples[inside]))
+        samples[inside] = resting.get(name, 0.0) + quiet * generator.standard_normal(
+            len(samples[inside])
+        )
     return replace(recording, channels=channels)
 
 
 def stuck(value, start, stop):
     """What a channel becomes that shows one value from one sample to another."""
-    return lambda samples: np.where((np.arange(LENGTH) >= start) & (np.arange(LENGTH) < stop), value, samples)
+    return lambda samples: np.where(
+        (np.arange(LENGTH) >= start) & (np.arange(LENGTH) < stop), value, samples
+    )
 
 
 def complaints(recording):
-    return [(finding.level, finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"]
+    return [
+        (finding.level, finding.check, finding.channel)
+        for finding in checks_of_recording(recording)
+        if finding.level != "note"
+    ]
 
 
 def only_complaint(recording):
@@ -86,7 +103,10 @@ def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
     found = only_complaint(changed(clean_drive(), ay=np.negative, yaw_rate=np.negative))
     assert (found.level, found.check, found.channel) == ("warning", "sign", "")
-    assert "either ay and yaw_rate together or sideslip_ref, steer and vy_ref together point the other way" in found.message
+    assert (
+        "either ay and yaw_rate together or sideslip_ref, steer and vy_ref together point the other way"
+        in found.message
+    )
 
 
 def test_kinematics_are_judged_on_moving_cars_alone():
@@ -101,7 +121,9 @@ def test_kinematics_are_judged_on_moving_cars_alone():
 def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_silent():
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["vy_ref"], np.nan)
-    gappy = replace(recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"}))
+    gappy = replace(
+        recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"})
+    )
     found = checks_of_recording(gappy)
     assert [(one.level, one.check, one.channel) for one in found] == [("note", "nan", "vy_ref")]
     assert "80.0 %" in found[0].message
@@ -115,11 +137,17 @@ def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "never changes: 0.02 rad" in found.message
     assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
-    assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [("warning", "held", "steer")]
+    assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [
+        ("warning", "held", "steer")
+    ]
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
     slow[2000:2500:5] = 0.03
-    found = only_complaint(replace(recording, channels={**recording.channels, "steer": slow}, gappy=frozenset({"steer"})))
+    found = only_complaint(
+        replace(
+            recording, channels={**recording.channels, "steer": slow}, gappy=frozenset({"steer"})
+        )
+    )
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "4.96 s" in found.message
 
@@ -130,18 +158,33 @@ def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
 
 
 def test_stuck_channels_are_told_from_standstill():
-    found = [one for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000))) if one.check == "stuck"]
+    found = [
+        one
+        for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000)))
+        if one.check == "stuck"
+    ]
     assert [finding.channel for finding in found] == ["vx"]
     assert "stays at 0 m/s for 10 s from 30 s" in found[0].message
-    found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200)))
+    found = only_complaint(
+        changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200))
+    )
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "0.03 rad for 2 s from 50 s" in found.message
 
 
-@pytest.mark.parametrize(("low", "high", "sides"), [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)])
+@pytest.mark.parametrize(
+    ("low", "high", "sides"),
+    [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)],
+)
 def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
-    found = [one for one in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high))) if one.level != "note"]
-    assert {(one.level, one.check, one.channel) for one in found if one.check == "saturated"} == {("warning", "saturated", "ay")}
+    found = [
+        one
+        for one in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high)))
+        if one.level != "note"
+    ]
+    assert {(one.level, one.check, one.channel) for one in found if one.check == "saturated"} == {
+        ("warning", "saturated", "ay")
+    }
     assert sum(one.check == "saturated" for one in found) == sides
     for one in found:
         if one.check == "saturated":
@@ -150,11 +193,16 @@ def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
 
 def test_quantised_resting_and_stepped_channels_are_not_saturated():
     for step in (0.05, 0.5):
-        assert complaints(changed(clean_drive(), ay=lambda ay, step=step: np.round(ay / step) * step)) == []
+        assert (
+            complaints(changed(clean_drive(), ay=lambda ay, step=step: np.round(ay / step) * step))
+            == []
+        )
     time = np.arange(LENGTH) / RATE
     sine = np.round(8.0 * np.sin(2 * np.pi * 0.71 * time), 1)
     assert complaints(Recording("r", "car", RATE, 0.0, {"ay": sine})) == []
-    found = checks_of_recording(changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4)))
+    found = checks_of_recording(
+        changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4))
+    )
     assert sum(one.check == "saturated" for one in found) == 2
     recording = with_standstill(clean_drive(), 20.0, 35.0)
     assert complaints(changed(recording, vx=lambda vx: vx.clip(0.0, None))) == []
@@ -165,14 +213,18 @@ def test_quantised_resting_and_stepped_channels_are_not_saturated():
 def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_named():
     whole = clean_drive()
     assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
-    assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [("warning", "offset", "steer")]
+    assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [
+        ("warning", "offset", "steer")
+    ]
     drive = clean_drive()
     wheels = {f"wheel_speed_{wheel}": drive["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
     whole = replace(drive, channels={**drive.channels, **wheels})
     assert not complaints(whole)
     dropped = changed(whole, wheel_speed_rl=stuck(0.0, 2000, 2060))
     assert complaints(dropped) == [("warning", "dropout", "wheel_speed_rl")]
-    assert "dropout" not in {check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))}
+    assert "dropout" not in {
+        check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))
+    }
 
 
 def backwards(recording, *stretches, speed=-2.0):
@@ -203,14 +255,20 @@ def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
 def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed():
     drive = backwards(clean_drive(), (1000, 1150))
     forwards = changed(drive, vx=np.abs)
-    assert [(found.level, "has no sign: the car goes backwards 1 times" in found.message) for found in reversing(forwards)] == [
-        ("warning", True)
-    ]
-    without = replace(forwards, channels={name: samples for name, samples in forwards.channels.items() if name != "vx"})
+    assert [
+        (found.level, "has no sign: the car goes backwards 1 times" in found.message)
+        for found in reversing(forwards)
+    ] == [("warning", True)]
+    without = replace(
+        forwards,
+        channels={name: samples for name, samples in forwards.channels.items() if name != "vx"},
+    )
     assert [found.channel for found in reversing(without)] == ["vx_ref"]
     assert not reversing(without.select(["yaw_rate", "ay"]))
 
 
-@pytest.mark.parametrize(("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)])
+@pytest.mark.parametrize(
+    ("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)]
+)
 def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length, speed, noted):
     assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted

@@ -23,23 +23,35 @@ def delays(recording):
 
 
 def between(recording, channel, against):
-    (found,) = [delay for delay in delays(recording) if (delay.channel, delay.against) == (channel, against)]
+    (found,) = [
+        delay for delay in delays(recording) if (delay.channel, delay.against) == (channel, against)
+    ]
     return found
 
 
 def reported(recording):
-    return {finding.channel: finding for finding in checks_of_recording(recording) if finding.check == "delay"}
+    return {
+        finding.channel: finding
+        for finding in checks_of_recording(recording)
+        if finding.check == "delay"
+    }
 
 
 @pytest.mark.parametrize(("rate", "seed"), [*((25.0, seed) for seed in range(5)), (100.0, 0)])
 def test_channels_on_one_clock_get_no_report(rate, seed):
-    assert [finding for finding in checks_of_recording(broadband_drive(rate_hz=rate, seed=seed)) if finding.level != "note"] == []
+    assert [
+        finding
+        for finding in checks_of_recording(broadband_drive(rate_hz=rate, seed=seed))
+        if finding.level != "note"
+    ] == []
 
 
 LATE = (("yaw_rate",), ("ay",), ("ax",), ("vy_ref", "sideslip_ref"), ("vx",))
 
 
-@pytest.mark.parametrize(("late", "rate"), [*product(LATE, (25.0, 100.0)), (("yaw_rate",), 1000.0 / 3.0)])
+@pytest.mark.parametrize(
+    ("late", "rate"), [*product(LATE, (25.0, 100.0)), (("yaw_rate",), 1000.0 / 3.0)]
+)
 def test_the_late_channel_is_named_and_no_other(late, rate):
     found = reported(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04)))
     assert set(found) == {late[0]}
@@ -51,7 +63,9 @@ def test_the_late_channel_is_named_and_no_other(late, rate):
 
 @pytest.mark.parametrize("late", [0.0333, 0.1, 0.25])
 def test_a_delay_is_measured_between_samples(late):
-    delay = between(broadband_drive(rate_hz=25.0, late={"yaw_rate": late}), "yaw_rate", "yaw_rate_ref").delay
+    delay = between(
+        broadband_drive(rate_hz=25.0, late={"yaw_rate": late}), "yaw_rate", "yaw_rate_ref"
+    ).delay
     assert delay.value == pytest.approx(late, abs=2e-3)
     assert delay.low < late < delay.high
 
@@ -60,7 +74,9 @@ def test_without_references_of_their_own_accelerations_and_angles_still_tell_who
     for channel in ("ay", "yaw_rate", "vy_ref"):
         drive = without(broadband_drive(late={channel: 0.04}), "yaw_rate_ref", "sideslip_ref")
         assert set(reported(drive)) == {channel}
-    assert set(reported(without(broadband_drive(late={"sideslip_ref": 0.06}), "vy_ref"))) == {"sideslip_ref"}
+    assert set(reported(without(broadband_drive(late={"sideslip_ref": 0.06}), "vy_ref"))) == {
+        "sideslip_ref"
+    }
     assert set(reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref"))) == {"ay"}
     # d(vy)/dt follows the yaw acceleration, as a delay does.
     assert not reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref", "sideslip_ref"))
@@ -72,9 +88,15 @@ def test_a_lever_arm_is_no_delay_and_one_in_channels_of_the_wrong_sign_and_unit_
     found = between(drive, "yaw_rate", "ay").delay
     assert found.low < 0.0 < found.high
     late = broadband_drive(late={"ay": 0.06})
-    spoilt = replace(late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]})
+    spoilt = replace(
+        late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]}
+    )
     found = checks_of_recording(spoilt)
-    assert {(one.check, one.channel) for one in found if one.level == "warning"} == {("sign", "ay"), ("unit", "vy_ref"), ("delay", "ay")}
+    assert {(one.check, one.channel) for one in found if one.level == "warning"} == {
+        ("sign", "ay"),
+        ("unit", "vy_ref"),
+        ("delay", "ay"),
+    }
 
 
 def test_the_delay_is_that_of_the_peak_of_the_cross_correlation():
@@ -96,7 +118,10 @@ def test_intervals_hold_the_truth_as_often_as_they_promise():
         generator = np.random.default_rng(seed)
         wave, clock = Wave.random(generator, 1.0, 0.05, 4.0), np.arange(1500) / 25.0
         signals = {"source": wave(clock), "follower": wave(clock - 0.03)}
-        noisy = {name: samples + 0.3 * samples.std() * generator.standard_normal(len(clock)) for name, samples in signals.items()}
+        noisy = {
+            name: samples + 0.3 * samples.std() * generator.standard_normal(len(clock))
+            for name, samples in signals.items()
+        }
         spectra = cross_spectra(noisy, 25.0)
         lag = lag_of(spectra, "source", "follower", low_pass=False)
         inside += lag.delay.low < 0.03 < lag.delay.high
@@ -107,7 +132,12 @@ def test_slipping_wheels_are_not_reported_and_late_ones_once():
     """Slip in proportion to the acceleration: r·ω = v + 0.1 s · dv/dt."""
     drive = broadband_drive()
     slipping = drive["vx_ref"] + 0.1 * np.gradient(drive["vx_ref"]) * drive.rate_hz
-    assert between(replace(drive, channels={**drive.channels, "vx": slipping}), "vx", "vx_ref").delay.low < -0.015
+    assert (
+        between(
+            replace(drive, channels={**drive.channels, "vx": slipping}), "vx", "vx_ref"
+        ).delay.low
+        < -0.015
+    )
     assert not reported(replace(drive, channels={**drive.channels, "vx": slipping}))
     drive = broadband_drive(noise=0.0)
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
@@ -126,7 +156,10 @@ def test_the_ferraris_accelerometers_are_a_sample_or_two_late_which_is_not_repor
         assert not reported(ferrari.cut(start, stop))
     # `vehest data align` finds 0.2 to 22.6 ms by another method: the intervals meet.
     drive = ferrari.cut(150.0, 450.0)
-    for delay in (between(drive, "ax", "vx_ref").delay, between(drive, "vy_ref", "ay").turned.delay):
+    for delay in (
+        between(drive, "ax", "vx_ref").delay,
+        between(drive, "vy_ref", "ay").turned.delay,
+    ):
         assert max(delay.low, 0.0002) < min(delay.high, 0.0226)
 
 

@@ -18,7 +18,13 @@ REFERENCES = ("vy_ref", "sideslip_ref", "yaw_rate_ref", "vx_ref")
 
 
 def changed(recording, **changes):
-    return replace(recording, channels={**recording.channels, **{name: change(recording[name]) for name, change in changes.items()}})
+    return replace(
+        recording,
+        channels={
+            **recording.channels,
+            **{name: change(recording[name]) for name, change in changes.items()},
+        },
+    )
 
 
 def turned(recording, *names):
@@ -38,12 +44,21 @@ def signs(recording):
 @pytest.mark.parametrize("rate_hz", [5.5, 20.0, 125.0, 1000.0])
 def test_the_band_of_the_checks_is_butterworths(rate_hz):
     samples, band = 30.0 + np.cumsum(np.random.default_rng(0).normal(size=3000)), KINEMATIC_BAND_HZ
-    expected = signal.sosfiltfilt(signal.butter(2, band, btype="bandpass", fs=rate_hz, output="sos"), samples)
-    np.testing.assert_allclose(without_phase(butterworth_band(*band, rate_hz), samples), expected, rtol=0, atol=1e-9 * expected.std())
+    expected = signal.sosfiltfilt(
+        signal.butter(2, band, btype="bandpass", fs=rate_hz, output="sos"), samples
+    )
+    np.testing.assert_allclose(
+        without_phase(butterworth_band(*band, rate_hz), samples),
+        expected,
+        rtol=0,
+        atol=1e-9 * expected.std(),
+    )
 
 
 @pytest.mark.parametrize("rate", [25.0, 100.0])
-@pytest.mark.parametrize("channel", ["ay", "yaw_rate", "ax", "steer", "vy_ref", "sideslip_ref", "yaw_rate_ref"])
+@pytest.mark.parametrize(
+    "channel", ["ay", "yaw_rate", "ax", "steer", "vy_ref", "sideslip_ref", "yaw_rate_ref"]
+)
 def test_one_reversed_channel_is_named(channel, rate):
     assert signs(turned(broadband_drive(rate_hz=rate), channel)) == [channel]
 
@@ -55,35 +70,49 @@ def test_several_reversed_channels_are_all_named_with_the_products_that_contradi
     assert found.channel == "ay"
     assert found.message.startswith("ay and vx·yaw_rate disagree in sign (correlation -")
     assert "steer and yaw_rate" in found.message.split("agree: ")[0].split(";")[1]
-    assert "ay points the other way, unless steer and yaw_rate together do; set sign: -1" in found.message
+    assert (
+        "ay points the other way, unless steer and yaw_rate together do; set sign: -1"
+        in found.message
+    )
 
 
 @pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
 def test_without_steering_and_heading_no_channel_is_named(channel):
     (found,) = warned(turned(without(broadband_drive(), *REFERENCES, "steer"), channel))
     assert (found.check, found.channel) == ("sign", "")
-    assert "either ay or yaw_rate point the other way, which a steering angle or yaw_rate_ref would decide" in found.message
+    assert (
+        "either ay or yaw_rate point the other way, which a steering angle or yaw_rate_ref would decide"
+        in found.message
+    )
 
 
 def test_without_a_channel_that_decides_none_is_named():
     """A unit and a slip sensor whose y axes point to the right are as likely as one whose yaw rate counts clockwise."""
-    (found,) = warned(turned(without(broadband_drive(), "sideslip_ref", "yaw_rate_ref", "steer"), "yaw_rate"))
+    (found,) = warned(
+        turned(without(broadband_drive(), "sideslip_ref", "yaw_rate_ref", "steer"), "yaw_rate")
+    )
     assert found.channel == ""
     assert "either yaw_rate or ay and vy_ref together point the other way" in found.message
 
 
 def test_steering_may_be_the_angle_of_the_steering_wheel():
     drive = broadband_drive()
-    drive = replace(drive, channels={**without(drive, "steer").channels, "handwheel": 15.0 * drive["steer"]})
+    drive = replace(
+        drive, channels={**without(drive, "steer").channels, "handwheel": 15.0 * drive["steer"]}
+    )
     assert signs(turned(drive, "ay")) == ["ay"]
     assert signs(turned(drive, "handwheel")) == ["handwheel"]
 
 
 def test_counter_steering_and_late_yaw_rates_are_not_taken_for_reversed_channels():
     drive = broadband_drive()
-    drifting = changed(drive, vy_ref=lambda vy: vy - 12.0 * np.sign(drive["yaw_rate_ref"]), steer=np.negative)
+    drifting = changed(
+        drive, vy_ref=lambda vy: vy - 12.0 * np.sign(drive["yaw_rate_ref"]), steer=np.negative
+    )
     assert "steer" not in [finding.channel for finding in warned(drifting)]
-    assert "sign" not in {finding.check for finding in warned(broadband_drive(late={"yaw_rate": 0.1}))}
+    assert "sign" not in {
+        finding.check for finding in warned(broadband_drive(late={"yaw_rate": 0.1}))
+    }
     assert "sign" not in {finding.check for finding in warned(broadband_drive(slow_yaw_rate=0.4))}
 
 
@@ -100,13 +129,19 @@ def test_counter_steering_and_late_yaw_rates_are_not_taken_for_reversed_channels
     ],
 )
 def test_a_wrong_unit_is_named(channel, factor, unit, level):
-    found = [one for one in warned(changed(broadband_drive(), **{channel: lambda samples: factor * samples})) if one.check != "impossible"]
+    found = [
+        one
+        for one in warned(changed(broadband_drive(), **{channel: lambda samples: factor * samples}))
+        if one.check != "impossible"
+    ]
     assert [(one.level, one.check, one.channel) for one in found] == [(level, "unit", channel)]
     assert f"{channel} is in {unit}; set its unit" in found[0].message
 
 
 def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
-    found = warned(changed(broadband_drive(), ay=lambda ay: ay / GRAVITY, vy_ref=lambda vy: 3.6 * vy))
+    found = warned(
+        changed(broadband_drive(), ay=lambda ay: ay / GRAVITY, vy_ref=lambda vy: 3.6 * vy)
+    )
     assert {(one.check, one.channel) for one in found} == {("unit", "ay"), ("unit", "vy_ref")}
     # ay is a tenth of vx·yaw_rate: no factor of vx alone does that; a ninth of km/h and g together is not looked for.
     found = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), vx=lambda vx: vx * 3.6))
@@ -114,11 +149,22 @@ def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
     odd = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), ay=lambda ay: ay * 2.0))
     assert "about 1 is expected: check the units of ay, yaw_rate and vx" in odd[0].message
     drive = broadband_drive()
-    for slip in (1.0 + 6.0 * (np.sin(0.5 * drive.time) > 0.3), 3.4 + 0.8 * np.sin(0.5 * drive.time)):
-        assert "unit" not in {finding.check for finding in warned(replace(drive, channels={**drive.channels, "vx": slip * drive["vx"]}))}
+    for slip in (
+        1.0 + 6.0 * (np.sin(0.5 * drive.time) > 0.3),
+        3.4 + 0.8 * np.sin(0.5 * drive.time),
+    ):
+        assert "unit" not in {
+            finding.check
+            for finding in warned(
+                replace(drive, channels={**drive.channels, "vx": slip * drive["vx"]})
+            )
+        }
 
 
-@pytest.mark.parametrize(("offset", "level"), [(0.1, None), (0.3, "note"), (-0.3, "note"), (1.0, "warning"), (-1.0, "warning")])
+@pytest.mark.parametrize(
+    ("offset", "level"),
+    [(0.1, None), (0.3, "note"), (-0.3, "note"), (1.0, "warning"), (-1.0, "warning")],
+)
 @pytest.mark.parametrize("missing", [(), ("vy_ref", "sideslip_ref")])
 def test_an_offset_of_ay_is_found_with_its_size(offset, level, missing):
     drive = without(changed(broadband_drive(), ay=lambda ay: ay + offset), *missing)
@@ -130,7 +176,12 @@ def test_an_offset_of_ay_is_found_with_its_size(offset, level, missing):
 
 def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():
     drive = broadband_drive()
-    left = changed(drive, yaw_rate=lambda r: r + 0.4, yaw_rate_ref=lambda r: r + 0.4, ay=lambda ay: 1.06 * (ay + 0.4 * drive["vx_ref"]))
+    left = changed(
+        drive,
+        yaw_rate=lambda r: r + 0.4,
+        yaw_rate_ref=lambda r: r + 0.4,
+        ay=lambda ay: 1.06 * (ay + 0.4 * drive["vx_ref"]),
+    )
     assert np.mean(left["ay"] - left["vx_ref"] * left["yaw_rate"]) > 0.4
     assert "offset" not in {finding.check for finding in checks_of_recording(left)}
 
@@ -138,7 +189,10 @@ def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():
 @pytest.mark.parametrize("seed", range(25))
 def test_no_recording_raises_or_warns(seed):
     generator = np.random.default_rng(seed)
-    length, rate = int(generator.choice([1, 2, 3, 50, 400, 4000])), float(generator.choice([0.01, 5.0, 25.0, 100.0, 1e5]))
+    length, rate = (
+        int(generator.choice([1, 2, 3, 50, 400, 4000])),
+        float(generator.choice([0.01, 5.0, 25.0, 100.0, 1e5])),
+    )
     walk = 0.02 * np.cumsum(generator.standard_normal(length))
     kinds = [
         np.zeros(length),
@@ -152,14 +206,27 @@ def test_no_recording_raises_or_warns(seed):
         20.0 + walk,
     ]
     channels, gappy = {}, set()
-    for name in ("vx", "yaw_rate", "ax", "ay", "steer", "vx_ref", "vy_ref", "sideslip_ref", "yaw_rate_ref", "motor_speed"):
+    for name in (
+        "vx",
+        "yaw_rate",
+        "ax",
+        "ay",
+        "steer",
+        "vx_ref",
+        "vy_ref",
+        "sideslip_ref",
+        "yaw_rate_ref",
+        "motor_speed",
+    ):
         samples = kinds[generator.integers(len(kinds))].copy()
         if generator.random() < 0.2:
             samples[generator.random(length) < generator.choice([0.01, 0.5, 1.0])] = np.nan
             gappy.add(name)
         if generator.random() < 0.85:
             channels[name] = samples
-    recording = Recording("r", "car", rate, 0.0, channels or {"vx": kinds[0]}, gappy=frozenset(gappy))
+    recording = Recording(
+        "r", "car", rate, 0.0, channels or {"vx": kinds[0]}, gappy=frozenset(gappy)
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for finding in checks_of_recording(recording):

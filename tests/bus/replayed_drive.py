@@ -13,7 +13,10 @@ JITTER, LOST = 0.001, 0.01
 SETTLED = 2.0  # s after the first estimate of both
 FERRARI = (550.0, 700.0)  # s, the test range of its drive
 MINUS = {1: "", -1: "-"}
-TOLD = ",".join(f"{name}={MINUS[entry.get('sign', 1)]}{entry['column']}:{entry['unit']}" for name, entry in SIGNALS.items())
+TOLD = ",".join(
+    f"{name}={MINUS[entry.get('sign', 1)]}{entry['column']}:{entry['unit']}"
+    for name, entry in SIGNALS.items()
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,9 @@ class Compared:
 
     online: tuple[float, float]
     offline: tuple[float, float]
-    at_sample: tuple[float, float]  # those online if estimates counted for the instant of their sample, as if filters took no time
+    at_sample: tuple[
+        float, float
+    ]  # those online if estimates counted for the instant of their sample, as if filters took no time
     samples: int
     lost: int  # samples at which a channel was missing
     latest_ms: float  # the longest step, as fast as it goes
@@ -46,7 +51,9 @@ def compare(model, drive, folder, output=None):
     offline = estimate(fitted, drive.without_references())
     table = folder / "estimates.csv"
     words = {"model": model, "dbc": written.dbc, "signals": told_for(fitted.channels)}
-    figures = replay_log(written.log, [f"output={output}"] if output else [], speed="max", out=table, **words)
+    figures = replay_log(
+        written.log, [f"output={output}"] if output else [], speed="max", out=table, **words
+    )
     online = pd.read_csv(table).dropna(subset=["vy", "sideslip"])
     known = ~np.isnan(offline["vy"])
     begin = SETTLED + max(online["time"].iloc[0] + written.origin, offline.time[known][0])
@@ -55,7 +62,9 @@ def compare(model, drive, folder, output=None):
     def errors(times, vy, sideslip):
         inside = (times >= begin) & (times <= end)
         v = vy[inside] - np.interp(times[inside], drive.time, drive["vy_ref"])
-        beta = np.degrees(sideslip[inside] - np.interp(times[inside], drive.time, drive["sideslip_ref"]))
+        beta = np.degrees(
+            sideslip[inside] - np.interp(times[inside], drive.time, drive["sideslip_ref"])
+        )
         return float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(beta**2)))
 
     estimates = (online["vy"].to_numpy(), online["sideslip"].to_numpy())

@@ -9,7 +9,9 @@ from refusals import refusal
 from vehest.data.errors import ConfigurationError
 from vehest.trust.health import NO_ESTIMATE, reason_in_words
 
-cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+cantools = pytest.importorskip(
+    "cantools", reason="cantools is not installed: pip install 'vehest[bus]'"
+)
 pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 
 from vehest.bus.messages import EstimateFrames, dbc_text  # noqa: E402
@@ -32,22 +34,43 @@ def decoded(said, first_id=1776):
 
 
 def test_cantools_reads_back_what_was_sent_within_half_a_step():
-    rng, most = np.random.default_rng(0), {"vy": 60, "sideslip": math.pi, "yaw_rate": 4, "band_vy": 100, "band_sideslip": math.pi}
+    rng, most = (
+        np.random.default_rng(0),
+        {"vy": 60, "sideslip": math.pi, "yaw_rate": 4, "band_vy": 100, "band_sideslip": math.pi},
+    )
     for _ in range(200):
         said = {name: rng.uniform(0 if "band" in name else -own, own) for name, own in most.items()}
         said |= {"health": float(rng.integers(3)), "health_reason": 10000.0 * NO_ESTIMATE}
         found = decoded(said)
         for name, (signal, factor) in NAMES.items():
-            assert float(str(found[signal])) == pytest.approx(said[name] * factor, abs=0.00025 + 1e-9)
+            assert float(str(found[signal])) == pytest.approx(
+                said[name] * factor, abs=0.00025 + 1e-9
+            )
         assert str(found["Health"]) == ("valid", "degraded", "invalid")[int(said["health"])]
         assert reason_in_words(float(str(found["HealthReason"]))) == "there is no estimate"
 
 
 def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signal_are_cut_off():
     found = decoded({"vy": math.nan, "sideslip": math.nan})
-    assert {str(found[name]) for name in (*(signal for signal, _ in NAMES.values()), "Health")} == {"not available"}
-    found = decoded({"vy": 1e300, "sideslip": -math.inf, "yaw_rate": -50.0, "band_vy": math.inf, "band_sideslip": 1e9, "health": 2.0})
-    ends = {"LateralVelocity": 262.1435, "SideslipAngle": -262.1435, "YawRate": -13.1071, "LateralVelocityBand": 524.287}
+    assert {str(found[name]) for name in (*(signal for signal, _ in NAMES.values()), "Health")} == {
+        "not available"
+    }
+    found = decoded(
+        {
+            "vy": 1e300,
+            "sideslip": -math.inf,
+            "yaw_rate": -50.0,
+            "band_vy": math.inf,
+            "band_sideslip": 1e9,
+            "health": 2.0,
+        }
+    )
+    ends = {
+        "LateralVelocity": 262.1435,
+        "SideslipAngle": -262.1435,
+        "YawRate": -13.1071,
+        "LateralVelocityBand": 524.287,
+    }
     assert {name: found[name] for name in ends} == pytest.approx(ends)
     assert decoded({"vy": 1.0, "sideslip": 0.0}, 0x123)["LateralVelocity"] == pytest.approx(1.0)
     assert "must lie between" in refusal(lambda: dbc_text(0x7FF), ConfigurationError)
@@ -56,6 +79,11 @@ def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signa
 def test_the_alive_counter_counts_estimates_modulo_16_in_both_frames():
     database, frames = cantools.database.load_string(dbc_text(), "dbc"), EstimateFrames()
     for k in range(40):
-        first, second = frames({"vy": 0.0, "sideslip": 0.0, "health": 0.0, "health_reason": 0.0}, 0.0)
+        first, second = frames(
+            {"vy": 0.0, "sideslip": 0.0, "health": 0.0, "health_reason": 0.0}, 0.0
+        )
         assert database.decode_message(first.arbitration_id, first.data)["AliveCounter"] == k % 16
-        assert database.decode_message(second.arbitration_id, second.data)["BandAliveCounter"] == k % 16
+        assert (
+            database.decode_message(second.arbitration_id, second.data)["BandAliveCounter"]
+            == k % 16
+        )

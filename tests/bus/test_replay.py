@@ -16,7 +16,9 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.run.replay import replay_log
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
-cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+cantools = pytest.importorskip(
+    "cantools", reason="cantools is not installed: pip install 'vehest[bus]'"
+)
 
 from can_drive import DBC, SIGNALS, ferrari, write_log  # noqa: E402
 from replayed_drive import FERRARI, compare, told_for  # noqa: E402
@@ -49,7 +51,9 @@ def by_cantools(written):
     return found
 
 
-def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold_for_their_sample_less_the_filters_delay(tmp_path):
+def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold_for_their_sample_less_the_filters_delay(
+    tmp_path,
+):
     written = write_log(drive(), tmp_path, jitter=0.001)
     figures = replayed(written, out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
@@ -63,7 +67,9 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
             last = said
     assert figures["samples_lost"] == 0
     assert figures["estimates"] == len(table) == len(expected)
-    np.testing.assert_allclose(table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9
+    )
     replayed(write_log(drive(), tmp_path), out=tmp_path / "out.csv")
     table, ahead = pd.read_csv(tmp_path / "out.csv"), stepper.horizon_steps / 20.0 - stepper.delay
     # frames come at whole cycles, 0 and 0.4 ms behind them; samples in the middle of the rest
@@ -74,7 +80,10 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
 def test_lost_frames_are_missing_samples(tmp_path):
     written = write_log(drive(30.0), tmp_path, jitter=0.001, lost=0.02)
     figures, lost = replayed(written), written.lost
-    assert figures["missing"] == {"vx": len(lost["Speed"]), **dict.fromkeys(("yaw_rate", "ay", "ax"), len(lost["IMU"]))}
+    assert figures["missing"] == {
+        "vx": len(lost["Speed"]),
+        **dict.fromkeys(("yaw_rate", "ay", "ax"), len(lost["IMU"])),
+    }
     assert figures["samples_lost"] == len({*lost["IMU"], *lost["Speed"]})
 
 
@@ -85,14 +94,25 @@ def test_frames_of_estimates_say_what_the_table_says(tmp_path):
     assert figures["written"] == [str(tmp_path / "sent.asc"), str(tmp_path / "sent.dbc")]
     table = pd.read_csv(tmp_path / "out.csv")
     database = cantools.database.load_file(tmp_path / "sent.dbc")
-    frames = [(frame, database.decode_message(frame.arbitration_id, frame.data)) for frame in can.LogReader(tmp_path / "sent.asc")]
+    frames = [
+        (frame, database.decode_message(frame.arbitration_id, frame.data))
+        for frame in can.LogReader(tmp_path / "sent.asc")
+    ]
     said = [values for frame, values in frames if frame.arbitration_id == 0x321]
     assert len(said) == len(table) == len(frames) / 2
     assert [values["AliveCounter"] for values in said] == [k % 16 for k in range(len(said))]
-    known = [k for k, values in enumerate(said) if str(values["LateralVelocity"]) != "not available"]
+    known = [
+        k for k, values in enumerate(said) if str(values["LateralVelocity"]) != "not available"
+    ]
     assert known == np.flatnonzero(table["vy"].notna()).tolist()
-    np.testing.assert_allclose([said[k]["LateralVelocity"] for k in known], table["vy"].iloc[known], atol=0.0003)
-    np.testing.assert_allclose([said[k]["SideslipAngle"] for k in known], np.degrees(table["sideslip"].iloc[known]), atol=0.0003)
+    np.testing.assert_allclose(
+        [said[k]["LateralVelocity"] for k in known], table["vy"].iloc[known], atol=0.0003
+    )
+    np.testing.assert_allclose(
+        [said[k]["SideslipAngle"] for k in known],
+        np.degrees(table["sideslip"].iloc[known]),
+        atol=0.0003,
+    )
 
 
 def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path):
@@ -100,7 +120,9 @@ def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path):
     figures = replayed(written, speed="4", out=tmp_path / "out.csv")
     assert figures["frames_sent"] == figures["frames_received"] == 600
     assert figures["samples"] == pytest.approx(300, abs=3)
-    assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"] == pytest.approx(60, abs=1)
+    assert (
+        len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"] == pytest.approx(60, abs=1)
+    )
 
 
 @pytest.mark.parametrize("speed", ["max", "1"])
@@ -114,17 +136,38 @@ def test_what_was_written_before_a_stop_is_kept(tmp_path, speed):
     assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]
 
 
-def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_as_words_do(tmp_path):
+def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_as_words_do(
+    tmp_path,
+):
     text = 'VERSION ""\n\nBO_ 5 A: 8 X\n SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
     (tmp_path / "own.dbc").write_text(text)
-    assert from_names(tmp_path / "own.dbc", ["vx", "ay"]).factors == {"vx": 1.0, "ay": pytest.approx(9.80665)}
+    assert from_names(tmp_path / "own.dbc", ["vx", "ay"]).factors == {
+        "vx": 1.0,
+        "ay": pytest.approx(9.80665),
+    }
     with pytest.raises(ConfigurationError, match="the model reads channel 'ax'"):
         from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"])
-    assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {"vx", "ay"}
+    assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {
+        "vx",
+        "ay",
+    }
     written = write_log(drive(1.0), tmp_path)
-    dataset = {"name": "mine", "source": "can", "dbc": str(written.dbc), "path": str(tmp_path), "rate_hz": 100, "channels": SIGNALS}
-    maps = from_dataset(dataset, CHANNELS), from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(","))
-    declared, named = ((own.factors, {name: (one.message.name, one.signal) for name, one in own.wanted.items()}) for own in maps)
+    dataset = {
+        "name": "mine",
+        "source": "can",
+        "dbc": str(written.dbc),
+        "path": str(tmp_path),
+        "rate_hz": 100,
+        "channels": SIGNALS,
+    }
+    maps = (
+        from_dataset(dataset, CHANNELS),
+        from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(",")),
+    )
+    declared, named = (
+        (own.factors, {name: (one.message.name, one.signal) for name, one in own.wanted.items()})
+        for own in maps
+    )
     assert declared == named
 
 
@@ -134,15 +177,27 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
         ({"signals": "ay"}, "takes CHANNEL=MESSAGE.SIGNAL"),
         ({"signals": "steer=SteerAng"}, "'steer', which the model does not read"),
         ({"signals": "vx=VehSpd"}, "reads channel 'yaw_rate', and no signal"),
-        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")}, "'parsec' of signal 'Speed.VehSpd' is no unit"),
-        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")}, "is in 'km/h' by the file and in 'm/s'"),
-        ({"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")}, "stands in several messages"),
+        (
+            {"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")},
+            "'parsec' of signal 'Speed.VehSpd' is no unit",
+        ),
+        (
+            {"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")},
+            "is in 'km/h' by the file and in 'm/s'",
+        ),
+        (
+            {"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")},
+            "stands in several messages",
+        ),
         ({"dbc": None}, "nothing describes the bus"),
         ({"dataset": "tabular", "signals": ""}, "is of source 'tabular'"),
         ({"dataset": "can"}, "both name the channels"),
         ({"speed": "-1"}, "--speed must be"),
         ({"speed": "max", "interface": "socketcan"}, "needs the virtual bus"),
-        ({"speed": "1", "interface": "nonsense"}, "cannot open channel 'vehest' of interface 'nonsense'"),
+        (
+            {"speed": "1", "interface": "nonsense"},
+            "cannot open channel 'vehest' of interface 'nonsense'",
+        ),
         ({"identifier": "0x120"}, "has a message 0x120, as estimates would"),
         ({"bus_rate": 10.0}, "too slow for an estimator that works at 20 Hz"),
         ({"out": Path("out.parquet")}, "must end in .csv or .asc"),
@@ -158,7 +213,9 @@ def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
     assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
 
 
-def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(tmp_path):
+def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(
+    tmp_path,
+):
     written = write_log(drive(2.0), tmp_path)
     before = written.log.read_bytes()
     with pytest.raises(ConfigurationError, match="is an input"):
@@ -171,17 +228,30 @@ def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_w
             replayed(written, speed=speed)
 
 
-FIGURES = Figures(frames_sent=30, frames_received=20, samples=10, samples_lost=1, estimates=2, latest_ms=1.2)
+FIGURES = Figures(
+    frames_sent=30, frames_received=20, samples=10, samples_lost=1, estimates=2, latest_ms=1.2
+)
 
 
 def test_the_view_shows_estimate_band_health_and_reason_in_a_line_every_ten_seconds():
     stream = io.StringIO()
-    values = {"vy": 0.5, "sideslip": math.radians(-1.25), "band_vy": 0.1, "band_sideslip": math.radians(0.5)}
-    for view, shown in ((View(stream), {**values, "health": 2.0, "health_reason": 3e5}), (View(stream), {}), (View(None), {})):
+    values = {
+        "vy": 0.5,
+        "sideslip": math.radians(-1.25),
+        "band_vy": 0.1,
+        "band_sideslip": math.radians(0.5),
+    }
+    for view, shown in (
+        (View(stream), {**values, "health": 2.0, "health_reason": 3e5}),
+        (View(stream), {}),
+        (View(None), {}),
+    ):
         view.show(FIGURES, shown, 10.1)
         view.show(FIGURES, shown, 10.2)
     first, second = stream.getvalue().splitlines()
-    assert first.startswith("time 10.1 s, v +0.500 ± 0.100 m/s, β -1.25 ± 0.50 °, health invalid: there is no estimate, 2 estimates, ")
+    assert first.startswith(
+        "time 10.1 s, v +0.500 ± 0.100 m/s, β -1.25 ± 0.50 °, health invalid: there is no estimate, 2 estimates, "
+    )
     assert second.startswith("time 10.1 s, v -, β -, health -, ")
 
 

@@ -22,32 +22,88 @@ TOLD = told_for(("vx", "yaw_rate", "ax", "ay"))
 @pytest.fixture
 def bus(place):
     """A log of ten seconds, its DBC, and a data set that describes both."""
-    write_log(planar_drive(10.0, 100.0, seed=2), place.folder / "raw" / "bus", jitter=0.001, lost=0.01)
+    write_log(
+        planar_drive(10.0, 100.0, seed=2), place.folder / "raw" / "bus", jitter=0.001, lost=0.01
+    )
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
-    described = {"kind": "simulated", "vehicle": "car", "licence": "none", "citation": "none", "source": "can", "rate_hz": 100}
-    described |= {"path": "${root}/bus", "files": "*.asc", "dbc": "${root}/bus/car.dbc", "channels": channels}
+    described = {
+        "kind": "simulated",
+        "vehicle": "car",
+        "licence": "none",
+        "citation": "none",
+        "source": "can",
+        "rate_hz": 100,
+    }
+    described |= {
+        "path": "${root}/bus",
+        "files": "*.asc",
+        "dbc": "${root}/bus/car.dbc",
+        "channels": channels,
+    }
     place.change("conf/dataset/bus.yaml", name="bus", **described)
     return place
 
 
 def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_in_plain_lines(bus):
-    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--json", "--quiet", "-o", "out.csv")
+    words = (
+        "--dbc",
+        "raw/bus/car.dbc",
+        "--signals",
+        TOLD,
+        "--speed",
+        "max",
+        "--json",
+        "--quiet",
+        "-o",
+        "out.csv",
+    )
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert (code, err) == (0, "")
     figures = json.loads(out)
     assert figures["samples_hz"] == 100.0
     assert figures["estimates"] == len(pd.read_csv("out.csv")) == 200
     assert figures["written"] == ["out.csv"]
-    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--quiet", "--write-dbc", "own.dbc", "--id", "0x100")
+    words = (
+        "--dbc",
+        "raw/bus/car.dbc",
+        "--signals",
+        TOLD,
+        "--speed",
+        "max",
+        "--quiet",
+        "--write-dbc",
+        "own.dbc",
+        "--id",
+        "0x100",
+    )
     assert bus("replay", "raw/bus/drive.asc", *words)[0] == 0
     assert "BO_ 256 VehestEstimate: 8" in Path("own.dbc").read_text()
-    _, err = bus.done("replay", "raw/bus/drive.asc", "--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max")
+    _, err = bus.done(
+        "replay",
+        "raw/bus/drive.asc",
+        "--dbc",
+        "raw/bus/car.dbc",
+        "--signals",
+        TOLD,
+        "--speed",
+        "max",
+    )
     assert err.startswith("time ")
     assert "\x1b" not in err
 
 
 def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_line(bus):
-    code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
+    code, _, err = bus(
+        "replay",
+        "raw/bus/drive.asc",
+        "--dataset",
+        "bus",
+        "--speed",
+        "max",
+        "--quiet",
+        "-o",
+        "online.csv",
+    )
     assert (code, err) == (0, "")
     bus.done("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
     online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")

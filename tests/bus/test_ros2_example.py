@@ -23,7 +23,9 @@ START = 1_700_000_000  # s
 
 @pytest.fixture(scope="module")
 def node():
-    return SimpleNamespace(**runpy.run_path(str(EXAMPLE / "sideslip_node.py"), run_name="sideslip_node"))
+    return SimpleNamespace(
+        **runpy.run_path(str(EXAMPLE / "sideslip_node.py"), run_name="sideslip_node")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,9 @@ def made(types, kind, **fields):
 
 def header(types, time):
     nanoseconds = START * 10**9 + round(1e9 * time)
-    stamp = made(types, "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+    stamp = made(
+        types, "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
+    )
     return made(types, "std_msgs/msg/Header", stamp=stamp, frame_id="base_link")
 
 
@@ -69,7 +73,9 @@ def speed(types, time, vx):
 
 def through(types, message):
     """As it arrives on the other side of a wire."""
-    return types.deserialize_cdr(types.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
+    return types.deserialize_cdr(
+        types.serialize_cdr(message, message.__msgtype__), message.__msgtype__
+    )
 
 
 def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path, node, types):
@@ -78,13 +84,24 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path,
     samples, sent, expected, last = node.Samples(), [], [], stepper.last
     for k in range(len(drive)):
         samples.speed(through(types, speed(types, k / 100, drive["vx"][k])))
-        time, sample = samples.imu(through(types, imu(types, k / 100, *(drive[name][k] for name in ("yaw_rate", "ax", "ay")))))
+        time, sample = samples.imu(
+            through(
+                types, imu(types, k / 100, *(drive[name][k] for name in ("yaw_rate", "ax", "ay")))
+            )
+        )
         said = stepper.step(sample, time)
         plain = bare.step({name: drive[name][k] for name in ("vx", "yaw_rate", "ax", "ay")})
         if said is not last:
             last = said
             expected.append(plain["vy"])
-            sent.append(made(types, KIND, header=header(types, time - START + node.ahead_of(stepper)), **node.fields_of(said)))
+            sent.append(
+                made(
+                    types,
+                    KIND,
+                    header=header(types, time - START + node.ahead_of(stepper)),
+                    **node.fields_of(said),
+                )
+            )
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
         topic = bag.add_connection("/sideslip", KIND, typestore=types)
         for k, message in enumerate(sent):
@@ -94,7 +111,11 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path,
     assert len(got) == len(expected) == 400
     np.testing.assert_array_equal([message.lateral_velocity for message in got], expected)
     assert [message.reason for message in got] == [message.reason for message in sent]
-    assert {message.health for message in got[100:]} <= {types.types[KIND].VALID, types.types[KIND].DEGRADED, types.types[KIND].INVALID}
+    assert {message.health for message in got[100:]} <= {
+        types.types[KIND].VALID,
+        types.types[KIND].DEGRADED,
+        types.types[KIND].INVALID,
+    }
     held = node.seconds(got[-1].header.stamp) - START
     assert held == pytest.approx(19.95 + 1 / 20 - stepper.delay, abs=1e-6)
 

@@ -12,7 +12,11 @@ CYCLE = 0.01
 
 def arrivals(n=2000, phase=0.003, jitter=0.0, period=CYCLE, seed=0):
     rng = np.random.default_rng(seed)
-    return phase + period * np.arange(n) + rng.uniform(0.0, jitter, n) if jitter else phase + period * np.arange(n)
+    return (
+        phase + period * np.arange(n) + rng.uniform(0.0, jitter, n)
+        if jitter
+        else phase + period * np.arange(n)
+    )
 
 
 def run(timing, frames, until):
@@ -29,24 +33,36 @@ def run(timing, frames, until):
 
 
 def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle_and_a_rate_that_is_none_is_refused():
-    timing = timing_of({"ay": arrivals(phase=0.001), "vx": arrivals(phase=0.003), "steer": arrivals(phase=0.002)})
+    timing = timing_of(
+        {"ay": arrivals(phase=0.001), "vx": arrivals(phase=0.003), "steer": arrivals(phase=0.002)}
+    )
     assert timing.rate_hz == 100.0
     assert timing.start % CYCLE == pytest.approx(0.007, abs=1e-6)  # the pause from 3 ms to 11 ms
     clock = {"ay": 0.001, "vx": 0.003, "steer": 0.002}[timing.clock]
     assert timing.offset == pytest.approx((0.007 - clock) % CYCLE, abs=1e-6)
-    assert "must be a positive number" in refusal(lambda: timing_of({"ay": arrivals()}, -5.0), ConfigurationError)
-    assert "repeat their time stamps" in refusal(lambda: timing_of({"ay": np.zeros(10)}), ConfigurationError)
+    assert "must be a positive number" in refusal(
+        lambda: timing_of({"ay": arrivals()}, -5.0), ConfigurationError
+    )
+    assert "repeat their time stamps" in refusal(
+        lambda: timing_of({"ay": np.zeros(10)}), ConfigurationError
+    )
 
 
 def test_every_frame_is_in_one_sample_however_it_jitters_or_its_clock_is_wrong_by_100_ppm():
     stamps = arrivals(jitter=0.005, seed=4)
     timing = timing_of({"ay": stamps})
-    found = run(timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(stamps)], stamps[-1] + 0.002)
+    found = run(
+        timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(stamps)], stamps[-1] + 0.002
+    )
     values = [sample["ay"] for _, sample, missing in found if not missing]
     assert len(values) >= len(stamps) - 2
     assert np.diff(values).min() == np.diff(values).max() == 1.0
     stamps = arrivals(n=60_000, period=CYCLE * (1 + 1e-4))  # ten minutes, 60 ms of drift
-    found = run(Timing(100.0, {"ay": CYCLE}, "ay", 0.005, 0.008), [(stamp, {"ay": 1.0}) for stamp in stamps], stamps[-1])
+    found = run(
+        Timing(100.0, {"ay": CYCLE}, "ay", 0.005, 0.008),
+        [(stamp, {"ay": 1.0}) for stamp in stamps],
+        stamps[-1],
+    )
     assert not any(missing for _, _, missing in found)
     assert len(found) == pytest.approx(len(stamps), abs=1)
 
@@ -55,7 +71,10 @@ def test_lost_frames_are_missing_samples_and_a_late_one_is_superseded_at_the_nex
     stamps = arrivals(jitter=0.001)
     lost = {50, 51, 700, 1203}
     timing = timing_of({"ay": stamps, "vx": stamps})
-    frames = [(stamp, {"ay": float(k)} if k in lost else {"ay": float(k), "vx": float(k)}) for k, stamp in enumerate(stamps)]
+    frames = [
+        (stamp, {"ay": float(k)} if k in lost else {"ay": float(k), "vx": float(k)})
+        for k, stamp in enumerate(stamps)
+    ]
     found = run(timing, frames, stamps[-1])
     assert {int(values["ay"]) for _, values, missing in found if missing == ["vx"]} == lost
     assert all("vx" not in values for _, values, missing in found if missing)
@@ -72,7 +91,9 @@ def test_lost_frames_are_missing_samples_and_a_late_one_is_superseded_at_the_nex
 def test_slower_messages_hold_for_their_own_period_and_no_longer():
     fast, slow = arrivals(), arrivals(n=400, phase=0.0031, period=0.05)
     timing = timing_of({"ay": fast, "vx": slow})
-    frames = [(stamp, {"ay": 1.0}) for stamp in fast] + [(stamp, {"vx": 2.0}) for k, stamp in enumerate(slow) if k != 200]
+    frames = [(stamp, {"ay": 1.0}) for stamp in fast] + [
+        (stamp, {"vx": 2.0}) for k, stamp in enumerate(slow) if k != 200
+    ]
     missing = [time for time, _, gone in run(timing, frames, fast[-1]) if "vx" in gone]
     assert len(missing) == 5
     assert missing[0] == pytest.approx(slow[200] + timing.offset, abs=CYCLE)

@@ -24,7 +24,9 @@ def install(folder):
     commands.mkdir(parents=True)
     for name in COMMANDS:
         file = commands / name
-        file.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).resolve()}" "{folder}" {name} "$@"\n')
+        file.write_text(
+            f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).resolve()}" "{folder}" {name} "$@"\n'
+        )
         file.chmod(0o755)
     return {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
 
@@ -53,7 +55,13 @@ def sbatch(folder, script):
     for own in [f"{job}_{index}" for index in range(int(found[1]) + 1)] if found else [job]:
         _set(folder, own, state="PENDING")
         words = [sys.executable, __file__, str(folder), "turn", script, own]
-        subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        subprocess.Popen(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
     print(f"Submitted batch job {job}")
 
 
@@ -62,7 +70,11 @@ def turn(folder, script, own):
     job, _, index = own.partition("_")
     variables = {"JOB_ID": own, "PROCID": "0", "LOCALID": "0", "NTASKS": "1", "NODEID": "0"}
     variables |= {"ARRAY_JOB_ID": job, "ARRAY_TASK_ID": index} if index else {}
-    environment = {**os.environ, **{f"SLURM_{name}": value for name, value in variables.items()}, "SLURM_JOB_NUM_NODES": "1"}
+    environment = {
+        **os.environ,
+        **{f"SLURM_{name}": value for name, value in variables.items()},
+        "SLURM_JOB_NUM_NODES": "1",
+    }
     while True:
         while sum(state == "RUNNING" for state in states(folder).values()) >= AT_A_TIME:
             time.sleep(MOMENT)

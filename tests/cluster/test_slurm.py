@@ -11,7 +11,10 @@ from two_nodes import Driver, metrics, under_way, weights, with_recordings
 
 pytestmark = [
     pytest.mark.cluster,
-    pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="submitit is not installed: pip install 'vehest[slurm]'"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("submitit") is None,
+        reason="submitit is not installed: pip install 'vehest[slurm]'",
+    ),
 ]
 
 
@@ -25,20 +28,39 @@ def queue(tmp_path):
 
 def with_a_checkpoint(output, but=None):
     """A training under way, of another process than that of an entry."""
-    return next((entry for entry in under_way(output) if but is None or entry["pid"] != but["pid"]), None)
+    return next(
+        (entry for entry in under_way(output) if but is None or entry["pid"] != but["pid"]), None
+    )
 
 
 def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, alone, tmp_path):  # noqa: F811
     output = with_recordings(alone["forty"], tmp_path / "out")
-    Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2").ends()
+    Driver(
+        folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2"
+    ).ends()
     assert metrics(output) == metrics(alone["forty"])
     assert weights(output) == weights(alone["forty"])
     assert not list(output.glob("clusters/*")), "what was handed over is forgotten"
 
 
-def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(folder, alone, queue, tmp_path):  # noqa: F811
+def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(
+    folder,  # noqa: F811
+    alone,  # noqa: F811
+    queue,
+    tmp_path,
+):
     output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
-    driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", "--slurm", "minutes=10", **environment)
+    driver = Driver(
+        folder,
+        output,
+        "sweep",
+        *LONGER,
+        "--launcher",
+        "slurm",
+        "--slurm",
+        "minutes=10",
+        **environment,
+    )
     lost = driver.sees(lambda: with_a_checkpoint(output))
     os.kill(lost["pid"], signal.SIGKILL)
     put_back = driver.sees(lambda: with_a_checkpoint(output, but=lost))
@@ -60,7 +82,12 @@ def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, 
     assert metrics(output) == metrics(alone["longer"])
 
 
-def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
+def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(
+    folder,  # noqa: F811
+    alone,  # noqa: F811
+    queue,
+    tmp_path,
+):
     output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
     sbatch = queue / "bin" / "sbatch"
     takes_jobs = sbatch.read_text()

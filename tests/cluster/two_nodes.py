@@ -24,7 +24,11 @@ class TwoNodes:
         self._cluster.wait_for_nodes()
 
     def _add(self, **options):
-        return self._cluster.add_node(num_cpus=1, env_vars={"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}, **options)
+        return self._cluster.add_node(
+            num_cpus=1,
+            env_vars={"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"},
+            **options,
+        )
 
     @property
     def address(self):
@@ -98,7 +102,11 @@ def under_way(output):
         name = file.name.removeprefix("train-").removesuffix(".lock")
         words = file.read_text(encoding="utf-8").split()
         alive = len(words) > 1 and Path(f"/proc/{words[1]}").exists()
-        if alive and not (output / "train" / name).exists() and (output / "checkpoints" / name / "checkpoint.safetensors").exists():
+        if (
+            alive
+            and not (output / "train" / name).exists()
+            and (output / "checkpoints" / name / "checkpoint.safetensors").exists()
+        ):
             found.append({"name": name, "pid": int(words[1])})
     return found
 

@@ -52,15 +52,24 @@ def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path):
         with written_aside(tmp_path / "folder", replace_folder=True) as aside:
             aside.mkdir()
             (aside / content).write_text(content)
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/two"]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
+        "folder",
+        "folder/two",
+    ]
 
 
 def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "old").write_text("old")
-    with pytest.raises(MissingError, match="cannot write"), written_aside(tmp_path / "folder") as aside:
+    with (
+        pytest.raises(MissingError, match="cannot write"),
+        written_aside(tmp_path / "folder") as aside,
+    ):
         aside.write_text("new")
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == [
+        "folder",
+        "folder/old",
+    ]
 
 
 def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp_path):
@@ -72,7 +81,9 @@ def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp
     (tmp_path / f"{ASIDE_PREFIX}{os.getpid()}-abc-file").write_text("growing")
     (tmp_path / "kept").write_text("whole")
     assert remove_leftovers(tmp_path) == 3
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["kept", f"{ASIDE_PREFIX}{os.getpid()}-abc-file"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        ["kept", f"{ASIDE_PREFIX}{os.getpid()}-abc-file"]
+    )
     assert remove_leftovers(tmp_path / "nowhere") == 0
 
 
@@ -80,7 +91,12 @@ def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
     script = "import os, sys, pathlib\nfrom vehest.data.files import written_aside\n"
     script += "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n    os.kill(os.getpid(), 9)\n"
     (tmp_path / "file").write_text("old")
-    assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "file")], check=False).returncode == -9
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", script, str(tmp_path / "file")], check=False
+        ).returncode
+        == -9
+    )
     assert (tmp_path / "file").read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 2
     assert remove_leftovers(tmp_path) == 1

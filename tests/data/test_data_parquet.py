@@ -14,7 +14,11 @@ N = 1000
 
 def columns():
     generator = np.random.default_rng(0)
-    return {"time": np.arange(N) / 100.0, "vx": generator.normal(20.0, 1.0, N), "gear": generator.integers(1, 6, N)}
+    return {
+        "time": np.arange(N) / 100.0,
+        "vx": generator.normal(20.0, 1.0, N),
+        "gear": generator.integers(1, 6, N),
+    }
 
 
 def written(folder, content, **options):
@@ -35,7 +39,11 @@ def refused(file):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"row_group_size": 77, "compression": "none"}, {"data_page_size": 100, "compression": "zstd", "write_page_checksum": True}],
+    [
+        {},
+        {"row_group_size": 77, "compression": "none"},
+        {"data_page_size": 100, "compression": "zstd", "write_page_checksum": True},
+    ],
     ids=str,
 )
 def test_numbers_come_out_as_they_went_in(tmp_path, options):
@@ -69,8 +77,13 @@ def test_a_column_of_something_else_than_numbers_is_named_with_its_type(tmp_path
 def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_path):
     file = written(tmp_path, columns())
     with use_limits(Limits(samples=999)):
-        assert "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER" in refused(file)
-    zeros = written(tmp_path, {name: np.zeros(100_000) for name in ("time", "vx", "ay")}, compression="zstd")
+        assert (
+            "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER"
+            in refused(file)
+        )
+    zeros = written(
+        tmp_path, {name: np.zeros(100_000) for name in ("time", "vx", "ay")}, compression="zstd"
+    )
     size = zeros.stat().st_size
     with use_limits(Limits(memory=2_400_000 - 10 * size - 1)):
         assert "unpacks to 2400000 bytes" in (said := refused(zeros))
@@ -82,7 +95,13 @@ def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_
 
 
 @pytest.mark.parametrize(
-    "content", [lambda raw: b"", lambda raw: raw[:100], lambda raw: b"PAR1" + raw[-8:], lambda raw: raw[:-8] + b"\xff" * 4 + b"PAR1"]
+    "content",
+    [
+        lambda raw: b"",
+        lambda raw: raw[:100],
+        lambda raw: b"PAR1" + raw[-8:],
+        lambda raw: raw[:-8] + b"\xff" * 4 + b"PAR1",
+    ],
 )
 def test_a_file_that_is_cut_off_is_refused(tmp_path, content):
     file = written(tmp_path, columns())

@@ -41,24 +41,36 @@ def test_consecutive_ranges_cover_every_sample_once(length, rate_hz, start_time,
 
 @PROPERTY
 @given(st.integers(1, 400), RATES, STARTS, st.data())
-def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(length, rate_hz, start_time, data):
+def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
+    length, rate_hz, start_time, data
+):
     recording = counting(length, rate_hz, start_time)
     first = data.draw(st.integers(0, length - 1))
     end = data.draw(st.integers(first + 1, length))
-    piece = recording.cut(recording.time[first], recording.time[end] if end < length else recording.end_time)
+    piece = recording.cut(
+        recording.time[first], recording.time[end] if end < length else recording.end_time
+    )
     assert piece["ay"].tolist() == list(range(first, end))
     assert piece.start_time == pytest.approx(recording.time[first], abs=1e-12, rel=1e-15)
 
 
 def test_ranges_without_samples_missing_channels_and_estimates_of_unknown_quantities_are_refused():
-    with pytest.raises(DataError, match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s"):
+    with pytest.raises(
+        DataError,
+        match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s",
+    ):
         counting(100, 100.0, 10.0).cut(10.501, 10.502)
     with pytest.raises(DataError, match=r"'lap' has no channel 'vx' \(it has ay\)"):
         _ = counting(3)["vx"]
-    for channels, said in (({"vz": np.zeros(3)}, "unknown quantity 'vz'"), ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length")):
+    for channels, said in (
+        ({"vz": np.zeros(3)}, "unknown quantity 'vz'"),
+        ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length"),
+    ):
         with pytest.raises(DataError, match=said):
             Estimate("r", "ekf", 20.0, 0.0, channels)
-    assert "not None and (vy)" in refusal(lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",)))
+    assert "not None and (vy)" in refusal(
+        lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
+    )
 
 
 def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_references():
@@ -68,9 +80,17 @@ def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_refer
     assert recording["ay"][0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         recording["ay"][0] = 1.0
-    recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
+    recording = Recording(
+        "r",
+        "car",
+        10.0,
+        0.0,
+        {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")},
+    )
     assert list(recording.without_references().channels) == ["vx", "ay"]
-    assert "reference channels only" in refusal(lambda: recording.select(["vy_ref"]).without_references())
+    assert "reference channels only" in refusal(
+        lambda: recording.select(["vy_ref"]).without_references()
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,48 +100,84 @@ def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_refer
         ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "one common length"),
         ({"channels": {"ay": np.zeros((3, 1))}}, "one common length"),
         ({"channels": {"vz": np.zeros(3)}}, "'vz' is not known"),
-        ({"channels": {"ay": np.array([0.0, np.nan, 0.0])}}, "channel 'ay' holds 1 NaN between 0.1 s and 0.1 s"),
+        (
+            {"channels": {"ay": np.array([0.0, np.nan, 0.0])}},
+            "channel 'ay' holds 1 NaN between 0.1 s and 0.1 s",
+        ),
         ({"channels": {"ay": np.array([0.0, np.inf, 0.0])}}, "infinite"),
-        ({"channels": {"ay": np.array([np.nan, -np.inf])}, "gappy": frozenset({"ay"})}, "holds 1 infinite values"),
+        (
+            {"channels": {"ay": np.array([np.nan, -np.inf])}, "gappy": frozenset({"ay"})},
+            "holds 1 infinite values",
+        ),
         ({"rate_hz": 0.0}, "rate must lie between 1e-06 and 100000 Hz, not at 0 Hz"),
         ({"start_time": math.nan}, "start time must be finite"),
         ({"kind": "reel"}, "real or simulated"),
     ],
 )
 def test_what_cannot_be_a_recording_is_refused(changes, what):
-    arguments = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
+    arguments = {
+        "id": "r",
+        "vehicle": "car",
+        "rate_hz": 10.0,
+        "start_time": 0.0,
+        "channels": {"ay": np.zeros(3)},
+    }
     assert what in refusal(lambda: Recording(**(arguments | changes)))
 
 
 @PROPERTY
 @given(st.integers(1, 60), RATES, STARTS, st.integers(1, 20))
-def test_held_estimates_are_the_latest_that_are_not_in_the_future(length, rate_hz, start_time, finer):
+def test_held_estimates_are_the_latest_that_are_not_in_the_future(
+    length, rate_hz, start_time, finer
+):
     values = np.arange(float(length))
     estimate = Estimate("r", "ekf", rate_hz, start_time, {"vy": values, "sideslip": values})
     ticks = np.arange(-finer, (length + 1) * finer)  # sample k of the estimate is tick k·finer
     held = estimate.held_at(start_time + ticks / (rate_hz * finer), "vy")
-    naive = [float(tick // finer) if 0 <= tick // finer < length else math.nan for tick in ticks.tolist()]
+    naive = [
+        float(tick // finer) if 0 <= tick // finer < length else math.nan for tick in ticks.tolist()
+    ]
     np.testing.assert_array_equal(held, naive)
 
 
 SHAPES = [(shape, ("vy", "vx")) for shape in ((3, 2), (2, 2, 2), (3, 2, 1), (4, 2, 2))]
-NAMES = [((3, 2, 2), own) for own in ((), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate"))]
+NAMES = [
+    ((3, 2, 2), own) for own in ((), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate"))
+]
 
 
 @pytest.mark.parametrize(("shape", "names"), [*SHAPES, *NAMES])
 def test_a_covariance_has_a_row_a_name(shape, names):
     with pytest.raises(DataError, match=r"covariance_of name n quantities, not \([234].* and \("):
-        Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance=np.zeros(shape), covariance_of=names)
+        Estimate(
+            "r",
+            "ekf",
+            20.0,
+            0.0,
+            {"vy": np.zeros(3)},
+            covariance=np.zeros(shape),
+            covariance_of=names,
+        )
 
 
 def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
     covariance = np.arange(27.0).reshape(3, 3, 3)
-    estimate = Estimate("r", "ukf", 10.0, 0.0, {"vy": np.zeros(3)}, covariance=covariance, covariance_of=("vx", "vy", "friction"))
+    estimate = Estimate(
+        "r",
+        "ukf",
+        10.0,
+        0.0,
+        {"vy": np.zeros(3)},
+        covariance=covariance,
+        covariance_of=("vx", "vy", "friction"),
+    )
     held = estimate.covariance_at(np.array([-0.05, 0.1, 0.19, 0.3]), ["friction", "vx"])
     assert np.isnan(held[[0, 3]]).all()
     assert (held[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
     assert (held[2] == held[1]).all()
-    assert "a covariance of vx, vy, friction, not of yaw_rate" in refusal(lambda: estimate.covariance_at(np.zeros(1), ["yaw_rate"]))
+    assert "a covariance of vx, vy, friction, not of yaw_rate" in refusal(
+        lambda: estimate.covariance_at(np.zeros(1), ["yaw_rate"])
+    )
 
 
 def test_units_of_something_else_and_unknown_channels_are_refused():

@@ -14,7 +14,16 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample, windowed_sinc
 
-RATIOS = [(100.0, 20.0), (125.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (20.0, 100.0), (50.0, 30.0), (1000.0 / 3.0, 20.0), (400.0, 100.0)]
+RATIOS = [
+    (100.0, 20.0),
+    (125.0, 20.0),
+    (125.0, 100.0),
+    (1000.0, 20.0),
+    (20.0, 100.0),
+    (50.0, 30.0),
+    (1000.0 / 3.0, 20.0),
+    (400.0, 100.0),
+]
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True, database=None)
 every_ratio = pytest.mark.parametrize(("rate", "new_rate"), RATIOS)
 
@@ -31,11 +40,19 @@ def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
     samples, half = np.cumsum(np.random.default_rng(length).normal(size=length)), 16 * max(up, down)
     sinc, window = windowed_sinc(half, 0.86 / max(up, down), 7.0)
     np.testing.assert_array_equal(window, signal.windows.kaiser(2 * half + 1, 7.0))
-    np.testing.assert_array_equal(sinc, signal.firwin(2 * half + 1, 0.86 / max(up, down), window=("kaiser", 7.0)))
+    np.testing.assert_array_equal(
+        sinc, signal.firwin(2 * half + 1, 0.86 / max(up, down), window=("kaiser", 7.0))
+    )
     taps = Resample(new_rate)._taps(up, down)
     margin = -(-(half // up + 1) // down) * down
-    extended = np.pad(samples, margin, mode="reflect", reflect_type="odd") if length > 1 else np.pad(samples, margin, mode="edge")
-    expected = signal.resample_poly(extended, up, down, window=taps)[margin * up // down :][: -(-length * up // down)]
+    extended = (
+        np.pad(samples, margin, mode="reflect", reflect_type="odd")
+        if length > 1
+        else np.pad(samples, margin, mode="edge")
+    )
+    expected = signal.resample_poly(extended, up, down, window=taps)[margin * up // down :][
+        : -(-length * up // down)
+    ]
     found = Resample(new_rate)(recorded(samples, rate, start_time=1_700_000_000.25))
     np.testing.assert_array_equal(found["ay"], expected)
     assert (found.start_time, found.rate_hz) == (1_700_000_000.25, new_rate)
@@ -64,7 +81,9 @@ def test_the_same_rate_changes_nothing_and_channels_with_gaps_are_refused_by_the
     for method in ("polyphase", "decimate"):
         assert Resample(100.0, method=method)(recording) is recording
     samples = np.where(np.arange(20) % 4 == 0, 1.0, np.nan)
-    recording = Recording("lap", "car", 100.0, 0.0, {"ay": samples, "ax": np.zeros(20)}, gappy=frozenset({"ay"}))
+    recording = Recording(
+        "lap", "car", 100.0, 0.0, {"ay": samples, "ax": np.zeros(20)}, gappy=frozenset({"ay"})
+    )
     with pytest.raises(DataError, match="'ay' has gaps") as error:
         Resample(20.0)(recording)
     assert "method=decimate" in str(error.value)
@@ -75,7 +94,9 @@ def test_ratios_that_a_method_cannot_make_are_refused():
     for new_rate, rate in ((20.0, 99.997), (1e-9, 100.0)):
         with pytest.raises(DataError, match="not a ratio of whole numbers"):
             Resample(new_rate)(recorded(np.zeros(10), rate))
-    assert "method=polyphase" in refusal(lambda: Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0)), ConfigurationError)
+    assert "method=polyphase" in refusal(
+        lambda: Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0)), ConfigurationError
+    )
     for rate_hz in (0.0, math.nan):
         with pytest.raises(ConfigurationError, match="rate_hz must be a positive number"):
             Resample(rate_hz)

@@ -25,7 +25,9 @@ from vehest.sources.base import open_source
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True, database=None)
 CONFIGURATIONS = sorted((Path(__file__).parents[2] / "conf" / "split").glob("*.yaml"))
 
-bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(0.0, 4.0)
+bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(
+    0.0, 4.0
+)
 
 
 @st.composite
@@ -34,7 +36,13 @@ def spans(draw):
     return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
 
 
-BASE = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
+BASE = {
+    "name": "s",
+    "dataset": "d",
+    "train": [{"recording": "a"}],
+    "validation": [{"recording": "b"}],
+    "tests": {},
+}
 
 
 def refusal(config, catalogue=None):
@@ -67,7 +75,9 @@ def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
     train, validation, test = parts
     taken = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
     shared = bool(taken[0] & taken[1] or taken[0] & taken[2] or taken[1] & taken[2])
-    apart = not any(a.overlaps(b) for one, other in combinations(parts, 2) for a in one for b in other)
+    apart = not any(
+        a.overlaps(b) for one, other in combinations(parts, 2) for a in one for b in other
+    )
     assert not (apart and shared)
     if apart:
         Split("drive", train, validation, {"test": test})
@@ -78,8 +88,16 @@ def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
 
 def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
-    Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
-    with pytest.raises(ConfigurationError, match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, 6\) s\)"):
+    Split(
+        "s",
+        (Span("d", "r", 0, 1),),
+        (Span("d", "r", 1, 2),),
+        {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)},
+    )
+    with pytest.raises(
+        ConfigurationError,
+        match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, 6\) s\)",
+    ):
         Split("s", (Span("d", "r", 0, 10),), (Span("d", "v"),), {"wet": (Span("d", "r", 5, 6),)})
 
 
@@ -89,7 +107,10 @@ def test_plain_values_make_a_split_of_which_tests_alone_will_do_and_a_stretch_ru
             Span("d", "r", start, stop)
     entry = {"recording": "lap", "start": 1, "stop": 2}
     tests = {"t": [{"recording": "x"}]}
-    split = split_from_config(BASE | {"train": [entry], "validation": [{"recording": "v", "dataset": "e"}], "tests": tests})
+    split = split_from_config(
+        BASE
+        | {"train": [entry], "validation": [{"recording": "v", "dataset": "e"}], "tests": tests}
+    )
     assert split.train == (Span("d", "lap", 1.0, 2.0),)
     assert split.validation == (Span("e", "v", -math.inf, math.inf),)
     assert split.tests == {"t": (Span("d", "x"),)}
@@ -107,8 +128,14 @@ def test_plain_values_make_a_split_of_which_tests_alone_will_do_and_a_stretch_ru
         ({"train": []}, "nothing to train on"),
         ({"validation": []}, "nothing to validate on"),
         ({"train": [{"start": 3}]}, "needs a recording"),
-        ({"train": [{"recording": "a", "start": "three"}]}, "are a number of seconds or a percentage such as \"60 %\", not 'three'"),
-        ({"train": "a"}, 'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"'),
+        (
+            {"train": [{"recording": "a", "start": "three"}]},
+            "are a number of seconds or a percentage such as \"60 %\", not 'three'",
+        ),
+        (
+            {"train": "a"},
+            'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"',
+        ),
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
@@ -122,8 +149,15 @@ def test_every_split_that_is_shipped_is_one(file):
 
     def cruising(dataset):
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
-        names = open_source(about).ids() if about["source"] == "simulated" else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
-        speed, lap = np.full(20_000, 20.0), 2.0 * np.pi * np.arange(20_000) / 2000.0  # a lap of 100 s
+        names = (
+            open_source(about).ids()
+            if about["source"] == "simulated"
+            else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
+        )
+        speed, lap = (
+            np.full(20_000, 20.0),
+            2.0 * np.pi * np.arange(20_000) / 2000.0,
+        )  # a lap of 100 s
         long = {
             "ay": np.full(20_000, 3.0),
             "vx": speed,
@@ -160,23 +194,41 @@ def drives(ay, vx=None, start_time=0.0):
 def kept_of(keep, catalogue, **entry):
     """A split whose training is cut by a condition."""
     train = {"recordings": "train_*", **entry, "keep": keep}
-    return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
+    return split_from_config(
+        {"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]},
+        catalogue,
+    )
 
 
 def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
     catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
-    config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
-    assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
+    config = {
+        "name": "s",
+        "dataset": "d",
+        "train": [{"recordings": "train_*", "start": 1}],
+        "validation": [{"recording": "v"}],
+    }
+    assert split_from_config(config, catalogue).train == (
+        Span("d", "train_a", 1.0),
+        Span("d", "train_b", 1.0),
+    )
     asked = []
 
     def catalogue(dataset):
         asked.append(dataset)
         return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
 
-    plain = {"name": "s", "dataset": "d", "train": [{"recording": "a1"}], "validation": [{"recording": "b1"}]}
+    plain = {
+        "name": "s",
+        "dataset": "d",
+        "train": [{"recording": "a1"}],
+        "validation": [{"recording": "b1"}],
+    }
     split_from_config(plain, catalogue)
     assert asked == []
-    split_from_config(plain | {"train": [{"recordings": "a*"}], "validation": [{"recordings": "b*"}]}, catalogue)
+    split_from_config(
+        plain | {"train": [{"recordings": "a*"}], "validation": [{"recordings": "b*"}]}, catalogue
+    )
     assert asked == ["d"]
 
 
@@ -189,7 +241,14 @@ def test_a_condition_keeps_whole_stretches_that_last():
 
 
 @PROPERTY
-@given(st.lists(st.tuples(st.sampled_from([0.0, 5.0, -9.0, math.nan]), st.integers(1, 40)), min_size=1, max_size=12), st.integers(0, 30))
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0.0, 5.0, -9.0, math.nan]), st.integers(1, 40)),
+        min_size=1,
+        max_size=12,
+    ),
+    st.integers(0, 30),
+)
 def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces, shortest):
     ay = [value for value, length in pieces for _ in range(length)]
     expected = set()
@@ -207,7 +266,9 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
             kept_of(keep, catalogue)
         return
     recording = catalogue("d")["train_1"](["ay"])
-    ranges = [recording.index_range(span.start, span.stop) for span in kept_of(keep, catalogue).train]
+    ranges = [
+        recording.index_range(span.start, span.stop) for span in kept_of(keep, catalogue).train
+    ]
     assert {k for first, end in ranges for k in range(first, end)} == expected
     assert all(one[1] < other[0] for one, other in pairwise(ranges))
 
@@ -218,7 +279,9 @@ def test_all_channels_of_a_condition_must_meet_it_within_the_range():
     spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
     keep = {"magnitude": {"ay": {"at_most": 7.0}}}
-    spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
+    spans = kept_of(
+        keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5
+    ).train
     assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
 
 
@@ -229,13 +292,28 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
     ("entry", "what"),
     [
         ({"recordings": "lap_*"}, "no recording of data set 'd' matches 'lap_*' (it has train_1)"),
-        ({"recordings": "train_*", "recording": "train_1"}, "needs a recording or recordings, a pattern of several"),
+        (
+            {"recordings": "train_*", "recording": "train_1"},
+            "needs a recording or recordings, a pattern of several",
+        ),
         ({"recording": "train_9", "keep": CONDITION}, "no recording 'train_9'"),
         ({"keep": {"magnitude": {"lateral": {"at_most": 7.0}}}}, "there is no channel 'lateral'"),
-        ({"keep": {"magnitude": {"ay": {"at_most": -7.0}}}}, "keep.magnitude.ay: no magnitude lies between 0 and -7"),
-        ({"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}}, "keep.magnitude.ay: no magnitude lies between 8 and 7"),
-        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds: input should be greater than or equal to 0, not -1"),
-        ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
+        (
+            {"keep": {"magnitude": {"ay": {"at_most": -7.0}}}},
+            "keep.magnitude.ay: no magnitude lies between 0 and -7",
+        ),
+        (
+            {"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}},
+            "keep.magnitude.ay: no magnitude lies between 8 and 7",
+        ),
+        (
+            {"keep": {**CONDITION, "at_least_seconds": -1.0}},
+            "at_least_seconds: input should be greater than or equal to 0, not -1",
+        ),
+        (
+            {"keep": {**CONDITION, "at_least_seconds": 3.0}},
+            "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)",
+        ),
     ],
 )
 def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
@@ -243,15 +321,23 @@ def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry
     assert what in refusal(BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200}))
 
 
-@pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
+@pytest.mark.parametrize(
+    "entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}]
+)
 def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
-    assert "its patterns and the like need the recordings of data set 'd'" in refusal(BASE | {"train": [entry]})
+    assert "its patterns and the like need the recordings of data set 'd'" in refusal(
+        BASE | {"train": [entry]}
+    )
 
 
 def test_windows_share_memory_and_gaps_and_missing_channels_are_refused_by_name():
     windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
     assert windows.series.nbytes == 1000 * 2 * 8
-    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
+    channels = {
+        "vx": np.zeros(9),
+        "ay": np.where(np.arange(9) == 4, np.nan, 0.0),
+        "vy_ref": np.zeros(9),
+    }
     recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
     with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
         windows_of([recording], ["vx", "ay"], "vy_ref", 3)
@@ -262,7 +348,9 @@ def test_windows_share_memory_and_gaps_and_missing_channels_are_refused_by_name(
 
 def recorded(name, length, offset):
     samples = offset + np.arange(float(length))
-    return Recording(name, "car", 20.0, 0.0, {"vx": samples, "ay": -samples, "vy_ref": samples + 0.5})
+    return Recording(
+        name, "car", 20.0, 0.0, {"vx": samples, "ay": -samples, "vy_ref": samples + 0.5}
+    )
 
 
 @PROPERTY
@@ -272,7 +360,9 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
     expected = []
     for recording in recordings:
         for now in range(n_window - 1, len(recording) - 1):
-            past = [[recording["vx"][k], recording["ay"][k]] for k in range(now - n_window + 1, now + 1)]
+            past = [
+                [recording["vx"][k], recording["ay"][k]] for k in range(now - n_window + 1, now + 1)
+            ]
             expected.append((past, recording["vy_ref"][now + 1]))
     if not expected:
         with pytest.raises(DataError, match=f"windows of {n_window} samples"):
@@ -296,10 +386,16 @@ def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
     place = np.mod(distance, length)
     curvature = np.zeros(len(time))
     curvature[(place >= straight) & (place < straight + bends[0])] = 1.0 / radii[0]
-    curvature[(place >= straight + bends[0] + 300.0) & (place < straight + 300.0 + sum(bends))] = 1.0 / radii[1]
+    curvature[(place >= straight + bends[0] + 300.0) & (place < straight + 300.0 + sum(bends))] = (
+        1.0 / radii[1]
+    )
     noise = 0.01 * np.random.default_rng(0).standard_normal(len(time))
     return Recording(
-        name, "car", rate_hz, start_time, {"vx": speed, "yaw_rate": curvature * speed + noise, "ay": curvature * speed**2}
+        name,
+        "car",
+        rate_hz,
+        start_time,
+        {"vx": speed, "yaw_rate": curvature * speed + noise, "ay": curvature * speed**2},
     ), length
 
 
@@ -315,11 +411,19 @@ def test_laps_last_as_long_as_the_course_is_driven_round_once_and_are_named_from
     laps = laps_of(recording)
     assert len(laps) == 4
     distance = np.cumsum(recording["vx"]) / recording.rate_hz
-    driven = [np.interp(stop, recording.time, distance) - np.interp(start, recording.time, distance) for start, stop in laps]
+    driven = [
+        np.interp(stop, recording.time, distance) - np.interp(start, recording.time, distance)
+        for start, stop in laps
+    ]
     np.testing.assert_allclose(driven, length, rtol=0.01)
     assert all(one[1] == other[0] for one, other in pairwise(laps))
     entry = {"recording": "lap"}
-    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
+    config = {
+        "name": "s",
+        "dataset": "d",
+        "train": [{**entry, "laps": "first 2"}],
+        "validation": [{**entry, "laps": "3"}],
+    }
     split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
     assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
     assert split.validation == (Span("d", "lap", *laps[2]),)
@@ -329,22 +433,42 @@ def test_laps_last_as_long_as_the_course_is_driven_round_once_and_are_named_from
 def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_none():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
-    bend = np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0  # two equal halves: a straight, and half a turn of 20 m
+    bend = (
+        np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0
+    )  # two equal halves: a straight, and half a turn of 20 m
     oval = Recording("oval", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.where(bend, 0.5, 0.0)})
     durations = [stop - start for start, stop in laps_of(oval)]
     np.testing.assert_allclose(durations, 2.0 * (100.0 + 20.0 * np.pi) / 10.0, rtol=0.02)
     circle = Recording("circle", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.full(6000, -0.4)})
-    np.testing.assert_allclose([stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03)
+    np.testing.assert_allclose(
+        [stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03
+    )
     generator = np.random.default_rng(1)
     yaw_rate = np.convolve(generator.standard_normal(6000), np.full(200, 0.01), mode="same")
-    assert laps_of(Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})) == []
-    assert laps_of(Recording("parked", "car", 50.0, 0.0, {"vx": np.zeros(600), "yaw_rate": np.zeros(600)})) == []
+    assert (
+        laps_of(
+            Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})
+        )
+        == []
+    )
+    assert (
+        laps_of(
+            Recording("parked", "car", 50.0, 0.0, {"vx": np.zeros(600), "yaw_rate": np.zeros(600)})
+        )
+        == []
+    )
 
 
 def test_percentages_follow_one_another_over_every_recording():
     one = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
     other = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
-    config = {"name": "s", "dataset": "d", "train": "60 %", "validation": "15%", "tests": {"wet": "20 %", "dry": "5 %"}}
+    config = {
+        "name": "s",
+        "dataset": "d",
+        "train": "60 %",
+        "validation": "15%",
+        "tests": {"wet": "20 %", "dry": "5 %"},
+    }
     split = split_from_config(config, catalogue_of(one, other))
     assert split.train == (Span("d", "a", -math.inf, 110.0), Span("d", "b", -math.inf, 12.0))
     assert split.validation == (Span("d", "a", 110.0, 125.0), Span("d", "b", 12.0, 15.0))
@@ -355,7 +479,9 @@ def test_percentages_follow_one_another_over_every_recording():
 def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     recording, _ = circuit(laps=6.5)
     config = {"name": "s", "dataset": "d", "folds": {"number": 4, "of": "laps", "gap_seconds": 1.0}}
-    splits = [split_from_config({**config, "fold": fold}, catalogue_of(recording)) for fold in range(4)]
+    splits = [
+        split_from_config({**config, "fold": fold}, catalogue_of(recording)) for fold in range(4)
+    ]
     assert [split.name for split in splits] == ["s_fold_1", "s_fold_2", "s_fold_3", "s_fold_4"]
     tested = sorted((span.start, span.stop) for split in splits for span in split.tests["test"])
     assert tested[0][0] == recording.start_time
@@ -363,20 +489,32 @@ def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     assert all(one[1] == other[0] for one, other in pairwise(tested))
     for split, after in zip(splits, [*splits[1:], splits[0]], strict=True):
         (tested_span,), (stopped_on,) = split.tests["test"], after.tests["test"]
-        assert stopped_on.start <= split.validation[0].start < split.validation[-1].stop <= stopped_on.stop
+        assert (
+            stopped_on.start
+            <= split.validation[0].start
+            < split.validation[-1].stop
+            <= stopped_on.stop
+        )
         for span in (*split.train, *split.validation):
             assert span.stop <= tested_span.start - 1.0 or span.start >= tested_span.stop + 1.0
 
 
 @pytest.mark.parametrize("of", ["recordings", "seconds"])
 def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
-    recordings = [Recording(name, "car", 10.0, 0.0, {"vx": np.ones(1000), "yaw_rate": np.zeros(1000)}) for name in "abcdef"]
+    recordings = [
+        Recording(name, "car", 10.0, 0.0, {"vx": np.ones(1000), "yaw_rate": np.zeros(1000)})
+        for name in "abcdef"
+    ]
     config = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": of, "gap_seconds": 0.0}}
     for fold in range(3):
         split = split_from_config({**config, "fold": fold}, catalogue_of(*recordings))
         length = {
             role: sum(span.stop - span.start for span in spans)
-            for role, spans in (("train", split.train), ("validation", split.validation), ("test", split.tests["test"]))
+            for role, spans in (
+                ("train", split.train),
+                ("validation", split.validation),
+                ("test", split.tests["test"]),
+            )
         }
         assert sum(length.values()) == pytest.approx(600.0)
         assert length["test"] == pytest.approx(200.0)
@@ -385,44 +523,89 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
-        ({"train": "70 %", "validation": "20 %", "tests": {"t": "20 %"}}, "the percentages come to 110 %"),
-        ({"train": [{"recording": "lap", "start": "150 %"}]}, "start and stop are a number of seconds or a percentage"),
-        ({"train": [{"recording": "lap", "laps": "2 to 9"}]}, "has no '2 to 9': 4 complete laps were found; name times instead"),
+        (
+            {"train": "70 %", "validation": "20 %", "tests": {"t": "20 %"}},
+            "the percentages come to 110 %",
+        ),
+        (
+            {"train": [{"recording": "lap", "start": "150 %"}]},
+            "start and stop are a number of seconds or a percentage",
+        ),
+        (
+            {"train": [{"recording": "lap", "laps": "2 to 9"}]},
+            "has no '2 to 9': 4 complete laps were found; name times instead",
+        ),
         ({"train": [{"recording": "lap", "laps": "some"}]}, "laps are first, last, first 3"),
-        ({"train": [{"recording": "lap", "laps": "1", "stop": 3}]}, "a range has laps, or start and stop, not both"),
+        (
+            {"train": [{"recording": "lap", "laps": "1", "stop": 3}]},
+            "a range has laps, or start and stop, not both",
+        ),
         ({"folds": {"number": 3}}, "folds make training, validation and test; leave train"),
-        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 2}}, "number: input should be greater than or equal to 3, not 2"),
-        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 9}}, "do not fill 9 folds"),
-        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 3}, "fold": 3}, "fold 3 is not one of 0 to 2"),
+        (
+            {"train": [], "validation": [], "tests": {}, "folds": {"number": 2}},
+            "number: input should be greater than or equal to 3, not 2",
+        ),
+        (
+            {"train": [], "validation": [], "tests": {}, "folds": {"number": 9}},
+            "do not fill 9 folds",
+        ),
+        (
+            {"train": [], "validation": [], "tests": {}, "folds": {"number": 3}, "fold": 3},
+            "fold 3 is not one of 0 to 2",
+        ),
         ({"minutes": 0.0}, "split.minutes: input should be greater than 0"),
         ({"minutes_at": 1.0}, "split.minutes_at: input should be less than 1"),
     ],
     ids=str,
 )
 def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
-    assert what in refusal(BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0]))
+    assert what in refusal(
+        BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0])
+    )
 
 
 def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():
     """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
-        config = {"name": "s", "dataset": "d", "folds": {"number": number, "of": "laps", "gap_seconds": 3.0}}
+        config = {
+            "name": "s",
+            "dataset": "d",
+            "folds": {"number": number, "of": "laps", "gap_seconds": 3.0},
+        }
         for fold in range(number):
             split = split_from_config({**config, "fold": fold}, catalogue_of(recording))
             assert min(span.stop - span.start for span in split.tests["test"]) > 30.0
-    short = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": "seconds", "block_seconds": 1.0, "gap_seconds": 2.0}}
-    split = split_from_config(short, catalogue_of(Recording("a", "car", 10.0, 0.0, {"vx": np.ones(300)})))
-    assert (split.tests["test"], split.validation) == ((Span("d", "a", 0.0, 10.0),), (Span("d", "a", 12.0, 18.0),))
+    short = {
+        "name": "s",
+        "dataset": "d",
+        "folds": {"number": 3, "of": "seconds", "block_seconds": 1.0, "gap_seconds": 2.0},
+    }
+    split = split_from_config(
+        short, catalogue_of(Recording("a", "car", 10.0, 0.0, {"vx": np.ones(300)}))
+    )
+    assert (split.tests["test"], split.validation) == (
+        (Span("d", "a", 0.0, 10.0),),
+        (Span("d", "a", 12.0, 18.0),),
+    )
 
 
 @pytest.mark.parametrize("laps", [2.3, 2.5, 3.3, 3.97])
 def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(laps):
     time = np.arange(int(laps * 60.0 * 20.0)) / 20.0
-    yaw_rate = 0.2 + 0.2 * np.sin(2.0 * np.pi * time / 60.0) + 0.3 * np.sin(6.0 * np.pi * time / 60.0 + 1.0) - (0.2 - 2.0 * np.pi / 60.0)
-    found = laps_of(Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate}))
+    yaw_rate = (
+        0.2
+        + 0.2 * np.sin(2.0 * np.pi * time / 60.0)
+        + 0.3 * np.sin(6.0 * np.pi * time / 60.0 + 1.0)
+        - (0.2 - 2.0 * np.pi / 60.0)
+    )
+    found = laps_of(
+        Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate})
+    )
     assert len(found) == int(laps)
-    np.testing.assert_allclose([stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3)
+    np.testing.assert_allclose(
+        [stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3
+    )
 
 
 SPANS = (Span("d", "one", 10.0, 40.0), Span("d", "two", 100.0, 160.0))
@@ -437,13 +620,23 @@ def total(spans):
 def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
     kept = limit_minutes(SPANS, seconds, at)
     assert total(kept) == pytest.approx(seconds)
-    assert all(any(own.start >= span.start and own.stop <= span.stop for span in SPANS if span.recording == own.recording) for own in kept)
+    assert all(
+        any(
+            own.start >= span.start and own.stop <= span.stop
+            for span in SPANS
+            if span.recording == own.recording
+        )
+        for own in kept
+    )
     for position, one in enumerate(kept):
         assert not any(one.overlaps(other) for other in kept[position + 1 :])
 
 
 def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
-    assert limit_minutes(SPANS, 60.0, 0.5) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
+    assert limit_minutes(SPANS, 60.0, 0.5) == (
+        Span("d", "one", 10.0, 25.0),
+        Span("d", "two", 115.0, 160.0),
+    )
     assert limit_minutes(SPANS, 31.0, 0.0) == (Span("d", "one", 10.0, 40.0),)
     assert split_of(minutes=4.0).train == (Span("d", "lap", 0.0, 180.0),)
     assert split_of(minutes=9.0).train == (Span("d", "lap", -math.inf, 360.0),)
@@ -457,7 +650,10 @@ def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
 def split_of(**changed):
     drive = Recording("lap", "car", 10.0, 0.0, {"vx": [1.0] * 6000})
     shares = {"train": "60 %", "validation": "20 %", "tests": {"test": "20 %"}}
-    return split_from_config({"name": "mine", "dataset": "d", **shares, **changed}, lambda _: {"lap": lambda channels: drive})
+    return split_from_config(
+        {"name": "mine", "dataset": "d", **shares, **changed},
+        lambda _: {"lap": lambda channels: drive},
+    )
 
 
 SETS = {  # Table I
@@ -466,7 +662,10 @@ SETS = {  # Table I
     "F-1": ("20140221_03_02_03", "20140221_03_03_03", "20140221_04_01_03"),
     "F-2": ("20140222_01_01_03", "20140222_02_01_03"),
 }
-SCHEMES = {"cross_vehicle_1": (["C-1"] * 3, ["F-1"] * 3), "cross_vehicle_2": (["F-1"] * 3, ["C-1"] * 3)}  # Table II: learn, stop
+SCHEMES = {
+    "cross_vehicle_1": (["C-1"] * 3, ["F-1"] * 3),
+    "cross_vehicle_2": (["F-1"] * 3, ["C-1"] * 3),
+}  # Table II: learn, stop
 SCHEMES |= {"one_vehicle": (["F-1"] * 2, ["F-1"])}
 
 
@@ -478,7 +677,9 @@ def sets_of(spans):
     """Which of Table I's sets the recordings are, in alphabetical order of their names."""
     names = sorted(span.recording for span in spans)
     simulated = [f"{name[0].upper()}-{name[1]}" for name in names if name[2] == "_"]
-    return simulated or [key for name in names for key, files in SETS.items() if name.rsplit("_", 1)[0] in files]
+    return simulated or [
+        key for name in names for key, files in SETS.items() if name.rsplit("_", 1)[0] in files
+    ]
 
 
 @pytest.mark.parametrize("place", ["", "_sim"])
@@ -487,13 +688,21 @@ def test_schemes_learn_on_one_car_stop_on_the_other_or_the_same_and_test_on_both
     found = split(scheme + place)
     assert (sets_of(found.train), sets_of(found.validation)) == SCHEMES[scheme]
     third = {"j1": ["J-1"] * 2} if place else {}
-    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {
+        "c2": ["C-2"] * 2,
+        "f2": ["F-2"] * 2,
+        **third,
+    }
 
 
 @pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])
 def test_simulated_sets_last_as_long_as_the_papers(dataset):
     drives = compose_config("ingest", [f"dataset={dataset}"])["dataset"]["drives"]
-    minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives if entry["id"] != "j1"}
+    minutes = {
+        entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0
+        for entry in drives
+        if entry["id"] != "j1"
+    }
     assert minutes == pytest.approx({"c1": 19.0, "c2": 12.6, "f1": 25.7, "f2": 18.1}, abs=0.05)
 
 

@@ -18,15 +18,25 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.recording import Recording
-from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
+from vehest.data.store import (
+    is_stored_recording,
+    read_estimate,
+    read_recording,
+    write_estimate,
+    write_recording,
+)
 
 PROPERTY = settings(max_examples=25, deadline=None, derandomize=True, database=None)
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)  # -0.0 and denormals included
-not_measured = st.integers(1, 2**51 - 1).map(lambda payload: np.array([0x7FF8 << 48 | payload], dtype=np.uint64).view(np.float64)[0])
+not_measured = st.integers(1, 2**51 - 1).map(
+    lambda payload: np.array([0x7FF8 << 48 | payload], dtype=np.uint64).view(np.float64)[0]
+)
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(max_size=8) | finite,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
@@ -36,7 +46,12 @@ def recordings(draw):
     length = draw(st.integers(1, 50))
     names = draw(st.lists(st.sampled_from(sorted(CHANNELS)), min_size=1, max_size=4, unique=True))
     gappy = frozenset(name for name in names if draw(st.booleans()))
-    channels = {name: draw(arrays(np.float64, length, elements=finite | not_measured if name in gappy else finite)) for name in names}
+    channels = {
+        name: draw(
+            arrays(np.float64, length, elements=finite | not_measured if name in gappy else finite)
+        )
+        for name in names
+    }
     return Recording(
         id=draw(st.text(min_size=1, max_size=10)),
         vehicle=draw(st.text(max_size=10)),
@@ -50,7 +65,9 @@ def recordings(draw):
 
 
 def simple(samples=(1.0, 2.0, 3.0), **changes):
-    return Recording("lap", "car", 100.0, 5.0, {"ay": np.asarray(samples, dtype=np.float64)}, **changes)
+    return Recording(
+        "lap", "car", 100.0, 5.0, {"ay": np.asarray(samples, dtype=np.float64)}, **changes
+    )
 
 
 def bits(values):
@@ -79,8 +96,13 @@ def test_other_tools_read_the_same_numbers_and_writing_twice_gives_the_same_byte
     table = pd.read_parquet(tmp_path / "r.parquet")
     assert list(table.columns) == ["ay"]
     assert bits(table["ay"].to_numpy()) == bits(samples)
-    write_estimate(Estimate("r", "gru", 20.0, 450.0, {"vy": np.arange(3.0), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
-    assert pd.read_parquet(tmp_path / "e.parquet")["time"].tolist() == pytest.approx([450.0, 450.05, 450.1], abs=1e-12)
+    write_estimate(
+        Estimate("r", "gru", 20.0, 450.0, {"vy": np.arange(3.0), "sideslip": np.zeros(3)}),
+        tmp_path / "e.parquet",
+    )
+    assert pd.read_parquet(tmp_path / "e.parquet")["time"].tolist() == pytest.approx(
+        [450.0, 450.05, 450.1], abs=1e-12
+    )
     for name in ("a", "b"):
         write_recording(simple(np.arange(500) / 7.0), tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -91,7 +113,10 @@ def test_chosen_channels_are_read_in_the_order_asked_for_and_missing_ones_named(
     recording = Recording("r", "car", 10.0, 0.0, channels, gappy=frozenset({"ax"}))
     write_recording(recording, tmp_path / "r.parquet")
     read = read_recording(tmp_path / "r.parquet", ["ay", "vx"])
-    assert {name: samples.tolist() for name, samples in read.channels.items()} == {"ay": [2.0] * 3, "vx": [0.0] * 3}
+    assert {name: samples.tolist() for name, samples in read.channels.items()} == {
+        "ay": [2.0] * 3,
+        "vx": [0.0] * 3,
+    }
     assert list(read.channels) == ["ay", "vx"]
     assert read.gappy == frozenset()
     write_recording(simple(), tmp_path / "r.parquet")
@@ -103,7 +128,9 @@ def test_chosen_channels_are_read_in_the_order_asked_for_and_missing_ones_named(
 @given(st.integers(1, 20), st.integers(1, 4), st.data())
 def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
     values = arrays(np.float64, length, elements=finite | st.just(math.nan))
-    covariance = data.draw(st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite))
+    covariance = data.draw(
+        st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite)
+    )
     names = tuple(data.draw(st.permutations(list(QUANTITIES)))[:n_states])
     estimate = Estimate(
         recording_id=data.draw(st.text(max_size=8)),
@@ -119,7 +146,9 @@ def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
         file = Path(folder) / "estimate.parquet"
         write_estimate(estimate, file)
         read = read_estimate(file)
-    assert {name: bits(samples) for name, samples in read.channels.items()} == {name: bits(s) for name, s in estimate.channels.items()}
+    assert {name: bits(samples) for name, samples in read.channels.items()} == {
+        name: bits(s) for name, s in estimate.channels.items()
+    }
     about = ("recording_id", "estimator", "rate_hz", "start_time", "mode", "covariance_of")
     assert [getattr(read, key) for key in about] == [getattr(estimate, key) for key in about]
     if estimate.covariance is None:
@@ -130,12 +159,16 @@ def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
 
 
 def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothing(tmp_path):
-    assert "JSON" in refusal(lambda: write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet"))
+    assert "JSON" in refusal(
+        lambda: write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet")
+    )
     assert list(tmp_path.iterdir()) == []
     message = refusal(lambda: read_recording(tmp_path / "none.parquet"), MissingError)
     assert all(words in message for words in ("there is no file", "none.parquet"))
     (tmp_path / "file").write_text("not a folder")
-    assert "cannot write" in refusal(lambda: write_recording(simple(), tmp_path / "file" / "r.parquet"), MissingError)
+    assert "cannot write" in refusal(
+        lambda: write_recording(simple(), tmp_path / "file" / "r.parquet"), MissingError
+    )
     assert (tmp_path / "file").read_text() == "not a folder"
 
 
@@ -143,14 +176,19 @@ def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothin
 def test_a_truncated_file_is_refused_in_one_line(tmp_path, kept):
     write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
     (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
-    assert "r.parquet' is truncated or damaged" in refusal(lambda: read_recording(tmp_path / "r.parquet"))
+    assert "r.parquet' is truncated or damaged" in refusal(
+        lambda: read_recording(tmp_path / "r.parquet")
+    )
     assert not is_stored_recording(tmp_path / "r.parquet")
 
 
 def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
     write_recording(simple(np.random.default_rng(1).standard_normal(64)), tmp_path / "r.parquet")
     intact = (tmp_path / "r.parquet").read_bytes()
-    samples_end = pq.ParquetFile(tmp_path / "r.parquet").metadata.row_group(0).column(0).total_compressed_size + 4
+    samples_end = (
+        pq.ParquetFile(tmp_path / "r.parquet").metadata.row_group(0).column(0).total_compressed_size
+        + 4
+    )
     for position in range(samples_end - 400, samples_end, 7):
         damaged = bytearray(intact)
         damaged[position] ^= 0x10
@@ -159,16 +197,28 @@ def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "metadata", [None, {b"vehest": b"[1, 2]"}, {b"vehest": b"not json"}, {b"vehest": b'{"content": "recording"}'}, {b"vehest": b"\xff"}]
+    "metadata",
+    [
+        None,
+        {b"vehest": b"[1, 2]"},
+        {b"vehest": b"not json"},
+        {b"vehest": b'{"content": "recording"}'},
+        {b"vehest": b"\xff"},
+    ],
 )
 def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path, metadata):
-    pq.write_table(pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet")
+    pq.write_table(
+        pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet"
+    )
     assert "foreign.parquet" in refusal(lambda: read_recording(tmp_path / "foreign.parquet"))
 
 
 def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path):
     write_recording(simple(), tmp_path / "r.parquet")
-    write_estimate(Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
+    write_estimate(
+        Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}),
+        tmp_path / "e.parquet",
+    )
     assert "not an estimate" in refusal(lambda: read_estimate(tmp_path / "r.parquet"))
     assert "not a recording" in refusal(lambda: read_recording(tmp_path / "e.parquet"))
     assert is_stored_recording(tmp_path / "r.parquet")

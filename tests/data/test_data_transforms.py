@@ -10,10 +10,24 @@ from hypothesis.extra.numpy import arrays
 from refusals import refusal
 
 from vehest.data import transforms
-from vehest.data.derived import AccelerationFromSpeed, ScaleToWheelbase, SideslipFromVelocity, SpeedFromWheels, VelocityFromSideslip
+from vehest.data.derived import (
+    AccelerationFromSpeed,
+    ScaleToWheelbase,
+    SideslipFromVelocity,
+    SpeedFromWheels,
+    VelocityFromSideslip,
+)
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
-from vehest.data.transforms import TRANSFORMS, LowPass, MountingCorrection, ReferenceLever, RemoveOutliers, Resample, transform_from_config
+from vehest.data.transforms import (
+    TRANSFORMS,
+    LowPass,
+    MountingCorrection,
+    ReferenceLever,
+    RemoveOutliers,
+    Resample,
+    transform_from_config,
+)
 from vehest.data.windows import windows_of
 
 PROPERTY = settings(max_examples=50, deadline=None, derandomize=True, database=None)
@@ -30,7 +44,9 @@ def filtered(samples, direction, cutoff_hz=5.0):
 
 def fitted_sine(samples, time, frequency):
     """Amplitude and phase of the sine that fits best."""
-    basis = np.stack([np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)], axis=1)
+    basis = np.stack(
+        [np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)], axis=1
+    )
     (sine, cosine), *_ = np.linalg.lstsq(basis, samples, rcond=None)
     return float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
 
@@ -57,8 +73,12 @@ def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency):
 
 @pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 50.0, 80.0, math.nan])
 def test_low_pass_beyond_nyquist_is_refused(cutoff_hz):
-    assert "between 0 and 50 Hz" in refusal(lambda: LowPass(cutoff_hz)(recorded(ay=np.zeros(10))), ConfigurationError)
-    assert "use design=butterworth for a causal one" in refusal(lambda: LowPass(5.0, direction="causal", design="fir"), ConfigurationError)
+    assert "between 0 and 50 Hz" in refusal(
+        lambda: LowPass(cutoff_hz)(recorded(ay=np.zeros(10))), ConfigurationError
+    )
+    assert "use design=butterworth for a causal one" in refusal(
+        lambda: LowPass(5.0, direction="causal", design="fir"), ConfigurationError
+    )
 
 
 @pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
@@ -95,21 +115,33 @@ def test_outlier_removal_removes_planted_spikes_and_keeps_steps_and_ramps():
     clean = 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
     spikes = np.random.default_rng(3).choice(np.arange(0, len(clean), 8), 60, replace=False)
     spoilt = clean.copy()
-    spoilt[spikes] += np.random.default_rng(4).choice([-1.0, 1.0], 60) * np.random.default_rng(5).uniform(3, 50, 60)
+    spoilt[spikes] += np.random.default_rng(4).choice([-1.0, 1.0], 60) * np.random.default_rng(
+        5
+    ).uniform(3, 50, 60)
     out = RemoveOutliers()(recorded(ay=spoilt))["ay"]
     assert np.abs(out - clean)[spikes].max() < 0.5
     untouched = np.setdiff1d(np.arange(len(clean)), spikes)
     np.testing.assert_array_equal(out[untouched], clean[untouched])
-    for samples in (np.repeat([0.0, 5.0], 50), np.arange(100.0), np.round(np.arange(100.0) / 7.0), np.full(100, 2.0)):
+    for samples in (
+        np.repeat([0.0, 5.0], 50),
+        np.arange(100.0),
+        np.round(np.arange(100.0) / 7.0),
+        np.full(100, 2.0),
+    ):
         np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], samples)
     samples = np.zeros(50)
     samples[20] = 9.0
     np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], np.zeros(50))
     np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=clean))["ay"], clean)
     noisy = clean + 0.3 * np.random.default_rng(0).standard_normal(2000)
-    assert np.mean(RemoveOutliers()(recorded(ay=noisy))["ay"] == noisy) > 0.99  # six deviations of eleven normal samples: a few in 1000
+    assert (
+        np.mean(RemoveOutliers()(recorded(ay=noisy))["ay"] == noisy) > 0.99
+    )  # six deviations of eleven normal samples: a few in 1000
     for wrong in ({"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}):
-        said = refusal(lambda wrong=wrong: transform_from_config({"name": "remove_outliers", **wrong}), ConfigurationError)
+        said = refusal(
+            lambda wrong=wrong: transform_from_config({"name": "remove_outliers", **wrong}),
+            ConfigurationError,
+        )
         assert "greater than 0" in said
 
 
@@ -128,7 +160,9 @@ def test_a_few_impossible_samples_are_bridged_by_lines_and_many_stay(beside):
     line = np.linspace(-5.0, 5.0, 400)
     spoilt, reach = line.copy(), round(beside * RATE)
     spoilt[[100, 101]] = 9e3
-    spoilt[100 - reach : 100] = spoilt[102 : 102 + reach] = 70.0  # of a slower signal that was interpolated
+    spoilt[100 - reach : 100] = spoilt[102 : 102 + reach] = (
+        70.0  # of a slower signal that was interpolated
+    )
     bridge = transform_from_config({"name": "bridge_impossible", "beside": beside})
     np.testing.assert_allclose(bridge(recorded(ay=spoilt))["ay"], line, atol=1e-12)
     np.testing.assert_array_equal(bridge(recorded(ay=100.0 * line))["ay"], 100.0 * line)
@@ -153,14 +187,25 @@ def rigid_body(lever_x, lever_y, yaw):
 
     def acceleration(position):
         """In the vehicle's axes."""
-        return (position(time + step) - 2 * position(time) + position(time - step)) / step**2 * np.exp(-1j * heading(time))
+        return (
+            (position(time + step) - 2 * position(time) + position(time - step))
+            / step**2
+            * np.exp(-1j * heading(time))
+        )
 
     truth, measured = acceleration(centre), acceleration(sensor) / turn
-    channels = {"ax": measured.real, "ay": measured.imag, "yaw_rate": 0.4 + 0.75 * np.cos(1.5 * time)}
+    channels = {
+        "ax": measured.real,
+        "ay": measured.imag,
+        "yaw_rate": 0.4 + 0.75 * np.cos(1.5 * time),
+    }
     return Recording("lap", "car", RATE, 0.0, channels), truth.real, truth.imag
 
 
-@pytest.mark.parametrize(("lever_x", "lever_y", "yaw"), [(0.0, 0.0, 0.2), (1.3, 0.0, 0.0), (0.0, -0.6, 0.0), (-0.8, 0.5, -0.15)])
+@pytest.mark.parametrize(
+    ("lever_x", "lever_y", "yaw"),
+    [(0.0, 0.0, 0.2), (1.3, 0.0, 0.0), (0.0, -0.6, 0.0), (-0.8, 0.5, -0.15)],
+)
 def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x, lever_y, yaw):
     recording, true_ax, true_ay = rigid_body(lever_x, lever_y, yaw)
     corrected = MountingCorrection(lever_x, lever_y, yaw)(recording)
@@ -184,20 +229,41 @@ def test_filters_and_corrections_refuse_gaps_and_missing_channels_by_name():
     for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0)):
         with pytest.raises(DataError, match="has gaps and cannot be filtered"):
             transform(recording)
-    for transform in (LowPass(5.0, channels=("vx",)), RemoveOutliers(channels=("vx",)), MountingCorrection(1.0)):
+    for transform in (
+        LowPass(5.0, channels=("vx",)),
+        RemoveOutliers(channels=("vx",)),
+        MountingCorrection(1.0),
+    ):
         with pytest.raises(DataError, match=r"no channel '(vx|ax)'"):
             transform(recorded(ay=np.zeros(20)))
 
 
 def test_transforms_are_built_from_plain_values():
-    assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}) == LowPass(5, ("ax", "ay"))
-    assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
+    assert transform_from_config(
+        {"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}
+    ) == LowPass(5, ("ax", "ay"))
+    assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(
+        channels=("ay",)
+    )
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
-    others = {"resample", "low_pass", "remove_outliers", "bridge_impossible", "mounting_correction", "reference_lever", "speed_from_wheels"}
-    deriving = {"acceleration_from_speed", "velocity_from_sideslip", "sideslip_from_velocity", "scale_to_wheelbase"}
+    others = {
+        "resample",
+        "low_pass",
+        "remove_outliers",
+        "bridge_impossible",
+        "mounting_correction",
+        "reference_lever",
+        "speed_from_wheels",
+    }
+    deriving = {
+        "acceleration_from_speed",
+        "velocity_from_sideslip",
+        "sideslip_from_velocity",
+        "scale_to_wheelbase",
+    }
     assert set(TRANSFORMS) == others | of_an_alignment | deriving
 
 
@@ -207,7 +273,10 @@ def test_transforms_are_built_from_plain_values():
         ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
         ({"name": "low_pass"}, "transform 'low_pass': cutoff_hz"),
         ({"name": "low_pass", "cutoff_hz": "5"}, "transform 'low_pass': cutoff_hz"),
-        ({"name": "low_pass", "cutoff_hz": 5, "direction": "sideways"}, "transform 'low_pass': direction"),
+        (
+            {"name": "low_pass", "cutoff_hz": 5, "direction": "sideways"},
+            "transform 'low_pass': direction",
+        ),
         ({"name": "low_pass", "cutoff_hz": 5, "zero": 1}, "transform 'low_pass': "),
     ],
 )
@@ -227,7 +296,12 @@ def rolling(**shown):
     wheels = {f"wheel_speed_{place}": (u - yaw_rate * side) / 0.48 for place, side in sides.items()}
     for place in ("fl", "fr"):
         wheels[f"wheel_speed_{place}"] /= np.cos(steer)
-    channels = {"yaw_rate": yaw_rate, "steer": steer, "ax": 2.1 * np.cos(0.7 * time), **wheels} | shown
+    channels = {
+        "yaw_rate": yaw_rate,
+        "steer": steer,
+        "ax": 2.1 * np.cos(0.7 * time),
+        **wheels,
+    } | shown
     gappy = frozenset(name for name, samples in channels.items() if np.isnan(samples).any())
     return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
 
@@ -250,10 +324,16 @@ def test_speed_from_wheels_inverts_what_rolling_wheels_do_also_of_the_rear_wheel
     assert "no wheel speed was measured" in refusal(lambda: WHEELS(rolling(yaw_rate=missing)[0]))
     whole, u = rolling()
     rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
-    np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12)  # left and right make up for the track
+    np.testing.assert_allclose(
+        SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12
+    )  # left and right make up for the track
     one = whole.select(["wheel_speed_rl"])
-    np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12)
-    assert "has no wheel speed to make vx of" in refusal(lambda: SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"])))
+    np.testing.assert_allclose(
+        SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12
+    )
+    assert "has no wheel speed to make vx of" in refusal(
+        lambda: SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
+    )
 
 
 def test_a_wheel_that_drops_out_or_spins_does_not_count_and_no_later_sample():
@@ -270,14 +350,18 @@ def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels):
     vx = WHEELS(drive)["vx"]
     limited = np.abs(vx - u).max()
     assert np.isfinite(vx).all()
-    assert limited < (0.1 if len(wheels) != 3 else 12.0)  # three that agree on zero outvote one: what remains is the limit of acceleration
+    assert limited < (
+        0.1 if len(wheels) != 3 else 12.0
+    )  # three that agree on zero outvote one: what remains is the limit of acceleration
     assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
 
 
 def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all():
     frequency, rate = 0.5, 100.0
     time = np.arange(3000) / rate
-    drive = Recording("lap", "car", rate, 0.0, {"vx": 20.0 + 3.0 * np.sin(2 * np.pi * frequency * time)})
+    drive = Recording(
+        "lap", "car", rate, 0.0, {"vx": 20.0 + 3.0 * np.sin(2 * np.pi * frequency * time)}
+    )
     amplitude = 3.0 * 2 * np.pi * frequency
     late = math.sqrt(2.0) / (2.0 * np.pi * 5.0) + 0.5 / rate
     for direction, delay in (("zero_phase", 0.0), ("causal", late)):
@@ -286,7 +370,9 @@ def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_
         np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
     causal = AccelerationFromSpeed()
     np.testing.assert_array_equal(causal(drive.cut(0.0, 9.0))["ax"], causal(drive)["ax"][:900])
-    assert "cutoff_hz must lie below half of 100 Hz" in refusal(lambda: AccelerationFromSpeed(cutoff_hz=50.0)(drive))
+    assert "cutoff_hz must lie below half of 100 Hz" in refusal(
+        lambda: AccelerationFromSpeed(cutoff_hz=50.0)(drive)
+    )
 
 
 def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
@@ -296,8 +382,12 @@ def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
     np.testing.assert_allclose(there["vy_ref"], drive["vx"] * np.tan(angle))
     back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
     np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
-    assert "less than 90 degrees" in refusal(lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6]))))
-    standing = VelocityFromSideslip()(recorded(vx=np.array([0.01, 0.05, 20.0]), sideslip_ref=np.array([3.1, 0.2, 0.1])))
+    assert "less than 90 degrees" in refusal(
+        lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
+    )
+    standing = VelocityFromSideslip()(
+        recorded(vx=np.array([0.01, 0.05, 20.0]), sideslip_ref=np.array([3.1, 0.2, 0.1]))
+    )
     np.testing.assert_allclose(standing["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)])
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
@@ -311,20 +401,34 @@ def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
     time = np.arange(4000) / 100.0
     vx, vy, yaw_rate = 3.0 + 0.5 * np.sin(time), 0.4 * np.sin(1.3 * time), 2.0 * np.sin(0.8 * time)
     ay = 0.4 * 1.3 * np.cos(1.3 * time) + vx * yaw_rate
-    small = Recording("lap", "car", 100.0, 2.0, {"vx": vx, "vy_ref": vy, "yaw_rate": yaw_rate, "ay": ay, "motor_current": ay})
+    small = Recording(
+        "lap",
+        "car",
+        100.0,
+        2.0,
+        {"vx": vx, "vy_ref": vy, "yaw_rate": yaw_rate, "ay": ay, "motor_current": ay},
+    )
     large = ScaleToWheelbase(0.25, 2.25)(small)
     assert large.rate_hz == pytest.approx(100.0 / 3.0)
     assert large.start_time == pytest.approx(6.0)
     assert "motor_current" not in large
     np.testing.assert_array_equal(large["ay"], ay)
-    np.testing.assert_allclose(np.arctan2(large["vy_ref"], large["vx"]), np.arctan2(vy, vx), atol=1e-12)
+    np.testing.assert_allclose(
+        np.arctan2(large["vy_ref"], large["vx"]), np.arctan2(vy, vx), atol=1e-12
+    )
     derived = np.gradient(large["vy_ref"]) * large.rate_hz + large["vx"] * large["yaw_rate"]
     np.testing.assert_allclose(derived[1:-1], ay[1:-1], atol=1e-3)
 
 
 def lap(rate_hz=100.0, n_samples=400):
     generator = np.random.default_rng(0)
-    return Recording("lap", "car", rate_hz, 0.0, {name: generator.normal(0.0, 1.0, n_samples) for name in ("vx", "ay")})
+    return Recording(
+        "lap",
+        "car",
+        rate_hz,
+        0.0,
+        {name: generator.normal(0.0, 1.0, n_samples) for name in ("vx", "ay")},
+    )
 
 
 @pytest.mark.parametrize(
@@ -341,7 +445,9 @@ def lap(rate_hz=100.0, n_samples=400):
 )
 def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
-    changed = transform_from_config({key: value for key, value in config.items() if value != "long"})
+    changed = transform_from_config(
+        {key: value for key, value in config.items() if value != "long"}
+    )
     message = refusal(lambda: changed(lap(n_samples=600 if long else 400)), VehestError)
     assert f"limits.{limit}=NUMBER" in message
     assert "recording 'lap'" in message
@@ -359,6 +465,7 @@ def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch)
 
 def test_a_window_longer_than_the_limit_is_refused():
     with pytest.raises(
-        DataError, match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples"
+        DataError,
+        match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples",
     ):
         windows_of([lap()], ["vx"], "ay", 2_000_000)

@@ -13,7 +13,14 @@ from refusals import refusal
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
 from vehest.data.files import file_name, regular_file
-from vehest.data.limits import Limits, check_limit, check_unpacked, current_limits, limits_from_config, use_limits
+from vehest.data.limits import (
+    Limits,
+    check_limit,
+    check_unpacked,
+    current_limits,
+    limits_from_config,
+    use_limits,
+)
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import parse_json, parse_yaml, read_text, read_yaml
 from vehest.run.config import compose_config
@@ -38,8 +45,15 @@ class Kinds:
 
 
 def test_plain_values_become_dataclasses_that_may_take_further_keys():
-    given = {"names": ["a"], "inner": [{"gain": 1}, None], "pair": [0, "b"], "maps": {"c": {"d": {"gain": 0.5, "steps": 4}}}}
-    assert validated(Kinds, given, "'f'") == Kinds(("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}})
+    given = {
+        "names": ["a"],
+        "inner": [{"gain": 1}, None],
+        "pair": [0, "b"],
+        "maps": {"c": {"d": {"gain": 0.5, "steps": 4}}},
+    }
+    assert validated(Kinds, given, "'f'") == Kinds(
+        ("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}}
+    )
 
     @dataclass(frozen=True)
     class Loose:
@@ -53,15 +67,30 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
     ("content", "message"),
     [
         ({"names": "a"}, "it.names must be a list of names, not 'a'"),
-        ({"inner": [{"gain": 1, "gian": 1}]}, "it.inner.0.gian is not an option of it.inner.0; options: gain, steps"),
+        (
+            {"inner": [{"gain": 1, "gian": 1}]},
+            "it.inner.0.gian is not an option of it.inner.0; options: gain, steps",
+        ),
         ({"lists": [3]}, "it.lists.0 must be a list, not 3"),
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
         ({"files": 3}, "it.files must be text or a list, not 3"),
-        ({"values": {"a": [1]}}, "it.values.a must be a whole number or a number or true or false or text, not [1]"),
-        ({"maps": {"a": {"b": 3}}}, "it.maps.a.b must be a group of options, not 3; options: gain, steps"),
+        (
+            {"values": {"a": [1]}},
+            "it.values.a must be a whole number or a number or true or false or text, not [1]",
+        ),
+        (
+            {"maps": {"a": {"b": 3}}},
+            "it.maps.a.b must be a group of options, not 3; options: gain, steps",
+        ),
         ({"inner": [{"gain": float("nan")}]}, "'f': inner.0.gain must be a number, not nan"),
-        ({"other": 1}, "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, maps"),
-        ({"names": {1, 2}}, "'f': names is no plain value but a set, {1, 2}; put it in quotes if it is text"),
+        (
+            {"other": 1},
+            "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, maps",
+        ),
+        (
+            {"names": {1, 2}},
+            "'f': names is no plain value but a set, {1, 2}; put it in quotes if it is text",
+        ),
     ],
 )
 def test_a_refusal_is_one_line_that_says_what_the_type_of_the_key_takes(content, message):
@@ -78,7 +107,9 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
     file = tmp_path / "bomb.yaml"
     file.write_text("\n".join(lines))
     started = time.process_time()
-    assert "bomb.yaml' nests deeper than 60 levels or holds more than 500000 values" in refusal(lambda: read_yaml(file))
+    assert "bomb.yaml' nests deeper than 60 levels or holds more than 500000 values" in refusal(
+        lambda: read_yaml(file)
+    )
     assert time.process_time() - started < 5.0  # processor time of a bomb that would take hours
 
 
@@ -100,12 +131,20 @@ def test_yaml_that_is_none_is_one_line(text, message):
 def test_honest_yaml_with_anchors_is_read_and_json_that_is_none_is_one_line():
     for text in ("[" * 100000, b"\xff\xfe"):
         assert "cannot be read as JSON" in refusal(lambda text=text: parse_json(text, "'f'"))
-    assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
+    assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {
+        "a": {"x": 1},
+        "b": {"x": 1},
+        "c": {"x": 1, "y": 2},
+    }
 
 
 def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for path, message in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
+    for path, message in (
+        (tmp_path / "pipe", "a pipe"),
+        (Path("/dev/zero"), "a device"),
+        (tmp_path, "a folder"),
+    ):
         with pytest.raises(DataError, match=message):
             regular_file(path)
     for path in (tmp_path / "none", tmp_path / "none" / "x"):
@@ -118,7 +157,10 @@ def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
     assert "is not UTF-8 text" in refusal(lambda: read_text(tmp_path / "latin"))
     with (
         use_limits(Limits(text_bytes=50)),
-        pytest.raises(DataError, match=r"long' is 100 bytes long, more than the limit of 50; .*limits.text_bytes"),
+        pytest.raises(
+            DataError,
+            match=r"long' is 100 bytes long, more than the limit of 50; .*limits.text_bytes",
+        ),
     ):
         read_text(tmp_path / "long")
 
@@ -126,7 +168,9 @@ def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
 def test_limits_come_from_a_configuration_and_end_with_their_block():
     with use_limits(limits_from_config({"samples": 5})):
         assert current_limits().samples == 5
-        assert "6 samples, more than the limit of 5" in refusal(lambda: check_limit("samples", 6, "'f' holds 6 samples"))
+        assert "6 samples, more than the limit of 5" in refusal(
+            lambda: check_limit("samples", 6, "'f' holds 6 samples")
+        )
     assert current_limits() == Limits()
     for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
         with pytest.raises(
@@ -142,7 +186,10 @@ def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more()
     assert Limits().memory > 8 * 3600 * 1000 * 55
     with use_limits(Limits(memory=1000)):
         check_unpacked("f", 200, 3000)
-        with pytest.raises(DataError, match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER"):
+        with pytest.raises(
+            DataError,
+            match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER",
+        ):
             check_unpacked("f", 200, 3001)
 
 

@@ -7,7 +7,9 @@ import torch
 
 
 def _digest(tensors):
-    return hashlib.sha256(b"".join(tensor.detach().numpy().tobytes() for tensor in tensors)).hexdigest()
+    return hashlib.sha256(
+        b"".join(tensor.detach().numpy().tobytes() for tensor in tensors)
+    ).hexdigest()
 
 
 if sys.argv[1] == "networks":

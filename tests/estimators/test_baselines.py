@@ -35,7 +35,12 @@ def steady_drive(car, seconds=30.0):
     steer = generator.uniform(-0.05, 0.05, len(vx))
     matrix, steering, *_ = lateral_model(car, vx)
     states = -np.linalg.solve(matrix, (steering * steer[:, None])[..., None])[..., 0]
-    channels = {"vx": vx, "yaw_rate": states[:, 1], "ay": vx * states[:, 1], "vy_ref": vx * states[:, 0]}
+    channels = {
+        "vx": vx,
+        "yaw_rate": states[:, 1],
+        "ay": vx * states[:, 1],
+        "vy_ref": vx * states[:, 0],
+    }
     return Recording("steady", "car", 20.0, 0.0, channels, "simulated")
 
 
@@ -46,12 +51,21 @@ def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_
     estimator, record = fitted("static_map", steady_drive(CAR))
     assert estimator.values["b"] == pytest.approx(CAR.cg_to_rear_axle, rel=1e-9)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
-    assert estimator.values["k"] == pytest.approx(CAR.mass * CAR.cg_to_front_axle / (wheelbase * CAR.cornering_stiffness_rear), rel=1e-9)
+    assert estimator.values["k"] == pytest.approx(
+        CAR.mass * CAR.cg_to_front_axle / (wheelbase * CAR.cornering_stiffness_rear), rel=1e-9
+    )
     assert record.metrics["best_train_loss"] == pytest.approx(0.0, abs=1e-18)
     drive = steady_drive(CAR)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
-    coefficient = CAR.cornering_stiffness_rear / (CAR.mass * 9.81 * CAR.cg_to_front_axle / wheelbase)
-    estimator = new("data_sheet", wheelbase=wheelbase, cg_to_rear_axle=CAR.cg_to_rear_axle, cornering_coefficient=coefficient)
+    coefficient = CAR.cornering_stiffness_rear / (
+        CAR.mass * 9.81 * CAR.cg_to_front_axle / wheelbase
+    )
+    estimator = new(
+        "data_sheet",
+        wheelbase=wheelbase,
+        cg_to_rear_axle=CAR.cg_to_rear_axle,
+        cornering_coefficient=coefficient,
+    )
     (estimate,) = estimator.estimate([drive.without_references()])
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
@@ -64,12 +78,18 @@ def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_consta
     rate = drive["ay"] - drive["vx"] * drive["yaw_rate"]
 
     def derivative(t, v):
-        return np.array([rate[min(int(np.floor(t * 20.0 + 1e-9)) + 1, len(rate) - 1)] - v[0] / 2.5])  # held from the sample before
+        return np.array(
+            [rate[min(int(np.floor(t * 20.0 + 1e-9)) + 1, len(rate) - 1)] - v[0] / 2.5]
+        )  # held from the sample before
 
     start = estimate["vy"][0]
     solved, times = [start], drive.time - drive.time[0]
     for begin, end in itertools.pairwise(times):
-        solved.append(solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[0, -1])
+        solved.append(
+            solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[
+                0, -1
+            ]
+        )
     np.testing.assert_allclose(estimate["vy"], solved, atol=1e-8)
     truth = new("kinematic")
     truth.values = {"time_constant": 1.7}
@@ -86,8 +106,22 @@ def test_zero_is_zero_and_a_map_that_is_not_fitted_or_not_determined_is_refused(
     assert not estimate["vy"].any()
     assert not estimate["sideslip"].any()
     assert "has not been fitted" in refusal(lambda: new("static_map").online(), ConfigurationError)
-    straight = Recording("straight", "car", 20.0, 0.0, {**drive.channels, "yaw_rate": np.zeros(len(drive))}, "simulated")
-    one_speed = Recording("one speed", "car", 20.0, 0.0, {**drive.channels, "vx": np.full(len(drive), 20.0)}, "simulated")
+    straight = Recording(
+        "straight",
+        "car",
+        20.0,
+        0.0,
+        {**drive.channels, "yaw_rate": np.zeros(len(drive))},
+        "simulated",
+    )
+    one_speed = Recording(
+        "one speed",
+        "car",
+        20.0,
+        0.0,
+        {**drive.channels, "vx": np.full(len(drive), 20.0)},
+        "simulated",
+    )
     for recording in (straight, one_speed):
         with pytest.raises(DataError, match="do not determine a static map"):
             fitted("static_map", recording)

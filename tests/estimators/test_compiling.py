@@ -17,8 +17,12 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.trust.health import SLOW_KERNEL
 
 
-def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_without_compilation(tmp_path, monkeypatch):
-    monkeypatch.setattr(planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path))))
+def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_without_compilation(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path)))
+    )
     assert has_to_compile(estimator_class("learned_ukf").slow_kernel)
     assert not has_to_compile(estimator_class("luenberger").slow_kernel)
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
@@ -30,7 +34,12 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_withou
     assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
 
 
-@pytest.mark.parametrize("where", sorted({SLOW_KERNEL, *(estimator_class(name).slow_kernel for name in estimator_names())} - {""}))
+@pytest.mark.parametrize(
+    "where",
+    sorted(
+        {SLOW_KERNEL, *(estimator_class(name).slow_kernel for name in estimator_names())} - {""}
+    ),
+)
 def test_slow_kernels_are_entries_that_are_there(where):
     module, _, name = where.partition(":")
     assert hasattr(getattr(importlib.import_module(module), name), "stats")
@@ -40,9 +49,16 @@ def test_slow_kernels_are_entries_that_are_there(where):
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
 def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path, kernels):
     here = Path(__file__).parent
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])}
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)]),
+    }
     command = [sys.executable, str(here / "digits.py"), kernels]
-    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
     assert list(tmp_path.rglob("*.nbc"))
     assert first == second
 
@@ -54,7 +70,8 @@ def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only():
         f"{path.relative_to(source)}:{call.lineno}"
         for path in source.rglob("*.py")
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("numba.njit", "njit", "numba.jit")
+        if isinstance(call, ast.Call)
+        and ast.unparse(call.func) in ("numba.njit", "njit", "numba.jit")
         if any(keyword.arg == "fastmath" for keyword in call.keywords)
     ]
     assert decorated == []

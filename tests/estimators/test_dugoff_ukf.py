@@ -37,7 +37,12 @@ def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
     drives = [dugoff_drive(30.0, seed, straight=5.0) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({})
     record = estimator.fit(FitData(drives, [dugoff_drive(10.0, 3)]), QUICK)
-    for name in ("cornering_stiffness_front", "friction_front", "cornering_stiffness_rear", "friction_rear"):
+    for name in (
+        "cornering_stiffness_front",
+        "friction_front",
+        "cornering_stiffness_rear",
+        "friction_rear",
+    ):
         assert record.metrics[name] == pytest.approx(TYRES[name], rel=0.05), name
         assert record.metrics[f"{name}_spread"] < 0.02 * TYRES[name]
     assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.2)
@@ -46,7 +51,16 @@ def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
     assert estimator.n_parameters == 6 + 7
     drives = [dugoff_drive(25.0, seed) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({"inputs": "imu"})
-    estimator.fit(FitData([drive.select([n for n in drive.channels if not n.startswith("fy")]) for drive in drives], []), QUICK)
+    estimator.fit(
+        FitData(
+            [
+                drive.select([n for n in drive.channels if not n.startswith("fy")])
+                for drive in drives
+            ],
+            [],
+        ),
+        QUICK,
+    )
     assert estimator.axle_tyres[0] == pytest.approx(TYRES["cornering_stiffness_front"], rel=0.1)
     assert estimator.channels == ("yaw_rate", "vx", "ay", "steer", "ax")
 
@@ -55,7 +69,9 @@ def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
 def test_the_filter_follows_the_car_and_knows_how_well(inputs):
     drive = dugoff_drive(20.0, 5)
     estimate = given(inputs).estimate([drive.without_references()])[0]
-    assert np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)) < np.radians(0.2), "after a second"
+    assert np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)) < np.radians(
+        0.2
+    ), "after a second"
     assert estimate.covariance_of == ("vy", "yaw_rate")
     error = (estimate["vy"] - drive["vy_ref"])[100:] / np.sqrt(estimate.covariance[100:, 0, 0])
     assert 0.2 < np.sqrt(np.mean(error**2)) < 2.0
@@ -63,7 +79,10 @@ def test_the_filter_follows_the_car_and_knows_how_well(inputs):
 
 
 def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_with_a_hysteresis():
-    drives = [dugoff_drive(seconds, seed).without_references() for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))]
+    drives = [
+        dugoff_drive(seconds, seed).without_references()
+        for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))
+    ]
     estimator = given()
     for together, drive in zip(estimator.estimate(drives), drives, strict=True):
         np.testing.assert_array_equal(together["vy"], estimator.estimate([drive])[0]["vy"])
@@ -73,7 +92,10 @@ def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_wi
     expected = [False, False, True, True, True, True, False, False, True]
     assert in_nonlinear_range(ay, 4.0, 3.0).tolist() == expected
     whole = in_nonlinear_range(ay, 4.0, 3.0)
-    assert all(in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k] for k in range(1, len(ay)))
+    assert all(
+        in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k]
+        for k in range(1, len(ay))
+    )
     assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
@@ -84,18 +106,29 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     gap[150:220] = np.nan
     slow[300:380] = np.linspace(20.0, -1.0, 80)
     slow[380:420] = np.linspace(-1.0, 15.0, 40)
-    drive = changed(drive, {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)}, ("ay", "fy_fl"))
+    drive = changed(
+        drive,
+        {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)},
+        ("ay", "fy_fl"),
+    )
     estimator = given(inputs)
     batch = estimator.estimate([drive.without_references()])[0]
     stepper = estimator.online()
-    online = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(len(drive))]
+    online = [
+        stepper.step({name: drive[name][k] for name in estimator.channels})
+        for k in range(len(drive))
+    ]
     for name in ("vy", "yaw_rate"):
         np.testing.assert_allclose([row[name] for row in online], batch[name], rtol=0.0, atol=1e-9)
     assert np.isfinite(batch["sideslip"]).all()
     assert batch["nis_dof"][160] == (3.0 if inputs == "full" else 1.0)
     rolling = np.flatnonzero(drive["vx"] < 3.0)
     assert (batch["nis_dof"][rolling] == 0.0).all()
-    np.testing.assert_allclose(batch["yaw_rate"][rolling[1:]], (drive["vx"] * drive["steer"])[rolling[1:] - 1] / 2.88, rtol=1e-12)
+    np.testing.assert_allclose(
+        batch["yaw_rate"][rolling[1:]],
+        (drive["vx"] * drive["steer"])[rolling[1:] - 1] / 2.88,
+        rtol=1e-12,
+    )
 
 
 def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
@@ -111,14 +144,21 @@ def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_bel
 def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
     estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
     drives = [dugoff_drive(4.0, seed) for seed in (1, 2)]
-    record = estimator.fit(FitData(drives, drives), IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=12))
+    record = estimator.fit(
+        FitData(drives, drives),
+        IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=12),
+    )
     untuned = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
     before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
     assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
     assert record.metrics["evaluations"] == 12
-    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
+    estimator = DugoffUkf.from_config(
+        {"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}}
+    )
     data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
-    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
+    estimator.fit(
+        data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings")
+    )
     assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5
 
 
@@ -129,35 +169,61 @@ def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_
         "vx": np.where(still, 0.0, drive["vx"]),
         "steer": np.where(still, 0.0, drive["steer"]),
     }
-    record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(FitData([changed(drive, quiet)], []), QUICK)
+    record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(
+        FitData([changed(drive, quiet)], []), QUICK
+    )
     assert record.metrics["noise_ay"] > 0.8 * NOISE["ay"]
     gap = changed(drive, {"ax": np.where(still, np.nan, drive["ax"])}, ("ax",))
-    assert "recording 'drive': channel 'ax' has gaps" in refusal(lambda: DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK))
+    assert "recording 'drive': channel 'ax' has gaps" in refusal(
+        lambda: DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
+    )
     drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
     other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
-    losses = [given().fit(FitData([], [own]), data).metrics["best_validation_loss"] for own in (drive, other)]
+    losses = [
+        given().fit(FitData([], [own]), data).metrics["best_validation_loss"]
+        for own in (drive, other)
+    ]
     assert losses[0] == losses[1]
     blind = drive.select([name for name in drive.channels if name != "vy_ref"])
     with pytest.raises(DataError, match="recording 'drive' has no vy_ref"):
-        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData([blind], []), IdentificationSettings(method="nelder_mead"))
+        DugoffUkf.from_config({"tyres": TYRES}).fit(
+            FitData([blind], []), IdentificationSettings(method="nelder_mead")
+        )
 
 
 def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
     """Going on identifies again; a network trained behind half a search would then meet another filter."""
     drives = [dugoff_drive(3.0)]
     estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
-    before = {name: values.copy() for name, values in estimator.weights().items() if name.startswith("network.")}
+    before = {
+        name: values.copy()
+        for name, values in estimator.weights().items()
+        if name.startswith("network.")
+    }
     identification = IdentificationSettings(method="nelder_mead", grid=2, max_evaluations=3)
     context = FitContext(should_stop=stop_after(1))
-    record = estimator.fit(FitData(drives, drives), EndToEndSettings(identification=identification), context)
+    record = estimator.fit(
+        FitData(drives, drives), EndToEndSettings(identification=identification), context
+    )
     assert record.interrupted
     assert record.metrics == {"best_epoch": 0}
-    assert all(np.array_equal(values, estimator.weights()[name], equal_nan=True) for name, values in before.items())
+    assert all(
+        np.array_equal(values, estimator.weights()[name], equal_nan=True)
+        for name, values in before.items()
+    )
 
 
 def test_stages_search_wide_bounds_and_then_close_to_the_best():
     pytest.importorskip("optuna", reason="needs optuna: pip install 'vehest[tuning]'")
-    search = optuna_search(lambda x: float(np.sum((x - 0.7) ** 2)), [(-5.0, 1.0)] * 2, 30, 0, FitContext(), stages=2, shrink=0.2)
+    search = optuna_search(
+        lambda x: float(np.sum((x - 0.7) ** 2)),
+        [(-5.0, 1.0)] * 2,
+        30,
+        0,
+        FitContext(),
+        stages=2,
+        shrink=0.2,
+    )
     assert search.evaluations == len(search.starts) == 30
     assert np.ptp(search.starts[:15, 0]) > 2.0
     assert np.ptp(search.starts[15:, 0]) <= 1.2
@@ -169,7 +235,13 @@ def test_what_makes_no_sense_or_is_not_installed_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     drives = [dugoff_drive(2.0)]
     with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):
-        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData(drives, drives), IdentificationSettings())
-    assert "has no tyres yet" in refusal(lambda: DugoffUkf.from_config({}).online(), ConfigurationError)
+        DugoffUkf.from_config({"tyres": TYRES}).fit(
+            FitData(drives, drives), IdentificationSettings()
+        )
+    assert "has no tyres yet" in refusal(
+        lambda: DugoffUkf.from_config({}).online(), ConfigurationError
+    )
     with pytest.raises(DataError, match=r"no training recording is called '\*skidpad\*'"):
-        DugoffUkf.from_config({}).fit(FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data"))
+        DugoffUkf.from_config({}).fit(
+            FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data")
+        )

@@ -22,7 +22,11 @@ from vehest.vehicle.parameters import FERRARI_250LM
 
 known = cache(fitted)
 """The same estimator for several tests, which leave it as it is."""
-OF_A_DTYPE = [name for name in estimator_names() if "dtype" in {own.name for own in fields(estimator_class(name).training_type)}]
+OF_A_DTYPE = [
+    name
+    for name in estimator_names()
+    if "dtype" in {own.name for own in fields(estimator_class(name).training_type)}
+]
 
 
 def test_parameter_counts_are_those_of_the_paper():
@@ -48,13 +52,19 @@ def test_parameter_counts_are_those_of_the_paper():
 def test_configuration_file_states_the_defaults(name):
     """What the pages' tables of settings say, from the class, is what `vehest train` takes."""
     needed = {"wheelbase": 2.7} if name == "data_sheet" else {}
-    family, given = estimator_class(name), compose_config("train", [f"estimator={name}"])["estimator"]
+    family, given = (
+        estimator_class(name),
+        compose_config("train", [f"estimator={name}"])["estimator"],
+    )
     assert family.from_config({**given, **needed}).settings == family.from_config(needed).settings
 
 
 @pytest.mark.parametrize(
     ("name", "dtype", "tolerance"),
-    [*((name, "float64", 1e-9) for name in estimator_names()), *((name, "float32", 1e-4) for name in OF_A_DTYPE)],
+    [
+        *((name, "float64", 1e-9) for name in estimator_names()),
+        *((name, "float32", 1e-4) for name in OF_A_DTYPE),
+    ],
 )
 def test_online_agrees_with_batch(name, dtype, tolerance):
     estimator = known(name, dtype)
@@ -63,14 +73,25 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     batch = estimate["vy"]
     stepper = estimator.online()
     assert stepper.horizon_steps == estimator.horizon_steps
-    said = [stepper.step({channel: drive[channel][k] for channel in drive.channels}) for k in range(len(drive))]
-    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in said])[: len(drive)]
+    said = [
+        stepper.step({channel: drive[channel][k] for channel in drive.channels})
+        for k in range(len(drive))
+    ]
+    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in said])[
+        : len(drive)
+    ]
     assert np.array_equal(np.isnan(online), np.isnan(batch))
     assert np.nanmax(np.abs(online - batch)) <= tolerance
-    assert np.isfinite(batch).sum() == len(drive) - estimator.warm_up_steps - estimator.horizon_steps
+    assert (
+        np.isfinite(batch).sum() == len(drive) - estimator.warm_up_steps - estimator.horizon_steps
+    )
     if "vy" in estimate.covariance_of:
         row = estimate.covariance_of.index("vy")
-        np.testing.assert_allclose([own["vy_variance"] for own in said], estimate.covariance[:, row, row], rtol=10 * tolerance)
+        np.testing.assert_allclose(
+            [own["vy_variance"] for own in said],
+            estimate.covariance[:, row, row],
+            rtol=10 * tolerance,
+        )
     else:
         assert "vy_variance" not in said[-1]
 
@@ -96,16 +117,28 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
     assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
-def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(drive):
+def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(
+    drive,
+):
     estimator = known("ksnn", "float64")
-    assert "works at 20 Hz; resample it first" in refusal(lambda: estimator.estimate([Resample(10).__call__(drive)]))
-    assert "no channel 'ax'" in refusal(lambda: estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])]))
+    assert "works at 20 Hz; resample it first" in refusal(
+        lambda: estimator.estimate([Resample(10).__call__(drive)])
+    )
+    assert "no channel 'ax'" in refusal(
+        lambda: estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])])
+    )
     gaps = {**drive.channels, "ay": np.where(np.arange(len(drive)) == 7, np.nan, drive["ay"])}
-    gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
+    gappy = type(drive)(
+        drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"})
+    )
     assert "has gaps" in refusal(lambda: estimator.estimate([gappy]))
-    with pytest.raises(ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"):
+    with pytest.raises(
+        ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"
+    ):
         estimator_class("kalman_filter_from_the_future")
-    assert "'windowed' is not one of" in refusal(lambda: estimator_class("windowed"), ConfigurationError)
+    assert "'windowed' is not one of" in refusal(
+        lambda: estimator_class("windowed"), ConfigurationError
+    )
 
 
 def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
@@ -115,7 +148,9 @@ def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, m
     description.write_text(description.read_text().replace("version: '1'\n", ""))
     assert load_model(tmp_path).gain == estimator.gain
     monkeypatch.setattr(type(estimator), "version", "2")
-    with pytest.raises(DataError, match=r"holds version 1 of 'luenberger'.*version 2 here; train it again"):
+    with pytest.raises(
+        DataError, match=r"holds version 1 of 'luenberger'.*version 2 here; train it again"
+    ):
         load_model(tmp_path)
     save_model(estimator, tmp_path)
     assert load_model(tmp_path).gain == estimator.gain
@@ -130,7 +165,9 @@ def test_a_number_that_is_given_is_not_fitted(drive):
 
 
 def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
-    assert "no state to start from" in refusal(lambda: known("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError)
+    assert "no state to start from" in refusal(
+        lambda: known("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError
+    )
     estimator = fitted("luenberger")
     estimator.threshold, drive = 0.0, drive_for(estimator)
     free = estimator.estimate([drive])[0]["vy"]
@@ -144,9 +181,13 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
     one = estimator.estimate([drive, drive], states[0])
     assert np.array_equal(one[0]["vy"], one[1]["vy"])
-    assert "2 initial states for 1 recordings" in refusal(lambda: estimator.estimate([drive], states))
+    assert "2 initial states for 1 recordings" in refusal(
+        lambda: estimator.estimate([drive], states)
+    )
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
-    assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
+    assert np.array_equal(
+        estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,17 +198,41 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         ("luenberger", {"gains": 3}, "gains is not an option"),
         ("kalman", {"noise": {"ay": -1}}, r"estimator\.noise\.ay must be positive"),
         ("kalman", {"noise": {"cutoff": 1.5}}, "cutoff must lie between"),
-        ("kalman", {"car": {**vars(FERRARI_250LM), "mass": -3}}, r"estimator\.car: mass must be positive, not -3"),
+        (
+            "kalman",
+            {"car": {**vars(FERRARI_250LM), "mass": -3}},
+            r"estimator\.car: mass must be positive, not -3",
+        ),
         ("kalman", {"minimum_speed": 0}, "minimum_speed must be positive"),
         ("kalman", {"offsets": {"ay": 0.0}}, r"estimator\.offsets\.ay must be positive"),
-        ("factor_graph", {"window": 0}, "window must be null or at least one sampling interval, 0.01 s, not 0.0 s"),
-        ("factor_graph", {"noise": {"measured_ay": 0}}, r"estimator\.noise\.measured_ay must be positive"),
+        (
+            "factor_graph",
+            {"window": 0},
+            "window must be null or at least one sampling interval, 0.01 s, not 0.0 s",
+        ),
+        (
+            "factor_graph",
+            {"noise": {"measured_ay": 0}},
+            r"estimator\.noise\.measured_ay must be positive",
+        ),
         ("factor_graph", {"gate": 5.0}, r"estimator\.gate needs estimator\.window"),
         ("rational_ekf", {"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
         ("rational_ekf", {"bound": 1.0}, "bound must be more than 1"),
-        ("rational_ekf", {"largest_sideslip": 1.6}, r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6"),
-        ("rational_ekf", {"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
-        ("rational_ekf", {"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
+        (
+            "rational_ekf",
+            {"largest_sideslip": 1.6},
+            r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6",
+        ),
+        (
+            "rational_ekf",
+            {"noise": {"yaw_rate": 0.1}},
+            "estimator.noise: give all of yaw_rate, ay, steer, or none",
+        ),
+        (
+            "rational_ekf",
+            {"curves": {"c1_front": 0.1}},
+            "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none",
+        ),
         ("velocity_gru", {"inputs": ["ax", "ax"]}, "list of different channels"),
         ("velocity_gru", {"inputs": ["warp"]}, "channel 'warp' is not known"),
         ("velocity_gru", {"inputs": ["vy_ref"]}, "'vy_ref' comes from a reference sensor"),
@@ -191,7 +256,11 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         ("sideslip_ffnn", {"hidden": "ab"}, "estimator"),
         ("sideslip_ffnn", {"dropout": 1.0}, "estimator"),
         ("sideslip_ffnn", {"normalisation": "rank"}, "estimator"),
-        ("self_calibrating", {"wheelbase": 2.7, "cg_to_rear_axle": 3.0}, "cg_to_rear_axle must lie between 0 and the wheelbase"),
+        (
+            "self_calibrating",
+            {"wheelbase": 2.7, "cg_to_rear_axle": 3.0},
+            "cg_to_rear_axle must lie between 0 and the wheelbase",
+        ),
         ("self_calibrating", {"grips": [9.0, -1.0]}, "grips must be positive"),
     ],
 )
@@ -223,13 +292,26 @@ def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_
     from vehest.run.estimate import pretrained_folder
 
     drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
-    started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
+    started = vehest.train(
+        "ksnn",
+        drives[:1],
+        drives[1:],
+        [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"],
+    )
     assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])
     assert np.abs(flat_weights(scratch) - flat_weights(started)).max() > 0.01
 
-    with pytest.raises(ConfigurationError, match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0"):
-        vehest.train("ksnn", drives[:1], drives[1:], ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"])
+    with pytest.raises(
+        ConfigurationError,
+        match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0",
+    ):
+        vehest.train(
+            "ksnn",
+            drives[:1],
+            drives[1:],
+            ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"],
+        )
 
 
 def test_the_model_counts_as_an_input_and_is_found_by_name(place):
@@ -238,4 +320,6 @@ def test_the_model_counts_as_an_input_and_is_found_by_name(place):
     code, out, _ = place("train", *common, "training.start_from=pretrained")
     assert code == 0
     assert "skipped: False" in out or "up to date" not in out
-    assert place.refused("train", *common, "training.start_from=nobody")[1].startswith("error: there is no model 'nobody'")
+    assert place.refused("train", *common, "training.start_from=nobody")[1].startswith(
+        "error: there is no model 'nobody'"
+    )

@@ -24,7 +24,10 @@ def factor_graph(**config):
 
 
 def drive_with_gaps(seconds=2.0):
-    return with_gaps(linear_drive(seconds, seed=1)[0].without_references(), {"ay": slice(40, 60), "yaw_rate": slice(50, 70)})
+    return with_gaps(
+        linear_drive(seconds, seed=1)[0].without_references(),
+        {"ay": slice(40, 60), "yaw_rate": slice(50, 70)},
+    )
 
 
 def least_squares(estimator, drive, first, last, start, deviation):
@@ -35,7 +38,10 @@ def least_squares(estimator, drive, first, last, start, deviation):
 
     def equation(coefficients, value, sigma):
         """Coefficients of state i of sample k."""
-        entries.extend((len(right), 2 * (k - first) + i, weight / sigma) for (k, i), weight in coefficients.items())
+        entries.extend(
+            (len(right), 2 * (k - first) + i, weight / sigma)
+            for (k, i), weight in coefficients.items()
+        )
         right.append(value / sigma)
 
     for i in (0, 1):
@@ -44,7 +50,11 @@ def least_squares(estimator, drive, first, last, start, deviation):
         if np.isfinite(drive["yaw_rate"][k]):
             equation({(k, 1): 1.0}, drive["yaw_rate"][k], noise.measured_yaw_rate)
         if np.isfinite(drive["ay"][k]):
-            equation({(k, 0): C[k, 0], (k, 1): C[k, 1]}, drive["ay"][k] - D[k] * drive["steer"][k], noise.measured_ay)
+            equation(
+                {(k, 0): C[k, 0], (k, 1): C[k, 1]},
+                drive["ay"][k] - D[k] * drive["steer"][k],
+                noise.measured_ay,
+            )
         if k < last:
             for i, sigma in enumerate((noise.model_sideslip, noise.model_yaw_rate)):
                 offset = B[k, i] * drive["steer"][k]
@@ -56,7 +66,12 @@ def least_squares(estimator, drive, first, last, start, deviation):
 
 def filtered(estimator, drive, gate=None):
     samples = drive.stack(estimator.channels)
-    return kalman_scan(estimator.linear_model(samples), samples[:, MEASURED], Gaussian(np.zeros(2), 100.0**2 * np.eye(2)), gate)
+    return kalman_scan(
+        estimator.linear_model(samples),
+        samples[:, MEASURED],
+        Gaussian(np.zeros(2), 100.0**2 * np.eye(2)),
+        gate,
+    )
 
 
 def states_of(estimate):
@@ -88,7 +103,12 @@ def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_
 def test_online_skips_gaps_as_batch_does_and_believes_a_state_handed_over():
     estimator, drive = factor_graph(window=0.1), drive_with_gaps()
     stepper = estimator.online()
-    online = np.array([stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))])
+    online = np.array(
+        [
+            stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
+            for k in range(len(drive))
+        ]
+    )
     assert np.abs(online - estimator.estimate([drive])[0]["vy"]).max() < 1e-9
     drive = linear_drive(1.0)[0]
     for window in (None, 0.05):
@@ -102,16 +122,26 @@ def test_variants_say_how_they_are_solved_and_learn_nothing():
     record = estimator.fit(FitData([], []), NoTraining())
     assert record.metrics["epochs"] == 0
     assert (estimator.learns, estimator.n_parameters, estimator.weights()) == (False, 0, {})
-    assert "'gain' is missing, unknown or of another shape" in refusal(lambda: estimator.load_weights({"gain": np.ones(1)}))
+    assert "'gain' is missing, unknown or of another shape" in refusal(
+        lambda: estimator.load_weights({"gain": np.ones(1)})
+    )
     assert (factor_graph().variant, factor_graph().causal) == ("factor_graph_batch", False)
-    assert (factor_graph(window=0.05).variant, factor_graph(window=0.05).causal) == ("factor_graph_lag_0.05s", True)
-    assert "cannot run along with a drive; set estimator.window" in refusal(lambda: factor_graph().online(), ConfigurationError)
+    assert (factor_graph(window=0.05).variant, factor_graph(window=0.05).causal) == (
+        "factor_graph_lag_0.05s",
+        True,
+    )
+    assert "cannot run along with a drive; set estimator.window" in refusal(
+        lambda: factor_graph().online(), ConfigurationError
+    )
 
 
 def test_with_a_long_window_its_gate_is_that_of_the_kalman_filter():
     estimator = factor_graph(window=3.0, gate=4.0, noise={"measured_ay": 0.5})
     drive = drive_with_gaps(1.35)
-    for name, samples, size in (("ay", slice(75, 76), 1e6), ("yaw_rate", slice(80, 135), 3.0)):  # longer than it is patient
+    for name, samples, size in (
+        ("ay", slice(75, 76), 1e6),
+        ("yaw_rate", slice(80, 135), 3.0),
+    ):  # longer than it is patient
         spoilt = drive[name].copy()
         spoilt[samples] += size
         drive = replace(drive, channels={**drive.channels, name: spoilt})

@@ -28,7 +28,12 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
     assert estimator.values["ay"] == high_passed_level([drive["ay"] for drive in drives], 0.2)
     assert estimator.values["yaw_rate"] == pytest.approx(NOISE["yaw_rate"] * np.sqrt(0.8), rel=0.05)
     assert record.metrics["epochs"] == 0
-    assert (estimator.n_parameters, estimator.learns, estimator.causal, estimator.variant) == (3, True, True, "kalman")
+    assert (estimator.n_parameters, estimator.learns, estimator.causal, estimator.variant) == (
+        3,
+        True,
+        True,
+        "kalman",
+    )
     drive = linear_drive(30.0, seed=3)[0].without_references()
     own, trained = kalman(noise={"read_from": "recording"}), kalman()
     trained.fit(FitData([drive], []), NoTraining())
@@ -45,8 +50,14 @@ def test_levels_that_are_given_are_not_read_and_need_no_training():
     assert estimator.values["ay"] == 0.7
     assert estimator.n_parameters == 2
     estimator = kalman(**GIVEN)
-    assert (estimator.learns, estimator.causal, estimator.variant) == (False, True, "kalman_given_noise")
-    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
+    assert (estimator.learns, estimator.causal, estimator.variant) == (
+        False,
+        True,
+        "kalman_given_noise",
+    )
+    assert np.isfinite(
+        estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"]
+    )
 
 
 def test_samples_that_are_missing_are_skipped():
@@ -62,7 +73,10 @@ def test_samples_that_are_missing_are_skipped():
     error = np.degrees(estimate["sideslip"] - states[:, 0])[1100:1200]
     assert np.abs(error).max() < 2.0
     stepper = estimator.online()
-    online = [stepper.step({name: gappy[name][k] for name in estimator.channels})["vy"] for k in range(1300)]
+    online = [
+        stepper.step({name: gappy[name][k] for name in estimator.channels})["vy"]
+        for k in range(1300)
+    ]
     assert np.abs(np.array(online) - estimate["vy"][:1300]).max() < 1e-9
 
 
@@ -71,13 +85,17 @@ def test_speed_and_steering_may_not_be_missing():
         kalman(**GIVEN).online().step({"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0})
     with pytest.raises(DataError, match="channel 'steer' has gaps"):
         kalman(**GIVEN).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
-    assert "no channel 'steer'" in refusal(lambda: kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0}))
+    assert "no channel 'steer'" in refusal(
+        lambda: kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
+    )
 
 
 def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():
     drive = linear_drive(20.0, seed=6)[0]
     slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
-    estimate = kalman(**GIVEN).estimate([type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)])[0]
+    estimate = kalman(**GIVEN).estimate(
+        [type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)]
+    )[0]
     assert np.isfinite(estimate["vy"]).all()
     assert np.isfinite(estimate.covariance).all()
     drive = linear_drive(2.0)[0]
@@ -89,13 +107,29 @@ def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed()
 @pytest.mark.parametrize(
     ("name", "samples", "message"),
     [
-        ("steer", np.zeros(3000), "'linear': channel 'steer' has no noise that could be read off it; give estimator.noise.steer"),
-        ("ay", np.full(3000, np.nan), "channel 'ay': 75 samples without a gap are needed to read a noise level; give estimator.noise.ay"),
+        (
+            "steer",
+            np.zeros(3000),
+            "'linear': channel 'steer' has no noise that could be read off it; give estimator.noise.steer",
+        ),
+        (
+            "ay",
+            np.full(3000, np.nan),
+            "channel 'ay': 75 samples without a gap are needed to read a noise level; give estimator.noise.ay",
+        ),
     ],
 )
 def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
     drive = linear_drive(30.0)[0]
-    wrong = type(drive)("linear", "car", 100.0, 0.0, {**drive.channels, name: samples}, "simulated", frozenset({"ay"}))
+    wrong = type(drive)(
+        "linear",
+        "car",
+        100.0,
+        0.0,
+        {**drive.channels, name: samples},
+        "simulated",
+        frozenset({"ay"}),
+    )
     with pytest.raises(DataError, match=message):
         kalman().fit(FitData([wrong], []), NoTraining())
 
@@ -104,8 +138,13 @@ def with_planted_offsets(seed, ay, steer):
     """A drive whose accelerometer and steering angle are off by constants that are drawn."""
     drive, states = linear_drive(4.0, seed=seed)
     generator = np.random.default_rng(1000 + seed)
-    shifted = {"ay": drive["ay"] + ay * generator.standard_normal(), "steer": drive["steer"] + steer * generator.standard_normal()}
-    return replace(drive.without_references(), channels={**drive.without_references().channels, **shifted}), states
+    shifted = {
+        "ay": drive["ay"] + ay * generator.standard_normal(),
+        "steer": drive["steer"] + steer * generator.standard_normal(),
+    }
+    return replace(
+        drive.without_references(), channels={**drive.without_references().channels, **shifted}
+    ), states
 
 
 def augmented(drive, ay, steer, seconds):
@@ -117,7 +156,12 @@ def augmented(drive, ay, steer, seconds):
     means, covariances = [], []
     for k in range(len(drive)):
         if k > 0:
-            F = np.block([[A[k - 1], np.zeros((2, 1)), -B[k - 1][:, None]], [np.zeros((2, 2)), kept * np.eye(2)]])
+            F = np.block(
+                [
+                    [A[k - 1], np.zeros((2, 1)), -B[k - 1][:, None]],
+                    [np.zeros((2, 2)), kept * np.eye(2)],
+                ]
+            )
             Q = np.zeros((4, 4))
             Q[:2, :2] = NOISE["steer"] ** 2 * np.outer(B[k - 1], B[k - 1])
             Q[2:, 2:] = (1.0 - kept**2) * np.diag([ay**2, steer**2])
@@ -126,7 +170,9 @@ def augmented(drive, ay, steer, seconds):
             covariance = F @ covariance @ F.T + Q
         H = np.array([[*C[k], 1.0, -D[k]], [0.0, 1.0, 0.0, 0.0]])
         gain = covariance @ H.T @ np.linalg.inv(H @ covariance @ H.T + R)
-        mean = mean + gain @ (np.array([drive["ay"][k] - D[k] * drive["steer"][k], drive["yaw_rate"][k]]) - H @ mean)
+        mean = mean + gain @ (
+            np.array([drive["ay"][k] - D[k] * drive["steer"][k], drive["yaw_rate"][k]]) - H @ mean
+        )
         left = np.eye(4) - gain @ H
         covariance = left @ covariance @ left.T + gain @ R @ gain.T
         means.append(mean)
@@ -150,5 +196,8 @@ def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
     drive, _ = with_planted_offsets(1, 0.6, 0.01)
     stepper, batch = estimator.online(), estimator.estimate([drive])[0]
-    online = [stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))]
+    online = [
+        stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
+        for k in range(len(drive))
+    ]
     assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9

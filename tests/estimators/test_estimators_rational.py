@@ -27,8 +27,12 @@ QUICK = NoiseTuningSettings(grid=1, max_evaluations=25)
 
 def rational(tyres="rational_adaptive", **config):
     """A filter with everything given."""
-    curves = {name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")}
-    return estimator_class("rational_ekf").from_config({"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
+    curves = {
+        name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")
+    }
+    return estimator_class("rational_ekf").from_config(
+        {"tyres": tyres, "noise": LEVEL, "curves": curves, **config}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +43,20 @@ def drive():
 def readable(estimator, samples):
     """The extended filter of the same model, with Jacobians from automatic differentiation, step by step."""
     first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
-    return extended_filter(rational_model(estimator), torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]]), first)
+    return extended_filter(
+        rational_model(estimator),
+        torch.as_tensor(samples[:, [0, 2]]),
+        torch.as_tensor(samples[:, [1, 3]]),
+        first,
+    )
 
 
 def test_slopes_and_peak_of_the_rational_tyre_are_those_of_differentiation_and_closed_form():
     values = torch.tensor([0.06, np.log(0.008), np.log(7e4), np.log(0.7)], dtype=torch.float64)
     found = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
-    slopes = torch.func.jacrev(lambda v: rational_axle(v[0], v[1].exp(), v[2].exp(), v[3].exp()).force)(values)
+    slopes = torch.func.jacrev(
+        lambda v: rational_axle(v[0], v[1].exp(), v[2].exp(), v[3].exp()).force
+    )(values)
     assert torch.allclose(torch.stack(found[1:]), slopes, rtol=1e-12)
     assert AxleForce._fields[1:] == ("per_slip", "per_log_c1", "per_log_c2", "per_log_friction")
     slip = np.linspace(0.0, 0.4, 100001)
@@ -69,13 +80,24 @@ def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
         steering = torch.func.jacrev(track.transition, 1)(state, inputs)[:, 1].numpy()
         wander = np.diag([0.0] * 4 + [0.05**2] * (n - 4))
         rows = np.stack([sample, sample])
-        silent = estimator.filter_samples(rows, Gaussian(mean, root @ root.T), levels=dict.fromkeys(LEVELS, 0.0)).last
+        silent = estimator.filter_samples(
+            rows, Gaussian(mean, root @ root.T), levels=dict.fromkeys(LEVELS, 0.0)
+        ).last
         noisy = estimator.filter_samples(
-            rows, Gaussian(mean, np.zeros((n, n))), levels=dict(zip(LEVELS, (0.1, 0.1, 0.2, 0.05), strict=True))
+            rows,
+            Gaussian(mean, np.zeros((n, n))),
+            levels=dict(zip(LEVELS, (0.1, 0.1, 0.2, 0.05), strict=True)),
         ).last
         assert np.allclose(silent.mean, track.transition(state, inputs), rtol=1e-12)
-        assert np.allclose(silent.covariance, slope @ root @ root.T @ slope.T, rtol=1e-9, atol=1e-15)
-        assert np.allclose(noisy.covariance, track.step * (0.04 * np.outer(steering, steering) + wander), rtol=1e-9, atol=1e-15)
+        assert np.allclose(
+            silent.covariance, slope @ root @ root.T @ slope.T, rtol=1e-9, atol=1e-15
+        )
+        assert np.allclose(
+            noisy.covariance,
+            track.step * (0.04 * np.outer(steering, steering) + wander),
+            rtol=1e-9,
+            atol=1e-15,
+        )
 
 
 @pytest.mark.parametrize("unstable", [False, True])
@@ -106,11 +128,15 @@ def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_
     assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
     free = rational(tyres).filter_samples(samples).mean
     assert np.abs(free[:, 0]).max() > np.radians(1.5)
-    assert np.mean(np.abs(ours.mean[:, 0]) > np.radians(1.5)) < np.mean(np.abs(free[:, 0]) > np.radians(1.5))
+    assert np.mean(np.abs(ours.mean[:, 0]) > np.radians(1.5)) < np.mean(
+        np.abs(free[:, 0]) > np.radians(1.5)
+    )
 
 
 @pytest.mark.parametrize(
-    "config", [{"tyres": tyres} for tyres in KINDS] + [{"filter": "unscented"}, {"filter": "unscented", "adapt_above": 2.0}]
+    "config",
+    [{"tyres": tyres} for tyres in KINDS]
+    + [{"filter": "unscented"}, {"filter": "unscented", "adapt_above": 2.0}],
 )
 def test_online_is_batch_through_gaps_and_a_stop_and_from_its_file(config, drive, tmp_path):
     gappy = with_gaps(drive, {"yaw_rate": slice(100, 120), "ay": slice(110, 150)}).cut(0.0, 12.0)
@@ -119,14 +145,19 @@ def test_online_is_batch_through_gaps_and_a_stop_and_from_its_file(config, drive
     estimate = estimator.estimate([gappy.without_references()])[0]
     save_model(estimator, tmp_path)
     stepper = load_model(tmp_path).online()
-    steps = [stepper.step({name: gappy[name][k] for name in estimator.channels}) for k in range(len(gappy))]
+    steps = [
+        stepper.step({name: gappy[name][k] for name in estimator.channels})
+        for k in range(len(gappy))
+    ]
     for name in set(steps[0]) - {"vy_variance"}:
         assert np.allclose([step[name] for step in steps], estimate[name], rtol=1e-9, atol=1e-9)
 
 
 def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncertainty(drive):
     short = drive.cut(0.0, 15.0)
-    extended, unscented = (rational(filter=kind).estimate([short])[0] for kind in ("extended", "unscented"))
+    extended, unscented = (
+        rational(filter=kind).estimate([short])[0] for kind in ("extended", "unscented")
+    )
     assert np.degrees(np.abs(extended["sideslip"] - unscented["sideslip"])[40:].max()) < 0.1
     assert (extended["nis_dof"] == 2).all()
 
@@ -139,11 +170,18 @@ def test_changed_tyres_and_friction_are_found_and_help():
         late = adaptive[f"cornering_stiffness_{axle}"][-600:]
         assert late.mean() == pytest.approx(0.85 * CURVES[f"c2_{axle}"], rel=0.05)
     late = worn.cut(60.0, 120.0)
-    errors = [np.sqrt(np.mean((estimate["sideslip"][1200:] - late["sideslip_ref"]) ** 2)) for estimate in (adaptive, fixed)]
+    errors = [
+        np.sqrt(np.mean((estimate["sideslip"][1200:] - late["sideslip_ref"]) ** 2))
+        for estimate in (adaptive, fixed)
+    ]
     assert errors[0] < 0.5 * errors[1]
-    estimate = rational("rational_friction").estimate([rational_drive(60.0, seed=3, friction=0.7)])[0]
+    estimate = rational("rational_friction").estimate([rational_drive(60.0, seed=3, friction=0.7)])[
+        0
+    ]
     assert estimate["friction"][-200:].mean() == pytest.approx(0.7, abs=0.03)
-    assert np.allclose(estimate["cornering_stiffness_front"], CURVES["c2_front"] * estimate["friction"])
+    assert np.allclose(
+        estimate["cornering_stiffness_front"], CURVES["c2_front"] * estimate["friction"]
+    )
 
 
 def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(drive):
@@ -156,11 +194,19 @@ def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(d
     assert held[bend < 1.5].all()
     assert not held[bend > 2.5].any()
     assert 0.1 < held.mean() < 0.9
-    straight = changed(drive, {"steer": np.zeros(800), "yaw_rate": np.zeros(800), "ay": np.full(800, 0.3)})
-    kept, moved = (rational(adapt_above=limit).filter_samples(straight.stack(estimator.channels)).last.mean[4:] for limit in (2.0, 0.0))
+    straight = changed(
+        drive, {"steer": np.zeros(800), "yaw_rate": np.zeros(800), "ay": np.full(800, 0.3)}
+    )
+    kept, moved = (
+        rational(adapt_above=limit).filter_samples(straight.stack(estimator.channels)).last.mean[4:]
+        for limit in (2.0, 0.0)
+    )
     assert (kept == 0.0).all()
     assert np.abs(moved).max() > 0.1
-    assert (rational(adapt_above=2.0).variant, rational("rational", adapt_above=2.0).variant) == ("ratte_held", "ratt")
+    assert (rational(adapt_above=2.0).variant, rational("rational", adapt_above=2.0).variant) == (
+        "ratte_held",
+        "ratt",
+    )
 
 
 def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_the_start(drive):
@@ -194,7 +240,9 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     train, held_out = rational_drive(60.0, seed=4), rational_drive(40.0, seed=5)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
-    assert "has no axle curves yet; fit or load it first" in refusal(lambda: estimator.online(), ConfigurationError)
+    assert "has no axle curves yet; fit or load it first" in refusal(
+        lambda: estimator.online(), ConfigurationError
+    )
     record = estimator.fit(FitData([train], [held_out]), QUICK)
     for name, value in CURVES.items():
         assert record.metrics[name] == pytest.approx(value, rel=0.15)
@@ -204,18 +252,25 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     assert nis.sum() / n_measured.sum() == pytest.approx(1.0, rel=0.05)
     assert np.degrees(np.sqrt(record.metrics["best_validation_loss"])) < 0.15
     assert record.metrics["best_validation_loss"] == pytest.approx(
-        np.mean((estimator.estimate([held_out])[0]["sideslip"] - held_out["sideslip_ref"])[30:] ** 2)
+        np.mean(
+            (estimator.estimate([held_out])[0]["sideslip"] - held_out["sideslip_ref"])[30:] ** 2
+        )
     )
     other = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     other.load_weights(estimator.weights())
-    assert np.array_equal(other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"])
+    assert np.array_equal(
+        other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"]
+    )
 
 
 @pytest.mark.parametrize("fault", ["slip", "force"])
 def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerometer_is_off(fault):
     """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals show neither."""
     drive = rational_drive(60.0, seed=4)
-    wrong = {"slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)}, "force": {"ay": 1.05 * drive["ay"]}}[fault]
+    wrong = {
+        "slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)},
+        "force": {"ay": 1.05 * drive["ay"]},
+    }[fault]
     estimator = estimator_class("rational_ekf").from_config({})
     record = estimator.fit(FitData([changed(drive, wrong)], []), NoiseTuningSettings(method="data"))
     for name in ("c2_front", "c2_rear"):
@@ -227,7 +282,10 @@ def test_levels_of_the_unscented_filter_are_found_through_the_extended_one_withi
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert estimator.fit(FitData([train], []), QUICK).metrics["levels_at_limits"] == 0
     train = rational_drive(30.0, seed=8)
-    fitted = [estimator_class("rational_ekf").from_config({"filter": kind}) for kind in ("extended", "unscented")]
+    fitted = [
+        estimator_class("rational_ekf").from_config({"filter": kind})
+        for kind in ("extended", "unscented")
+    ]
     for estimator in fitted:
         estimator.fit(FitData([train], []), NoiseTuningSettings(grid=1, max_evaluations=5))
     assert fitted[0].values == fitted[1].values
@@ -237,14 +295,26 @@ def test_levels_of_the_unscented_filter_are_found_through_the_extended_one_withi
 def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(drive):
     """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
     train, worn = rational_drive(60.0, seed=4), rational_drive(60.0, seed=7, stiffness=0.85)
-    alone, both = (estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}}) for spread in (None, 0.2))
+    alone, both = (
+        estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}})
+        for spread in (None, 0.2)
+    )
     alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
     both.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
     assert np.array_equal(alone.axle_curves, both.axle_curves)
-    np.testing.assert_allclose(both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12)
-    with pytest.raises(ConfigurationError, match=r"curves_from 'fit_\*' matches no training recording \(rational4\)"):
+    np.testing.assert_allclose(
+        both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12
+    )
+    with pytest.raises(
+        ConfigurationError,
+        match=r"curves_from 'fit_\*' matches no training recording \(rational4\)",
+    ):
         both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
-    assert "sideslip_ref" in refusal(lambda: rational(noise={"tyres": 0.01}).fit(FitData([drive.without_references()], []), QUICK))
+    assert "sideslip_ref" in refusal(
+        lambda: rational(noise={"tyres": 0.01}).fit(
+            FitData([drive.without_references()], []), QUICK
+        )
+    )
 
 
 def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
@@ -257,18 +327,30 @@ def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
     assert "evaluations" not in record.metrics
     estimator = rational()
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (False, 0, "ratte")
-    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
+    assert np.isfinite(
+        estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"]
+    )
 
 
-@pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
+@pytest.mark.skipif(
+    importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'"
+)
 def test_optuna_finds_the_minimum_for_its_seed_and_levels_in_their_box_that_get_better():
     train = rational_drive(30.0, seed=9)
-    few, many = (estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2))
-    records = [own.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n)) for own, n in ((few, 3), (many, 25))]
+    few, many = (
+        estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2)
+    )
+    records = [
+        own.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n))
+        for own, n in ((few, 3), (many, 25))
+    ]
     assert [record.metrics["evaluations"] for record in records] == [3, 25]
     assert records[1].metrics["best_train_loss"] <= records[0].metrics["best_train_loss"]
     low, high = BOXES["ay"]
     assert 10.0**low <= many.values["ay"] / many.values["yaw_rate"] <= 10.0**high
-    records = [optuna_search(lambda p: float((p[0] - 0.3) ** 2), [(-1.0, 1.0)], 40, 7, FitContext()) for _ in range(2)]
+    records = [
+        optuna_search(lambda p: float((p[0] - 0.3) ** 2), [(-1.0, 1.0)], 40, 7, FitContext())
+        for _ in range(2)
+    ]
     assert records[0].best[0] == pytest.approx(0.3, abs=0.1)
     assert np.array_equal(records[0].starts, records[1].starts)

@@ -23,8 +23,14 @@ QUICK = SequenceSettings(PhaseSettings(max_epochs=3, learning_rate=1e-2), 60, 10
 def _drive(seconds=2.5, seed=0, scale=1.0):
     """A planar drive at 100 Hz with a reference of the yaw rate."""
     drive = planar_drive(seconds, 100.0, seed, noise=0.02, name=f"drive {seed}")
-    channels = {**drive.channels, "yaw_rate_ref": drive["yaw_rate"], "vy_ref": scale * drive["vy_ref"]}
-    return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, "simulated")
+    channels = {
+        **drive.channels,
+        "yaw_rate_ref": drive["yaw_rate"],
+        "vy_ref": scale * drive["vy_ref"],
+    }
+    return Recording(
+        drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, "simulated"
+    )
 
 
 DATA = FitData([_drive(seed=1), _drive(0.5, seed=2)], [_drive(seed=3)])
@@ -46,7 +52,9 @@ def _phase(estimator, training, train, validation):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(name):
+def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(
+    name,
+):
     """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
     estimator = _estimator(name)
     record = estimator.fit(DATA, QUICK)
@@ -54,7 +62,9 @@ def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_d
     for first in (0.0, 1.0):  # the last half second does not fill a sequence
         piece = DATA.validation[0].cut(first, first + 1.0)
         estimate = estimator.estimate([piece.without_references()])[0]
-        errors.append(np.stack([estimate[q] - piece[f"{q}_ref"] for q in ("vx", "vy", "yaw_rate")])[:, 20:])
+        errors.append(
+            np.stack([estimate[q] - piece[f"{q}_ref"] for q in ("vx", "vy", "yaw_rate")])[:, 20:]
+        )
     weighted = np.array([0.2225, 0.5064, 0.1566]) @ np.square(np.concatenate(errors, axis=1))
     assert record.metrics["best_validation_loss"] == pytest.approx(weighted.mean(), rel=1e-4)
 
@@ -64,7 +74,10 @@ def test_error_in_dropped_samples_teaches_nothing(name):
     """References that differ only where every possible sequence drops its samples lead to the same weights."""
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
     whole = _drive(seed=1)
-    spoilt = {**whole.channels, "vy_ref": np.where(np.arange(250) < 20, -whole["vy_ref"], whole["vy_ref"])}
+    spoilt = {
+        **whole.channels,
+        "vy_ref": np.where(np.arange(250) < 20, -whole["vy_ref"], whole["vy_ref"]),
+    }
     # means and deviations of the references must not move either
     estimators = []
     for drive in (whole, Recording(whole.id, whole.vehicle, 100.0, 0.0, spoilt, "simulated")):
@@ -90,7 +103,9 @@ def test_members_train_as_if_alone_and_seeds_differ(name):
 def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path):
     whole = _estimator("velocity_gru", dropout=0.3)
     record = whole.fit(DATA, QUICK)
-    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=stop_after(4)))
+    stopped = _estimator("velocity_gru", dropout=0.3).fit(
+        DATA, QUICK, FitContext([tmp_path], should_stop=stop_after(4))
+    )
     assert stopped.interrupted
     assert 0 < stopped.metrics["epochs"] < 3
     resumed = _estimator("velocity_gru", dropout=0.3)
@@ -103,7 +118,10 @@ def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropou
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, QUICK, recordings, recordings[:1])
     generator = torch.Generator().manual_seed(0)
-    known = [{tuple(row) for row in _drives(estimator, [recording]).inputs.tolist()} for recording in recordings]
+    known = [
+        {tuple(row) for row in _drives(estimator, [recording]).inputs.tolist()}
+        for recording in recordings
+    ]
     firsts = []
     for _ in range(3):
         sequences = [sequence for batch in phase.batches(generator) for sequence in batch.inputs]
@@ -116,14 +134,24 @@ def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropou
     assert firsts[0] != firsts[1] != firsts[2]
     estimator = _estimator("velocity_gru", dropout=0.25, n_states=64)
     phase = _phase(estimator, QUICK, DATA.train, DATA.train[:1])
-    masks = torch.cat([batch.mask.reshape(-1) for batch in phase.batches(torch.Generator().manual_seed(0))])
+    masks = torch.cat(
+        [batch.mask.reshape(-1) for batch in phase.batches(torch.Generator().manual_seed(0))]
+    )
     assert float((masks == 0).float().mean()) == pytest.approx(0.25, abs=0.02)
     assert float(masks.mean()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
     """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
-    training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, validation_dropped_steps=20, truncate_steps=25, batch_size=3)
+    training = SequenceSettings(
+        PhaseSettings(max_epochs=1),
+        60,
+        100,
+        0,
+        validation_dropped_steps=20,
+        truncate_steps=25,
+        batch_size=3,
+    )
     estimator = _estimator("velocity_gru")
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, training, recordings, recordings[:1])
@@ -131,7 +159,9 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
     lengths = set()
     for seed in range(2):
         batches = list(phase.batches(torch.Generator().manual_seed(seed)))
-        found = [tuple(row) for batch in batches for row in batch.inputs[batch.counted > 0].tolist()]
+        found = [
+            tuple(row) for batch in batches for row in batch.inputs[batch.counted > 0].tolist()
+        ]
         assert sorted(found) == expected
         assert not batches[0].goes_on
         assert any(batch.goes_on for batch in batches)
@@ -142,21 +172,29 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
 @pytest.mark.parametrize("name", NAMES)
 def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
     """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
-    training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1)
+    training = SequenceSettings(
+        PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1
+    )
     estimator = _estimator(name)
     network, drive = estimator.network, _drive(0.6, 1)
     phase = _phase(estimator, training, [drive], DATA.validation)
     whole = _drives(estimator, [drive]).padded(torch.tensor([[0, 60]]), 0)
     parts = [whole.stretch(0, 30), whole.stretch(30, 60)]
     together, apart = phase.loss(whole).detach(), [phase.loss(part) for part in parts]
-    assert float(together) == pytest.approx(float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4)
+    assert float(together) == pytest.approx(
+        float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4
+    )
     gradients = torch.autograd.grad(apart[1], list(network.parameters()), allow_unused=True)
     with torch.no_grad():
         _, state = network(parts[0].inputs, network.start(parts[0].starts))
     outputs, _ = network(parts[1].inputs, state)
     weights = torch.tensor([0.2225, 0.5064, 0.1566])
     alone = ((outputs - parts[1].targets).square() @ weights).mean()
-    for one, other in zip(gradients, torch.autograd.grad(alone, list(network.parameters()), allow_unused=True), strict=True):
+    for one, other in zip(
+        gradients,
+        torch.autograd.grad(alone, list(network.parameters()), allow_unused=True),
+        strict=True,
+    ):
         assert torch.allclose(one, other, rtol=1e-3, atol=1e-6)
 
 
@@ -164,7 +202,9 @@ def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
     estimator = _estimator("velocity_lstm")
     drives = _drives(estimator, DATA.train[:1])
-    turned = next(iter(_phase(estimator, training, DATA.train[:1], DATA.train[:1]).batches(torch.Generator())))
+    turned = next(
+        iter(_phase(estimator, training, DATA.train[:1], DATA.train[:1]).batches(torch.Generator()))
+    )
     signs = {"yaw_rate": -1.0, "ax": 1.0, "ay": -1.0}
     known = {tuple(row) for row in drives.inputs.tolist()}
     own = (turned.inputs * torch.tensor([signs[name] for name in INPUTS])).reshape(-1, 3).tolist()
@@ -182,7 +222,9 @@ def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not():
     for name in NAMES:
         estimator = _estimator(name)
         estimator.fit(DATA, QUICK)
-        free, started, told = (estimator.estimate([drive], state)[0] for state in (None, given, measured))
+        free, started, told = (
+            estimator.estimate([drive], state)[0] for state in (None, given, measured)
+        )
         assert np.array_equal(free["vy"], told["vy"])
         assert np.array_equal(free["vy"], started["vy"]) == (name == "velocity_gru")
         assert abs(free["vy"][-1] - started["vy"][-1]) < 1e-3, "it forgets where it started"
@@ -211,28 +253,60 @@ def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
     y = (start - w["output_mean"]) / w["output_scale"]
     expected = []
     for x in (drive.stack(INPUTS) - w["input_mean"]) / w["input_scale"]:
-        gates = w["recurrent.weight_ih_l0"] @ x + w["recurrent.bias_ih_l0"] + w["recurrent.weight_hh_l0"] @ h + w["recurrent.bias_hh_l0"]
+        gates = (
+            w["recurrent.weight_ih_l0"] @ x
+            + w["recurrent.bias_ih_l0"]
+            + w["recurrent.weight_hh_l0"] @ h
+            + w["recurrent.bias_hh_l0"]
+        )
         admit, keep, new, show = gates.reshape(4, 6)
         c = c / (1 + np.exp(-keep)) + np.tanh(new) / (1 + np.exp(-admit))
         h = np.tanh(c) / (1 + np.exp(-show))
-        y = w["read_out.weight"] @ np.maximum(w["dense.weight"] @ np.concatenate([h, y]) + w["dense.bias"], 0.0) + w["read_out.bias"]
+        y = (
+            w["read_out.weight"]
+            @ np.maximum(w["dense.weight"] @ np.concatenate([h, y]) + w["dense.bias"], 0.0)
+            + w["read_out.bias"]
+        )
         expected.append(y * w["output_scale"] + w["output_mean"])
     estimate = estimator.estimate([drive])[0]
-    assert np.abs(np.stack([estimate[q] for q in ("vx", "vy", "yaw_rate")], axis=1) - np.array(expected)).max() < 1e-12
-    assert estimator_class("velocity_gru").from_config({}).n_parameters == 3 * 64 * (6 + 64 + 2) + 3 * 65
-    assert estimator_class("velocity_lstm").from_config({}).n_parameters == 4 * 64 * (6 + 64 + 2) + 64 * 68 + 3 * 65
+    assert (
+        np.abs(
+            np.stack([estimate[q] for q in ("vx", "vy", "yaw_rate")], axis=1) - np.array(expected)
+        ).max()
+        < 1e-12
+    )
+    assert (
+        estimator_class("velocity_gru").from_config({}).n_parameters
+        == 3 * 64 * (6 + 64 + 2) + 3 * 65
+    )
+    assert (
+        estimator_class("velocity_lstm").from_config({}).n_parameters
+        == 4 * 64 * (6 + 64 + 2) + 64 * 68 + 3 * 65
+    )
 
 
 def test_recordings_too_short_or_with_gaps_are_one_clear_error():
     with pytest.raises(
-        DataError, match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it"
+        DataError,
+        match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it",
     ):
         _estimator("velocity_gru").fit(DATA, SequenceSettings())
-    with pytest.raises(DataError, match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60"):
-        _estimator("velocity_gru").fit(FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60))
-    with pytest.raises(ConfigurationError, match=r"sequence_steps must be more than dropped_steps \(200\), not 100"):
+    with pytest.raises(
+        DataError,
+        match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60",
+    ):
+        _estimator("velocity_gru").fit(
+            FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60)
+        )
+    with pytest.raises(
+        ConfigurationError, match=r"sequence_steps must be more than dropped_steps \(200\), not 100"
+    ):
         SequenceSettings(sequence_steps=100)
     drive = _drive()
     holes = {**drive.channels, "vy_ref": np.where(np.arange(250) == 7, np.nan, drive["vy_ref"])}
-    gappy = Recording(drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"}))
-    assert "'vy_ref' has gaps" in refusal(lambda: _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK))
+    gappy = Recording(
+        drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"})
+    )
+    assert "'vy_ref' has gaps" in refusal(
+        lambda: _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK)
+    )

@@ -19,11 +19,19 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.registry import estimator_class, estimator_names
 
 SPIKE, JUMP = 6.0, 8.0  # s
-DUGOFF = {"inputs": "imu", "tyres": TYRES, "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002}}
+DUGOFF = {
+    "inputs": "imu",
+    "tyres": TYRES,
+    "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002},
+}
 CONFIGS = {
     "kalman": {"noise": {**NOISE, "steer_factor": 1.0}},
     "factor_graph": {"window": 0.2, "noise": {"measured_ay": 0.5}},
-    "rational_ekf": {"tyres": "rational", "curves": CURVES, "noise": {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003}},
+    "rational_ekf": {
+        "tyres": "rational",
+        "curves": CURVES,
+        "noise": {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003},
+    },
     "dugoff_ukf": DUGOFF,
     "cnn_ukf": {**DUGOFF, "hidden": [8, 4]},
     "learned_ukf": {"dynamics": "pacejka", "noise": "constant"},
@@ -59,7 +67,13 @@ def estimator(name, gate=None):
 def drive(name):
     """Two drives one after the other, as if the car had jumped from the one motion into the other."""
     first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
-    return replace(first, channels={channel: np.concatenate([values, second[channel]]) for channel, values in first.channels.items()})
+    return replace(
+        first,
+        channels={
+            channel: np.concatenate([values, second[channel]])
+            for channel, values in first.channels.items()
+        },
+    )
 
 
 def spoilt(name, value):
@@ -74,7 +88,9 @@ def vy(made, recording):
     return made.estimate([recording])[0]["vy"]
 
 
-@pytest.mark.parametrize("name", [name for name in CONFIGS if name != "cnn_ukf"])  # whose network sees the spike, too
+@pytest.mark.parametrize(
+    "name", [name for name in CONFIGS if name != "cnn_ukf"]
+)  # whose network sees the spike, too
 @pytest.mark.parametrize("size", [1e6, -1e3])
 def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
     gated, free = estimator(name, 6.0), estimator(name)
@@ -114,32 +130,59 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
 
 
 @EVERY
-def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(name):
+def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(
+    name,
+):
     assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
-    assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
+    assert (
+        estimator(name, 5.0).variant.replace("_gate5", "")
+        == estimator(name).variant
+        != estimator(name, 5.0).variant
+    )
     assert "gated at 5 sigma" in estimator(name, 5.0).full_title
-    assert "estimator.gate must be positive" in refusal(lambda: estimator(name, 0.0), ConfigurationError)
+    assert "estimator.gate must be positive" in refusal(
+        lambda: estimator(name, 0.0), ConfigurationError
+    )
 
 
 @EVERY
 def test_online_with_a_gate_is_batch_with_a_gate(name):
     recording, made = spoilt(name, 1e4), estimator(name, 4.0)
     batch, stepper = vy(made, recording), made.online()
-    online = [stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"] for k in range(len(recording))]
-    assert np.abs(np.array(online) - batch).max() < (1e-6 if name.startswith("learned_ukf") else 1e-9)
+    online = [
+        stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"]
+        for k in range(len(recording))
+    ]
+    assert np.abs(np.array(online) - batch).max() < (
+        1e-6 if name.startswith("learned_ukf") else 1e-9
+    )
     if name != "factor_graph":
         taken = made.estimate([recording])[0]["nis_dof"]
         assert taken[round(SPIKE * recording.rate_hz)] < taken.max()
 
 
 def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
-    with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
-        estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
+    with pytest.raises(
+        ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"
+    ):
+        estimator_class("rational_ekf").from_config(
+            {**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0}
+        )
     assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key
 
 
-FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
-OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
+FILTERS = (
+    "kalman",
+    "factor_graph",
+    "rational_ekf",
+    "dugoff_ukf",
+    "cnn_ukf",
+    "learned_ukf",
+    "learned_ukf_variant",
+)
+OTHERS = [
+    name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")
+]  # whose stepper is that of cnn_ukf
 known = cache(fitted)
 
 
@@ -154,7 +197,9 @@ def ready(name):
 
 def rows(name):
     recording = small_car_drive(2.0) if name.startswith("learned_ukf") else linear_drive(2.0)[0]
-    return [{channel: float(recording[channel][k]) for channel in recording.channels} for k in range(60)]
+    return [
+        {channel: float(recording[channel][k]) for channel in recording.channels} for k in range(60)
+    ]
 
 
 def missing(row):
@@ -176,7 +221,10 @@ def motion(steps):
 
 @pytest.mark.parametrize(
     ("name", "wrong"),
-    [*product((*FILTERS, *OTHERS), (missing, none)), *product(FILTERS, (infinite,))],  # others take an infinite value
+    [
+        *product((*FILTERS, *OTHERS), (missing, none)),
+        *product(FILTERS, (infinite,)),
+    ],  # others take an infinite value
 )
 def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
     made, samples = ready(name), rows(name)

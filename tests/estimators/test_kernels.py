@@ -40,9 +40,13 @@ def _problem(estimator, dtype, members=3, batch=70):
         network.reset(torch.Generator().manual_seed(member))
         rows.append(layout.pack([network])[0])
     flat = torch.stack(rows).requires_grad_()
-    starts = torch.randint(0, len(windows), (members, batch), generator=torch.Generator().manual_seed(9))
+    starts = torch.randint(
+        0, len(windows), (members, batch), generator=torch.Generator().manual_seed(9)
+    )
     series = prepare(network, torch.as_tensor(windows.series, dtype=dtype))
-    weights = torch.randn(members, batch, generator=torch.Generator().manual_seed(10), dtype=torch.float64).to(dtype)
+    weights = torch.randn(
+        members, batch, generator=torch.Generator().manual_seed(10), dtype=torch.float64
+    ).to(dtype)
 
     def value_and_gradient(compiled):
         value = predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled)
@@ -56,7 +60,10 @@ def _problem(estimator, dtype, members=3, batch=70):
 @pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
 def test_compiled_recursion_equals_plain_one(estimator, dtype, tolerance):
     value_and_gradient = _problem(estimator, dtype)
-    (value, gradient), (plain_value, plain_gradient) = value_and_gradient(True), value_and_gradient(False)
+    (value, gradient), (plain_value, plain_gradient) = (
+        value_and_gradient(True),
+        value_and_gradient(False),
+    )
     scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
     assert (value - plain_value).abs().max() <= tolerance * scale
     assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
@@ -64,7 +71,9 @@ def test_compiled_recursion_equals_plain_one(estimator, dtype, tolerance):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_threads_do_not_change_a_bit_of_the_ksnn(dtype):
-    value_and_gradient = _problem(Ksnn(Ksnn.settings_type(n_local=3, n_hidden=2, bias=True)), dtype, members=5)
+    value_and_gradient = _problem(
+        Ksnn(Ksnn.settings_type(n_local=3, n_hidden=2, bias=True)), dtype, members=5
+    )
     alone = value_and_gradient(True)
     before = torch.get_num_threads()
     try:
@@ -89,7 +98,9 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
             over_members(work, members)
             assert (times == 1).all()
             assert len(workers) <= min(threads, members)
-        barrier = threading.Barrier(4, timeout=60)  # broken unless members still have all four threads
+        barrier = threading.Barrier(
+            4, timeout=60
+        )  # broken unless members still have all four threads
         with threads_for_members():
             over_members(lambda first, end: barrier.wait(), 4, pieces=1)
             assert torch.get_num_threads() == 1
@@ -106,12 +117,16 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
     network.reset(torch.Generator().manual_seed(0))
     network.yaw_rate_max.fill_(0.3)
     series = torch.as_tensor(drive.stack(estimator.channels))
-    series[:, 0] = torch.tensor([0.0, 0.1, -0.2, 0.3, 0.05, -0.15, 0.29, 0.5, -0.7])[torch.arange(len(series)) % 9]
+    series[:, 0] = torch.tensor([0.0, 0.1, -0.2, 0.3, 0.05, -0.15, 0.29, 0.5, -0.7])[
+        torch.arange(len(series)) % 9
+    ]
     layout, starts = FlatParameters(network), torch.arange(65).unsqueeze(0)
     flat = layout.pack([network]).requires_grad_()
     values, gradients = [], []
     for compiled in (True, False):
-        values.append(predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled))
+        values.append(
+            predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled)
+        )
         gradients.append(torch.autograd.grad(values[-1].sum(), flat)[0])
     assert torch.allclose(*values, rtol=0, atol=1e-12)
     assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
@@ -119,36 +134,56 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
 
 @pytest.mark.parametrize(
     ("kind", "library_kind", "states", "order"),
-    [(Gru, torch.nn.GRU, 5, [0, 1, 2]), (Lstm, torch.nn.LSTM, 6, [0, 1, 3, 2])],  # the library's LSTM has its output gate last
+    [
+        (Gru, torch.nn.GRU, 5, [0, 1, 2]),
+        (Lstm, torch.nn.LSTM, 6, [0, 1, 3, 2]),
+    ],  # the library's LSTM has its output gate last
 )
 def test_gru_and_lstm_equal_those_of_the_library(kind, library_kind, states, order):
     network = kind(kind.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
     library = library_kind(4, states, batch_first=True).double()
     with torch.no_grad():
-        network.gate_bias.copy_(torch.randn(len(order), states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+        network.gate_bias.copy_(
+            torch.randn(
+                len(order), states, generator=torch.Generator().manual_seed(4), dtype=torch.float64
+            )
+        )
         library.weight_ih_l0.copy_(network.input_weight[order].reshape(-1, 4))
         library.weight_hh_l0.copy_(network.state_weight[order].reshape(-1, states))
         library.bias_ih_l0.copy_(network.gate_bias[order].reshape(-1))
         library.bias_hh_l0.zero_()
-    windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    windows = torch.randn(
+        11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64
+    )
     last = library(windows)[1]
-    assert torch.allclose(network.last_state(windows), (last[0] if kind is Lstm else last)[0], rtol=0, atol=1e-12)
+    assert torch.allclose(
+        network.last_state(windows), (last[0] if kind is Lstm else last)[0], rtol=0, atol=1e-12
+    )
 
 
 def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones():
     x = np.linspace(-12.0, 12.0, 20001).astype(np.float32)
-    assert np.abs(np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))).max() < 2e-7
+    assert (
+        np.abs(
+            np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))
+        ).max()
+        < 2e-7
+    )
 
     def apply(x, above, angle):
         for i in range(x.size):
             above[i], angle[i] = softplus(x[i]), arctan(x[i])
 
-    x = np.concatenate([np.linspace(-80.0, 80.0, 20001), np.linspace(-2.0, 2.0, 20001)]).astype(np.float32)
+    x = np.concatenate([np.linspace(-80.0, 80.0, 20001), np.linspace(-2.0, 2.0, 20001)]).astype(
+        np.float32
+    )
     above, angle = np.empty_like(x), np.empty_like(x)
     apply(x, above, angle)
     exact = x.astype(np.float64)
-    assert (np.abs(above / np.logaddexp(0.0, exact) - 1.0) <= 6e-8 * (4.0 + np.abs(exact))).all(), "the argument of exp is rounded once"
+    assert (np.abs(above / np.logaddexp(0.0, exact) - 1.0) <= 6e-8 * (4.0 + np.abs(exact))).all(), (
+        "the argument of exp is rounded once"
+    )
     assert np.allclose(angle, np.arctan(exact), rtol=3e-7, atol=0)
 
 

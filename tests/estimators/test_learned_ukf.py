@@ -28,11 +28,19 @@ REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 
 def quick(epochs=1, one_step=40, dtype="float64", **changes):
     phases = {
-        "one_step": PhaseSettings(learning_rate=1e-2, max_epochs=one_step, validate_every=one_step, schedule="cosine"),
+        "one_step": PhaseSettings(
+            learning_rate=1e-2, max_epochs=one_step, validate_every=one_step, schedule="cosine"
+        ),
         "through": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
         "noise": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
     }
-    sizes = {"one_step_batch": 128, "steps": 100, "validation_steps": 150, "validation_drop_steps": 30, "dtype": dtype}
+    sizes = {
+        "one_step_batch": 128,
+        "steps": 100,
+        "validation_steps": 150,
+        "validation_drop_steps": 30,
+        "dtype": dtype,
+    }
     return ThroughFilterSettings(**phases, **sizes | changes)
 
 
@@ -50,7 +58,9 @@ def estimator(family=LearnedUkf, **config):
 def trained(dtype="float64"):
     """NNTF_UH, trained for a moment; tests leave it as it is."""
     made = estimator()
-    drives = FitData([small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)])
+    drives = FitData(
+        [small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)]
+    )
     made.fit(drives, quick(3, 200, dtype=dtype, one_step_batch=256))
     return made
 
@@ -62,7 +72,10 @@ def drive(seed=3, seconds=6.0):
 def online(made, recording):
     stepper = made.online()
     names = (*SENSORS, "vx")
-    rows = [stepper.step({name: float(recording[name][k]) for name in names}) for k in range(len(recording))]
+    rows = [
+        stepper.step({name: float(recording[name][k]) for name in names})
+        for k in range(len(recording))
+    ]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -77,7 +90,9 @@ def test_variants_are_called_and_parameters_counted_as_in_the_paper():
         "nntf_uh_unrepaired": {"repair": False},
         "nntf_uh_si": {"scaled": False},
     }
-    assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {name: name for name in cases}
+    assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {
+        name: name for name in cases
+    }
     # A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state.
     made = estimator_class("learned_ukf").from_config({})
     assert made.settings == LearnedUkf.settings_type()
@@ -89,19 +104,28 @@ def test_variants_are_called_and_parameters_counted_as_in_the_paper():
 @pytest.mark.parametrize("dynamics", SHORT)
 def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
     made = estimator(
-        dynamics=dynamics, noise="constant" if dynamics == "pacejka" else "state_dependent", through_filter=dynamics != "residual"
+        dynamics=dynamics,
+        noise="constant" if dynamics == "pacejka" else "state_dependent",
+        through_filter=dynamics != "residual",
     )
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
-    record = made.fit(short, quick(one_step=2, steps=40, validation_steps=60, validation_drop_steps=10))
+    record = made.fit(
+        short, quick(one_step=2, steps=40, validation_steps=60, validation_drop_steps=10)
+    )
     assert record.metrics["epochs"] == 3
-    assert record.history["epoch"] == [1, 2, 3], "whole numbers, over all phases, as a tracker wants them"
+    assert record.history["epoch"] == [1, 2, 3], (
+        "whole numbers, over all phases, as a tracker wants them"
+    )
     assert record.history["phase"] == [0, 0, 1]
     assert record.metrics["skipped_steps"] == 0
     assert record.metrics["best_validation_loss"] <= record.metrics["start_validation_loss"] < 10.0
     estimate = made.estimate([small_car_drive(1.0, 3).without_references()])[0]
     assert estimate.covariance_of == ("vx", "vy", "yaw_rate", "rim_speed", "friction")
     assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
-    assert all(np.isfinite(estimate[name]).all() for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip", "nis"))
+    assert all(
+        np.isfinite(estimate[name]).all()
+        for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip", "nis")
+    )
 
 
 def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training():
@@ -111,9 +135,14 @@ def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training(
     estimate = trained().estimate([recording.without_references()], start)[0]
     for name, reference in REFERENCES.items():
         error = (estimate[name] - recording[reference])[100:]
-        assert np.sqrt(np.mean(error**2)) < (0.5 * recording["vy_ref"].std() if name == "vy" else 0.3), name
+        assert np.sqrt(np.mean(error**2)) < (
+            0.5 * recording["vy_ref"].std() if name == "vy" else 0.3
+        ), name
     recording = drive()
-    free, given = (trained().estimate([recording], state)[0] for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5}))
+    free, given = (
+        trained().estimate([recording], state)[0]
+        for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5})
+    )
     assert abs(given["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
     assert given.covariance[0, 1, 1] < free.covariance[0, 1, 1]
     assert abs(given["vy"][-1] - free["vy"][-1]) < 0.02
@@ -121,7 +150,10 @@ def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training(
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
-    recording = with_gaps(drive(seconds=2.0), {"ay": slice(40, 60), "steer": slice(50, 55), "motor_speed": slice(100, 120)})
+    recording = with_gaps(
+        drive(seconds=2.0),
+        {"ay": slice(40, 60), "steer": slice(50, 55), "motor_speed": slice(100, 120)},
+    )
     batch = trained(dtype).estimate([recording])[0]
     step_by_step = online(trained(dtype), recording)
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
@@ -130,11 +162,16 @@ def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
 
 def test_members_that_differ_in_the_start_of_friction_share_their_training():
     one, other, third = estimator(), estimator(start_friction=0.4), estimator(repair=False)
-    assert one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
+    assert (
+        one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
+    )
     told = []
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
     LearnedUkf.fit_members(
-        [one, other, third], short, quick(one_step=2, steps=40, validation_steps=60), FitContext(on_progress=told.append)
+        [one, other, third],
+        short,
+        quick(one_step=2, steps=40, validation_steps=60),
+        FitContext(on_progress=told.append),
     )
     assert len(told) == 3, "the epochs of one training"
     for name, values in one.weights().items():
@@ -147,7 +184,10 @@ def test_members_that_differ_in_the_start_of_friction_share_their_training():
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
     whole = drive()
-    estimate, undisturbed = (trained().estimate([recording])[0] for recording in (with_gaps(whole, {sensor: slice(200, 250)}), whole))
+    estimate, undisturbed = (
+        trained().estimate([recording])[0]
+        for recording in (with_gaps(whole, {sensor: slice(200, 250)}), whole)
+    )
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip"):
         assert np.isfinite(estimate[name]).all(), name
     assert np.array_equal(estimate["vy"][:200], undisturbed["vy"][:200])
@@ -161,9 +201,20 @@ def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
 def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
     """20 s of nothing but noise, with the deviations and worse of a wild drive."""
     generator = np.random.default_rng(0)
-    scales = {"ax": 6.0, "ay": 6.0, "yaw_rate": 3.0, "motor_speed": 60.0, "steer": 0.3, "motor_current": 15.0}
-    channels = {name: scale * generator.standard_normal(2000) for name, scale in scales.items()} | {"vx": np.zeros(2000)}
-    recording = Recording("noise", "none", 100.0, 0.0, channels | {"vx": 0.05 * channels["motor_speed"]}, "simulated")
+    scales = {
+        "ax": 6.0,
+        "ay": 6.0,
+        "yaw_rate": 3.0,
+        "motor_speed": 60.0,
+        "steer": 0.3,
+        "motor_current": 15.0,
+    }
+    channels = {name: scale * generator.standard_normal(2000) for name, scale in scales.items()} | {
+        "vx": np.zeros(2000)
+    }
+    recording = Recording(
+        "noise", "none", 100.0, 0.0, channels | {"vx": 0.05 * channels["motor_speed"]}, "simulated"
+    )
     estimate = trained(dtype).estimate([recording])[0]
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
         assert np.isfinite(estimate[name]).all(), name
@@ -172,12 +223,18 @@ def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
 
 
 def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
-    assert "do not fit its settings: 'dynamics.network.0.bias'" in refusal(lambda: estimator(width=8).load_weights(trained().weights()))
+    assert "do not fit its settings: 'dynamics.network.0.bias'" in refusal(
+        lambda: estimator(width=8).load_weights(trained().weights())
+    )
     missing = small_car_drive(1.2, 0).without_references()
-    with pytest.raises(DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"):
+    with pytest.raises(
+        DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"
+    ):
         estimator().fit(FitData([missing], [missing]), quick())
     gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})
-    assert "channel 'steer' has gaps" in refusal(lambda: estimator().fit(FitData([gappy], [gappy]), quick()))
+    assert "channel 'steer' has gaps" in refusal(
+        lambda: estimator().fit(FitData([gappy], [gappy]), quick())
+    )
 
 
 variant_of = partial(estimator, LearnedUkfVariant)
@@ -189,8 +246,12 @@ def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
         made.fit(data(), quick(one_step=3))
     assert other.variant == "nntf_uh"
     assert other.n_parameters == one.n_parameters
-    assert all(np.array_equal(values, other.weights()[name]) for name, values in one.weights().items())
-    assert "estimator.curvature is of estimator.dynamics=pacejka" in refusal(lambda: variant_of(curvature=True), ConfigurationError)
+    assert all(
+        np.array_equal(values, other.weights()[name]) for name, values in one.weights().items()
+    )
+    assert "estimator.curvature is of estimator.dynamics=pacejka" in refusal(
+        lambda: variant_of(curvature=True), ConfigurationError
+    )
 
 
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])
@@ -208,12 +269,16 @@ def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
             assert bool((covariance == covariance.diagonal().diag()).all()) == is_diagonal
             assert (torch.linalg.eigvalsh(covariance) > 0).all()
     start = variant_of(noise=noise, correlated_noise=False)
-    start.filter.to(torch.float64).begin_noise([made.drive(own, torch.float64) for own in data().train], 0.2)
+    start.filter.to(torch.float64).begin_noise(
+        [made.drive(own, torch.float64) for own in data().train], 0.2
+    )
     with torch.no_grad():
         moved = made.filter.process_noise(state, inputs) - start.filter.process_noise(state, inputs)
     assert (moved[0].diagonal().abs() > 0).all(), "the diagonal has learnt"
     each = (1 + 5 + 1) if noise == "state_dependent" else 1
-    assert full.n_parameters - made.n_parameters == each * (10 + 6), "entries off the diagonals of 5 and 4 rows"
+    assert full.n_parameters - made.n_parameters == each * (10 + 6), (
+        "entries off the diagonals of 5 and 4 rows"
+    )
 
 
 def test_diagonal_noise_in_use_is_that_of_its_training():
@@ -225,9 +290,15 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
     nothing = torch.zeros(4, 2, dtype=torch.float64)
     with torch.no_grad():
         expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
-        of_process = with_entropy(made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY).numpy()
-    np.testing.assert_allclose(covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(covariances(process, states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0)
+        of_process = with_entropy(
+            made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY
+        ).numpy()
+    np.testing.assert_allclose(
+        covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0
+    )
+    np.testing.assert_allclose(
+        covariances(process, states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0
+    )
 
 
 def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
@@ -236,7 +307,12 @@ def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
     assert other.n_parameters == one.n_parameters + 3
     state, inputs = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]]), torch.tensor([[0.1, 8.0]])
     with torch.no_grad():
-        torch.testing.assert_close(other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6)
-    other.fit(FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)]), quick(one_step=5, steps=40, validation_steps=60))
+        torch.testing.assert_close(
+            other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6
+        )
+    other.fit(
+        FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)]),
+        quick(one_step=5, steps=40, validation_steps=60),
+    )
     assert other.variant == "pc_curved"
     assert (other.filter.dynamics.tyres.curvature.detach().abs() > 0).all()

@@ -29,12 +29,22 @@ from vehest.training.sequences import PhaseSettings
 LEVELS = {"process_vy": 2e-3, "process_yaw_rate": 2e-3, "force_factor": 2.0}
 LEVELS |= {"ay": 0.06, "yaw_rate": 0.002, "fy_front": 100.0, "fy_rear": 100.0}
 GIVEN = {"tyres": TYRES, "noise": LEVELS, "hidden": [10, 6]}
-DATA = FitData([loaded_drive(seed=1, name="first"), loaded_drive(3.0, seed=2, name="second")], [loaded_drive(4.0, seed=3)])
+DATA = FitData(
+    [loaded_drive(seed=1, name="first"), loaded_drive(3.0, seed=2, name="second")],
+    [loaded_drive(4.0, seed=3)],
+)
 NOTHING = IdentificationSettings(method="data")
 TRAININGS = {
-    "ensemble_ukf": EnsembleSettings(PhaseSettings(learning_rate=5e-3, max_epochs=2), batch_size=256, identification=NOTHING),
+    "ensemble_ukf": EnsembleSettings(
+        PhaseSettings(learning_rate=5e-3, max_epochs=2), batch_size=256, identification=NOTHING
+    ),
     "cnn_ukf": EndToEndSettings(
-        PhaseSettings(learning_rate=5e-3, max_epochs=1), 256, PhaseSettings(max_epochs=2), steps=64, batch_size=6, identification=NOTHING
+        PhaseSettings(learning_rate=5e-3, max_epochs=1),
+        256,
+        PhaseSettings(max_epochs=2),
+        steps=64,
+        batch_size=6,
+        identification=NOTHING,
     ),
 }
 BOTH = pytest.mark.parametrize("name", list(TRAININGS))
@@ -49,7 +59,10 @@ def estimator_of(name, **config):
 
 def filter_alone(estimator):
     """The same filter without its network."""
-    own = {entry.name: getattr(estimator.settings, entry.name) for entry in fields(DugoffUkf.settings_type)}
+    own = {
+        entry.name: getattr(estimator.settings, entry.name)
+        for entry in fields(DugoffUkf.settings_type)
+    }
     alone = DugoffUkf(DugoffUkf.settings_type(**own))
     alone.load_weights(DugoffUkf.weights(estimator))
     return alone
@@ -76,7 +89,9 @@ def test_a_word_counts_as_much_as_its_variance_says():
     wrong = drive["sideslip_ref"] + 0.02
 
     def filtered(variance):
-        ((_, steps),) = estimator.filtered([drive], pseudo=[PseudoMeasurement(wrong, np.full(len(drive), variance))])
+        ((_, steps),) = estimator.filtered(
+            [drive], pseudo=[PseudoMeasurement(wrong, np.full(len(drive), variance))]
+        )
         return steps.filtered.mean[0, :, 0].numpy()
 
     np.testing.assert_allclose(np.arctan2(filtered(1e-10), drive["vx"])[5:], wrong[5:], atol=1e-4)
@@ -86,8 +101,13 @@ def test_a_word_counts_as_much_as_its_variance_says():
 
 def test_the_ensembles_variance_is_that_of_its_networks_scaled_by_the_papers_formula():
     variance = np.array([1e-6, 4e-4])
-    np.testing.assert_allclose(scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE)
-    np.testing.assert_allclose(scaled_variance(variance, np.array([-4.269, 0.7901])), 10**-4.269 * variance**0.7901 + LEAST_VARIANCE)
+    np.testing.assert_allclose(
+        scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE
+    )
+    np.testing.assert_allclose(
+        scaled_variance(variance, np.array([-4.269, 0.7901])),
+        10**-4.269 * variance**0.7901 + LEAST_VARIANCE,
+    )
     inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").network_inputs)
     told = {}
     for kind in ("models", "mixture"):
@@ -97,7 +117,9 @@ def test_the_ensembles_variance_is_that_of_its_networks_scaled_by_the_papers_for
         told[kind] = estimator.pseudo_of(inputs)
     unit = float(estimator.network.unit)
     said = unit * estimator.network.outputs(inputs)[..., 0]
-    np.testing.assert_allclose(told["models"].sideslip, np.clip(said.mean(0), -1.5, 1.5), rtol=1e-12)
+    np.testing.assert_allclose(
+        told["models"].sideslip, np.clip(said.mean(0), -1.5, 1.5), rtol=1e-12
+    )
     np.testing.assert_allclose(told["models"].variance, said.var(0) + LEAST_VARIANCE, rtol=1e-9)
     assert (told["mixture"].variance > told["models"].variance).all()
 
@@ -122,7 +144,9 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
 def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_where_the_filter_has_it():
     """Eqs. 5 and 6, with the distrust as a standard deviation."""
     estimator, _ = end_to_end()
-    samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.network_inputs, estimator.name))
+    samples = estimator.network.samples(
+        *learnt_samples(DATA.train, estimator.network_inputs, estimator.name)
+    )
     levels, rows = torch.tensor([2e-3, 3e-3], dtype=torch.float64), torch.tensor([[3, 500, 1000]])
     phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
     outputs = estimator.network(samples.inputs[rows])[0]
@@ -130,19 +154,29 @@ def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_wher
     sigma = torch.sigmoid(outputs[:, 1:])
     variance = sigma[:, 0] ** 2 + 1e-6
     error = unit * (outputs[:, 0] - samples.targets[rows[0]])
-    expected = (0.5 * variance.log() + 0.5 * error**2 / variance).mean() + ((sigma[:, 1:] - levels) ** 2).sum(1).mean()
-    assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(expected.item(), rel=1e-12)
+    expected = (0.5 * variance.log() + 0.5 * error**2 / variance).mean() + (
+        (sigma[:, 1:] - levels) ** 2
+    ).sum(1).mean()
+    assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(
+        expected.item(), rel=1e-12
+    )
     estimator = estimator_of("cnn_ukf")
-    estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=stop_after(1)))  # before its first step
+    estimator.fit(
+        DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=stop_after(1))
+    )  # before its first step
     estimator.network.get_parameter("weight_3").data.zero_()
     word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)[:3])
     np.testing.assert_allclose(np.sqrt(word.process), [[2e-3, 2e-3]] * 3, rtol=1e-4)
-    np.testing.assert_allclose(word.variance, float(estimator.network.unit) ** 2 + LEAST_VARIANCE, rtol=1e-4)
+    np.testing.assert_allclose(
+        word.variance, float(estimator.network.unit) ** 2 + LEAST_VARIANCE, rtol=1e-4
+    )
 
 
 def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch):
     """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
-    monkeypatch.setattr(cnn_ukf, "START", (KNOWN, KNOWN))  # as precise as a state that is handed over
+    monkeypatch.setattr(
+        cnn_ukf, "START", (KNOWN, KNOWN)
+    )  # as precise as a state that is handed over
     estimator, training = end_to_end()
     recording = DATA.train[1]
     training.training = replace(training.training, steps=len(recording))
@@ -152,7 +186,10 @@ def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(
     ((_, steps),) = estimator.filtered([recording], [start], pseudo=[word])
     mean = steps.filtered.mean.numpy()
     wanted = np.arctan2(recording["vy_ref"], recording["vx"])
-    errors = [np.square(angle - wanted).mean() for angle in (word.sideslip, np.arctan2(mean[0, :, 0], recording["vx"]))]
+    errors = [
+        np.square(angle - wanted).mean()
+        for angle in (word.sideslip, np.arctan2(mean[0, :, 0], recording["vx"]))
+    ]
     assert training.loss(batch).item() == pytest.approx(sum(errors), rel=1e-6)
 
 
@@ -167,11 +204,15 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation():
     ours, training.filter = training.filter, expected_filter
     expected = training.loss(batch)
     assert found.item() == pytest.approx(expected.item(), rel=1e-10)
-    for own, other in zip(gradients_of(estimator, found), gradients_of(estimator, expected), strict=True):
+    for own, other in zip(
+        gradients_of(estimator, found), gradients_of(estimator, expected), strict=True
+    ):
         torch.testing.assert_close(own, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))
     training.filter = ours
     said = estimator.output_of(estimator.network(batch.inputs.reshape(1, -1, 17)).reshape(4, 30, 4))
-    assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
+    assert (
+        found.item() > (batch.sideslip - said.sideslip).square().mean().item()
+    )  # the filter's error comes on top of the network's
 
 
 def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_training():
@@ -196,7 +237,10 @@ def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_traini
     firsts = torch.tensor([30, 830, 60, 100])
     batch = training.cut(firsts, torch.tensor([5]))
     batch.driven[:, 7, 1] = torch.nan
-    with pytest.raises(DataError, match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of the batch's 4"):
+    with pytest.raises(
+        DataError,
+        match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of the batch's 4",
+    ):
         training.loss(batch)
     assert training.place(830) == "0.30 s of recording 'second'"
 
@@ -218,16 +262,25 @@ def test_what_makes_no_sense_is_said():
         estimator_of("cnn_ukf").fit(DATA, EndToEndSettings(steps=900, identification=NOTHING))
     estimator = estimator_of("cnn_ukf")
     with pytest.raises(DataError, match="'unit' is missing, unknown or of another shape"):
-        estimator.load_weights({name: values for name, values in estimator.weights().items() if name != "network.unit"})
+        estimator.load_weights(
+            {name: values for name, values in estimator.weights().items() if name != "network.unit"}
+        )
     wrong = {"error": "drives", "most_process_yaw_rate": 0.0}
-    for settings, name, value in ((EndToEndSettings, "loss_unit", "grad"), *((IdentificationSettings, *own) for own in wrong.items())):
+    for settings, name, value in (
+        (EndToEndSettings, "loss_unit", "grad"),
+        *((IdentificationSettings, *own) for own in wrong.items()),
+    ):
         with pytest.raises(ConfigurationError, match=name):
             settings_from_config(settings, {name: value}, "training")
 
 
 @pytest.mark.parametrize(
     ("away", "held"),
-    [("pseudo_measurement", [cnn_ukf.DISTRUST]), ("adaptive_distrust", [cnn_ukf.DISTRUST]), ("adaptive_process", cnn_ukf.PROCESS)],
+    [
+        ("pseudo_measurement", [cnn_ukf.DISTRUST]),
+        ("adaptive_distrust", [cnn_ukf.DISTRUST]),
+        ("adaptive_process", cnn_ukf.PROCESS),
+    ],
 )
 def test_what_is_taken_away_is_the_same_at_every_sample(away, held):
     estimator = estimator_of("cnn_ukf", **{away: False})
@@ -238,19 +291,29 @@ def test_what_is_taken_away_is_the_same_at_every_sample(away, held):
     assert changing == [output for output in range(4) if output not in held]
     word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs))
     if away == "adaptive_process":
-        np.testing.assert_allclose(np.sqrt(word.process[0]), [LEVELS["process_vy"], LEVELS["process_yaw_rate"]], rtol=1e-5)
+        np.testing.assert_allclose(
+            np.sqrt(word.process[0]), [LEVELS["process_vy"], LEVELS["process_yaw_rate"]], rtol=1e-5
+        )
     elif away == "pseudo_measurement":
         np.testing.assert_allclose(word.variance, 1.0, rtol=1e-5)
         alone = filter_alone(estimator).estimate([DATA.validation[0].without_references()])[0]["vy"]
-        constant = word._replace(process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone)))
+        constant = word._replace(
+            process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone))
+        )
         ((_, steps),) = estimator.filtered([DATA.validation[0]], pseudo=[constant])
         mean = steps.filtered.mean.numpy()
         np.testing.assert_allclose(mean[0, :, 0], alone, atol=2e-3)
     else:
         other = estimator_of("cnn_ukf", **{away: False})
-        other.fit(DATA, replace(TRAININGS["cnn_ukf"], pre_training=PhaseSettings(learning_rate=5e-3, max_epochs=2)))
+        other.fit(
+            DATA,
+            replace(
+                TRAININGS["cnn_ukf"], pre_training=PhaseSettings(learning_rate=5e-3, max_epochs=2)
+            ),
+        )
         assert (
-            other.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)).variance[0] != word.variance[0]
+            other.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)).variance[0]
+            != word.variance[0]
         )  # one value, but a learnt one
 
 
@@ -259,7 +322,9 @@ def test_a_loss_in_degrees_is_the_same_in_another_unit():
     batch = next(iter(own.batches(torch.Generator().manual_seed(0))))
     in_radians = float(own.loss(batch).detach())
     own.training = replace(own.training, loss_unit="deg")
-    assert float(own.loss(batch).detach()) == pytest.approx(np.degrees(np.degrees(in_radians)), rel=1e-12)
+    assert float(own.loss(batch).detach()) == pytest.approx(
+        np.degrees(np.degrees(in_radians)), rel=1e-12
+    )
 
 
 def test_one_recording_decides_less_where_recordings_count():
@@ -274,6 +339,10 @@ def test_one_recording_decides_less_where_recordings_count():
     ]
     both, first, second = (
         estimator.mean_squared_error(drives, pseudo=own, over="recordings")
-        for drives, own in ((DATA.train, pseudo), (DATA.train[:1], pseudo[:1]), (DATA.train[1:], pseudo[1:]))
+        for drives, own in (
+            (DATA.train, pseudo),
+            (DATA.train[:1], pseudo[:1]),
+            (DATA.train[1:], pseudo[1:]),
+        )
     )
     assert np.sqrt(both) == pytest.approx(0.5 * (np.sqrt(first) + np.sqrt(second)))

@@ -37,7 +37,9 @@ def a_car(kind="NNTF", dtype=torch.float64):
 
 
 def readable(car):
-    return TorchModel(lambda x, u: car.transition(x, u, STEP), car.observation, list(car.parameters()), LOWER)
+    return TorchModel(
+        lambda x, u: car.transition(x, u, STEP), car.observation, list(car.parameters()), LOWER
+    )
 
 
 def drawn(*shape, seed=1):
@@ -46,7 +48,9 @@ def drawn(*shape, seed=1):
 
 def driven(count):
     """States from slow to fast and sliding, and inputs."""
-    states = torch.tensor([2.5, 0.0, 0.0, 2.5, 0.6], dtype=torch.float64) + drawn(count, 5) * torch.tensor([0.6, 0.5, 1.5, 0.8, 0.1])
+    states = torch.tensor([2.5, 0.0, 0.0, 2.5, 0.6], dtype=torch.float64) + drawn(
+        count, 5
+    ) * torch.tensor([0.6, 0.5, 1.5, 0.8, 0.1])
     return states, drawn(count, 2, seed=2) * torch.tensor([0.25, 6.0])
 
 
@@ -56,25 +60,44 @@ def through_the_filter(car, compiled, dtype):
     _, inputs = driven(sequences * steps)
     measurements = drawn(sequences, steps, 4) + torch.tensor([0.0, 0.0, 1.0, 3.0])
     measurements[1, 4, 0] = torch.nan
-    initial = Gaussian(torch.tensor([3.0, 0.2, 1.0, 3.0, 0.6]), torch.tensor([1e-3, 1e-3, 1e-3, 1e-3, 1e-4]).diag())
-    noises = [torch.tensor(noise).to(dtype).diag() for noise in ([1e-3, 1e-3, 1e-2, 1e-2, 1e-4], [50.0, 50.0, 0.1, 0.1])]
+    initial = Gaussian(
+        torch.tensor([3.0, 0.2, 1.0, 3.0, 0.6]), torch.tensor([1e-3, 1e-3, 1e-3, 1e-3, 1e-4]).diag()
+    )
+    noises = [
+        torch.tensor(noise).to(dtype).diag()
+        for noise in ([1e-3, 1e-3, 1e-2, 1e-2, 1e-4], [50.0, 50.0, 0.1, 0.1])
+    ]
     model = CompiledPlanarCar(car, STEP, LOWER, dtype) if compiled else readable(car)
     y, u = measurements.to(dtype), inputs.reshape(sequences, steps, 2).to(dtype)
-    outcome = unscented_scan(model, y, u, Gaussian(*(part.to(dtype) for part in initial)), *noises, symmetric_rule(5, -2.0))
+    outcome = unscented_scan(
+        model,
+        y,
+        u,
+        Gaussian(*(part.to(dtype) for part in initial)),
+        *noises,
+        symmetric_rule(5, -2.0),
+    )
     car.zero_grad()
     (outcome.steps.filtered.mean * drawn(sequences, steps, 5, seed=3).to(dtype)).sum().backward()
-    gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad.clone() for name, p in car.named_parameters()}
+    gradients = {
+        name: torch.zeros_like(p) if p.grad is None else p.grad.clone()
+        for name, p in car.named_parameters()
+    }
     return outcome.steps.filtered.mean.detach(), gradients
 
 
 @pytest.mark.parametrize("kind", CARS)
 def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
     car = a_car(kind)
-    (known, gradients), (mean, own) = (through_the_filter(car, compiled, torch.float64) for compiled in (False, True))
+    (known, gradients), (mean, own) = (
+        through_the_filter(car, compiled, torch.float64) for compiled in (False, True)
+    )
     assert torch.allclose(mean, known, rtol=0, atol=1e-10)
     assert gradients.keys() == own.keys()
     for name, gradient in gradients.items():
-        assert torch.allclose(own[name], gradient, rtol=0, atol=1e-8 * float(gradient.abs().max()) + 1e-14), name
+        assert torch.allclose(
+            own[name], gradient, rtol=0, atol=1e-8 * float(gradient.abs().max()) + 1e-14
+        ), name
         assert float(gradient.abs().max()) > 0, name
 
 
@@ -87,14 +110,28 @@ def test_in_single_precision_values_agree_and_gradients_survive_a_crawl():
         assert float((own[name].double() - gradient).norm() / gradient.norm()) < 1e-3, name
     # At 5 cm/s and sliding: squashed values have reached their ends, and what rounding leaves of their slopes must not count.
     car = a_car("NNTF in SI units")
-    states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(200, 5) * torch.tensor([0.004, 1.0, 0.5, 0.3, 0.05])
+    states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(
+        200, 5
+    ) * torch.tensor([0.004, 1.0, 0.5, 0.3, 0.05])
     inputs = drawn(200, 2, seed=2) * torch.tensor([0.25, 6.0])
     slopes = []
     for dtype in (torch.float64, torch.float32):
         model = CompiledPlanarCar(car.to(dtype), STEP, LOWER, dtype)
-        points, own = (part.to(dtype).reshape(20, 10, -1).contiguous().numpy() for part in (states, inputs))
+        points, own = (
+            part.to(dtype).reshape(20, 10, -1).contiguous().numpy() for part in (states, inputs)
+        )
         gradients = [np.zeros(parameter.shape, points.dtype) for parameter in model.parameters]
-        slopes.append(called(model, 3, points, np.ascontiguousarray(own[:, 0]), 5, np.ones((20, 10, 4), points.dtype), gradients))
+        slopes.append(
+            called(
+                model,
+                3,
+                points,
+                np.ascontiguousarray(own[:, 0]),
+                5,
+                np.ones((20, 10, 4), points.dtype),
+                gradients,
+            )
+        )
     assert np.abs(slopes[1] - slopes[0]).max() < 1e-3 * np.abs(slopes[0]).max()
 
 
@@ -106,5 +143,9 @@ def test_cars_with_nothing_to_learn_have_no_gradients_and_other_cars_no_code():
     assert learning.requires_grad
     assert not list(frozen.parameters)
     assert torch.equal(moved(frozen, states, inputs), learning.detach())
-    for car in (TyreNetworkCar(hidden=(4, 4, 4)), NeuralCar(hidden=(4,)), PacejkaCar(with_curvature=True)):
+    for car in (
+        TyreNetworkCar(hidden=(4, 4, 4)),
+        NeuralCar(hidden=(4,)),
+        PacejkaCar(with_curvature=True),
+    ):
         assert not is_compilable(car)

@@ -28,7 +28,9 @@ def _tested(estimator, recording, reference):
 def test_luenberger_on_the_ferrari_is_below_0_80_degrees(ferrari):
     """Published on the neighbouring set: 0.73°; a throw-away script had 0.78° at 100 Hz."""
     estimator = estimator_class("luenberger").from_config({})
-    estimator.fit(FitData([ferrari.cut(150.0, 450.0)], [ferrari.cut(450.0, 550.0)]), DirectSearchSettings())
+    estimator.fit(
+        FitData([ferrari.cut(150.0, 450.0)], [ferrari.cut(450.0, 550.0)]), DirectSearchSettings()
+    )
     assert _tested(estimator, ferrari, Resample(20.0)(ferrari))["rmse_sideslip"] <= 0.80
     assert 0.0 <= estimator.gain <= 50.0
     assert 0.0 <= estimator.threshold <= 0.5 * np.abs(ferrari["yaw_rate"]).max()
@@ -38,7 +40,10 @@ def test_short_training_of_the_linear_ksnn_beats_the_luenberger_observer(ferrari
     slow = Resample(20.0)(ferrari)
     estimator = estimator_class("ksnn").from_config({"n_hidden": 0, "bias": True})
     estimator.seed(0)
-    estimator.fit(FitData([slow.cut(150.0, 450.0)], [slow.cut(450.0, 550.0)]), SupervisedSettings(max_epochs=30))
+    estimator.fit(
+        FitData([slow.cut(150.0, 450.0)], [slow.cut(450.0, 550.0)]),
+        SupervisedSettings(max_epochs=30),
+    )
     figures = _tested(estimator, slow, slow)
     assert figures["rmse_sideslip"] < 0.50
     assert figures["fvu"] < 0.10
@@ -53,9 +58,13 @@ def _over_the_whole_drive(name, recording, **config):
     return accuracy([score(estimate, Resample(20.0)(recording), whole, Protocol(20.0))])
 
 
-def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(ferrari):
+def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(
+    ferrari,
+):
     """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""
-    assert _over_the_whole_drive("kalman", ferrari, noise={"read_from": "recording"})["rmse_sideslip"] == pytest.approx(0.87, abs=0.05)
+    assert _over_the_whole_drive("kalman", ferrari, noise={"read_from": "recording"})[
+        "rmse_sideslip"
+    ] == pytest.approx(0.87, abs=0.05)
     # Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter.
     batch = _over_the_whole_drive("factor_graph", ferrari)["rmse_sideslip"]
     window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]

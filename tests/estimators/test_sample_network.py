@@ -8,7 +8,14 @@ from dugoff_drive import dugoff_drive
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
-from vehest.estimators.kernels.sample_network import LEVELS, _activate, gaussian_likelihood, losses_of, outputs_of, squared_error
+from vehest.estimators.kernels.sample_network import (
+    LEVELS,
+    _activate,
+    gaussian_likelihood,
+    losses_of,
+    outputs_of,
+    squared_error,
+)
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork
 from vehest.estimators.registry import estimator_class
@@ -25,7 +32,10 @@ def loaded_drive(seconds=8.0, seed=0, name="drive"):
     drive = dugoff_drive(seconds, seed, name=name)
     channels = dict(drive.channels)
     for corner in ("fl", "fr", "rl", "rr"):
-        channels[f"fx_{corner}"], channels[f"fz_{corner}"] = 492.5 * drive["ax"], np.full(len(drive), 4831.0)
+        channels[f"fx_{corner}"], channels[f"fz_{corner}"] = (
+            492.5 * drive["ax"],
+            np.full(len(drive), 4831.0),
+        )
     return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, drive.kind)
 
 
@@ -38,7 +48,14 @@ def network(outputs, members=3):
     with torch.no_grad():
         for name, parameter in made.named_parameters():
             if name.startswith("bias"):
-                parameter.copy_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+                parameter.copy_(
+                    0.1
+                    * torch.randn(
+                        parameter.shape,
+                        generator=torch.Generator().manual_seed(4),
+                        dtype=torch.float64,
+                    )
+                )
     return made
 
 
@@ -53,7 +70,9 @@ def readable(inputs, parameters, member, dropout):
     """One member's outputs in torch, with the masks that its seed stands for."""
     hidden, scale = inputs, 256.0 / (256.0 - round(256 * dropout))
     for layer in (0, 1):
-        hidden = torch.relu(hidden @ parameters[2 * layer][member] + parameters[2 * layer + 1][member])
+        hidden = torch.relu(
+            hidden @ parameters[2 * layer][member] + parameters[2 * layer + 1][member]
+        )
         mask = kept(int(SEEDS[member]), layer, (len(hidden), hidden.shape[1]), dropout)
         hidden = hidden * torch.as_tensor(mask) * scale
     return hidden @ parameters[4][member] + parameters[5][member]
@@ -62,8 +81,15 @@ def readable(inputs, parameters, member, dropout):
 def samples(count=40):
     """Inputs, targets, and rows that three members see."""
     generator = torch.Generator().manual_seed(3)
-    table, targets = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((count, 5), (count,)))
-    return table, targets, torch.stack([torch.randperm(count, generator=generator)[:20] for _ in range(3)])
+    table, targets = (
+        torch.randn(shape, generator=generator, dtype=torch.float64)
+        for shape in ((count, 5), (count,))
+    )
+    return (
+        table,
+        targets,
+        torch.stack([torch.randperm(count, generator=generator)[:20] for _ in range(3)]),
+    )
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.4])
@@ -72,9 +98,13 @@ def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout):
     parameters = list(network(2).parameters())
     weights = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     found = outputs_of(table[rows], parameters, SEEDS, dropout)
-    expected = torch.stack([readable(table[rows[member]], parameters, member, dropout) for member in range(3)])
+    expected = torch.stack(
+        [readable(table[rows[member]], parameters, member, dropout) for member in range(3)]
+    )
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-    gradients = [torch.autograd.grad((outcome * weights).sum(), parameters) for outcome in (found, expected)]
+    gradients = [
+        torch.autograd.grad((outcome * weights).sum(), parameters) for outcome in (found, expected)
+    ]
     for own, other in zip(*gradients, strict=True):
         torch.testing.assert_close(own, other, rtol=1e-10, atol=1e-12)
 
@@ -85,16 +115,24 @@ def test_losses_and_their_gradients_are_those_of_the_formulas():
         parameters = list(network(outputs).parameters())
         expected = []
         for member in range(3):
-            said, wanted = readable(table[rows[member]], parameters, member, 0.2), targets[rows[member]]
+            said, wanted = (
+                readable(table[rows[member]], parameters, member, 0.2),
+                targets[rows[member]],
+            )
             if outputs == 1:
                 expected.append((said[:, 0] - wanted).square().mean())
             else:
                 variance = torch.nn.functional.softplus(said[:, 1]) + 1e-6
-                expected.append(torch.nn.functional.gaussian_nll_loss(said[:, 0], wanted, variance, eps=1e-12))
+                expected.append(
+                    torch.nn.functional.gaussian_nll_loss(said[:, 0], wanted, variance, eps=1e-12)
+                )
         found = losses_of(table, targets, rows, parameters, SEEDS, 0.2, criterion)
         torch.testing.assert_close(found, torch.stack(expected), rtol=1e-10, atol=1e-12)
         scale = torch.tensor([1.0, 2.0, -1.0], dtype=torch.float64)
-        gradients = [torch.autograd.grad((losses * scale).sum(), parameters) for losses in (found, torch.stack(expected))]
+        gradients = [
+            torch.autograd.grad((losses * scale).sum(), parameters)
+            for losses in (found, torch.stack(expected))
+        ]
         for own, other in zip(*gradients, strict=True):
             torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-12)
 
@@ -113,15 +151,23 @@ def test_masks_hide_their_share_and_follow_from_the_seed_and_what_is_missing_is_
     mask = kept(1, 0, (400, 250), 0.2)
     assert abs(mask.mean() - 205 / 256) < 3 * np.sqrt(0.2 * 0.8 / mask.size)
     assert np.array_equal(mask, kept(1, 0, (400, 250), 0.2))
-    for other in (kept(2, 0, (400, 250), 0.2), kept(1, 1, (400, 250), 0.2)):  # as often alike as masks that know nothing of each other
+    for other in (
+        kept(2, 0, (400, 250), 0.2),
+        kept(1, 1, (400, 250), 0.2),
+    ):  # as often alike as masks that know nothing of each other
         assert (mask == other).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
     drive = dugoff_drive(2.0)
-    with pytest.raises(DataError, match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu"):
+    with pytest.raises(
+        DataError,
+        match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu",
+    ):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
 
 
 def fitted(training=QUICK, **config):
-    estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05} | config)
+    estimator = estimator_class("sideslip_ffnn").from_config(
+        {"hidden": [24, 12], "dropout": 0.05} | config
+    )
     estimator.seed(1)
     return estimator, estimator.fit(DATA, training)
 
@@ -139,7 +185,9 @@ def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs, tmp
     save_model(estimator, tmp_path)
     stepper = load_model(tmp_path).online()
     steps = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(50)]
-    np.testing.assert_allclose([step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        [step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6
+    )
 
 
 def test_inputs_are_scaled_by_their_range_or_to_z_scores():
@@ -147,10 +195,21 @@ def test_inputs_are_scaled_by_their_range_or_to_z_scores():
     network = SampleNetwork(2, (4, 3), 1).double()
     network.scale(inputs, np.ones(50))
     scaled = network.scaled(torch.as_tensor(inputs)).numpy()
-    np.testing.assert_allclose([scaled[:, 0].min(), scaled[:, 0].max(), *scaled[:, 1]], [0.0, 1.0, *np.zeros(50)], atol=1e-12)
+    np.testing.assert_allclose(
+        [scaled[:, 0].min(), scaled[:, 0].max(), *scaled[:, 1]],
+        [0.0, 1.0, *np.zeros(50)],
+        atol=1e-12,
+    )
     network.scale(inputs, np.ones(50), "standard")
     scaled = network.scaled(torch.as_tensor(inputs)).numpy()
-    np.testing.assert_allclose([scaled[:, 0].mean(), scaled[:, 0].std(), *scaled[:, 1]], [0.0, 1.0, *np.zeros(50)], atol=1e-12)
+    np.testing.assert_allclose(
+        [scaled[:, 0].mean(), scaled[:, 0].std(), *scaled[:, 1]],
+        [0.0, 1.0, *np.zeros(50)],
+        atol=1e-12,
+    )
     network.scale(np.array([[-2.0, 5.0], [6.0, 5.0]]), np.array([0.3, -0.4]))
     assert float(network.unit) == pytest.approx(np.sqrt(0.125))
-    assert estimator_class("sideslip_ffnn").from_config({"normalisation": "standard"}).variant == "full_standard"
+    assert (
+        estimator_class("sideslip_ffnn").from_config({"normalisation": "standard"}).variant
+        == "full_standard"
+    )

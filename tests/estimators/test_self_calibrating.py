@@ -16,14 +16,28 @@ from vehest.run.estimate import pretrained_folder
 RATE = 20.0
 
 
-def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset=0.1, noise=1.0, delay=0.0, angle=1.0):
+def drive(
+    seconds=60.0,
+    seed=0,
+    compliance=0.006,
+    rear=1.3,
+    leakage=0.02,
+    offset=0.1,
+    noise=1.0,
+    delay=0.0,
+    angle=1.0,
+):
     """A car whose rear axle is as the filter assumes, below the limit, at a changing speed: samples (T, 4) and vy (T,)."""
     fine, rng = 10, np.random.default_rng(seed)
     dt, t = 1.0 / (RATE * fine), np.arange(round(seconds * RATE * fine)) / (RATE * fine)
     speed = 22.0 + 6.0 * np.sin(2.0 * np.pi * t / 37.0)
-    force = angle * (4.0 * np.sin(2.0 * np.pi * t / 7.0) + 2.0 * np.sin(2.0 * np.pi * t / 3.1 + seed))  # acceleration of the rear axle
+    force = angle * (
+        4.0 * np.sin(2.0 * np.pi * t / 7.0) + 2.0 * np.sin(2.0 * np.pi * t / 3.1 + seed)
+    )  # acceleration of the rear axle
     force *= np.minimum(t / 3.0, 1.0)
-    slip = np.vectorize(lambda a: np.sign(a) * 14.0 * (1.0 - (1.0 - abs(a) / 14.0) ** 0.25) / 0.25)(force)
+    slip = np.vectorize(lambda a: np.sign(a) * 14.0 * (1.0 - (1.0 - abs(a) / 14.0) ** 0.25) / 0.25)(
+        force
+    )
     v, yaw_rate = np.zeros(len(t)), np.zeros(len(t))
     for k in range(1, len(t)):  # a_r = v' + ω u - b ω', v = b ω - C u φ: solved for ω
         v_rear = -compliance * speed[k] * slip[k]
@@ -32,7 +46,9 @@ def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset
         v[k] = rear * yaw_rate[k] + v_rear
     ay, ax = np.gradient(v, dt) + yaw_rate * speed, np.gradient(speed, dt) - yaw_rate * v
     measured = np.column_stack([yaw_rate, speed, (ay + offset) / (1.0 - leakage), ax + 0.05])
-    measured = np.column_stack([np.convolve(one, np.ones(fine) / fine, mode="same") for one in measured.T])
+    measured = np.column_stack(
+        [np.convolve(one, np.ones(fine) / fine, mode="same") for one in measured.T]
+    )
     late = np.interp(t - delay, t, measured[:, 0])
     samples = np.column_stack([late, measured[:, 1:]])[::fine]
     samples += noise * rng.normal(size=samples.shape) * [0.002, 0.05, 0.05, 0.05]
@@ -48,16 +64,34 @@ def plain_filter(model, samples, network=None):
     grip, of_network = model.grips[0], 0.0
     x, p = mean.copy(), np.diag(deviation**2)
     x[1] = samples[0, 1]
-    times = np.array([np.inf, np.inf, model.offset_ay_time, model.offset_ax_time, np.inf, np.inf, np.inf, model.axle_error_time])
+    times = np.array(
+        [
+            np.inf,
+            np.inf,
+            model.offset_ay_time,
+            model.offset_ax_time,
+            np.inf,
+            np.inf,
+            np.inf,
+            model.axle_error_time,
+        ]
+    )
     decay, g = np.exp(-n.dt / times), 1.0 - np.exp(-n.dt / n.axle_lag)
-    smooth, sums, last, found = samples[0].copy(), np.zeros(3), samples[0], np.empty((len(samples), 8))
+    smooth, sums, last, found = (
+        samples[0].copy(),
+        np.zeros(3),
+        samples[0],
+        np.empty((len(samples), 8)),
+    )
 
     def curve(force):
         if network is not None:
             return of_network, 0.0
         limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
         share = min(abs(force) / limit, n.largest_share)
-        return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (1.0 - share) ** (n.exponent - 1.0)
+        return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (
+            1.0 - share
+        ) ** (n.exponent - 1.0)
 
     for t, sample in enumerate(samples):
         before = smooth[0]
@@ -67,24 +101,45 @@ def plain_filter(model, samples, network=None):
         turn, speed = (last[0] * last[1] + sample[0] * sample[1]) / 2.0, sample[1]
         sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
         if network is not None:
-            of_network += g * ((mean[5] * sample[0] - network[t]) / n.compliance / sample[1] - of_network)
+            of_network += g * (
+                (mean[5] * sample[0] - network[t]) / n.compliance / sample[1] - of_network
+            )
         phi, slope = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)
-        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * max(slope - 1.0, 0.0) + n.axle_per_slope * slope
+        bent = (
+            n.axle_per_slip * abs(phi)
+            + n.axle_per_bend * max(slope - 1.0, 0.0)
+            + n.axle_per_slope * slope
+        )
         size = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
         a = np.eye(8)
         a[0, 2], a[0, 4], a[1, 0], a[1, 3] = -n.dt, -n.dt * ay, n.dt * r, -n.dt
         x, p = a @ x + np.array([n.dt * (ay - turn), n.dt * ax, *np.zeros(6)]), a @ p @ a.T
         f, q = np.diag(decay), deviation**2 * (1.0 - decay**2)
         x, p = mean * (1.0 - decay) + f @ x, f @ p @ f + np.diag(q)
-        p += np.diag([n.dt * (n.noise_vy**2 + (n.noise_delay * turning * speed) ** 2), n.dt * n.noise_vx**2, *np.zeros(6)])
+        p += np.diag(
+            [
+                n.dt * (n.noise_vy**2 + (n.noise_delay * turning * speed) ** 2),
+                n.dt * n.noise_vx**2,
+                *np.zeros(6),
+            ]
+        )
 
         def axle(x, smooth=smooth, sums=sums, turning=turning, size=size, speed=speed):
             phi = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)[0]
             rear = x[5] if network is None else mean[5]
-            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - rear * smooth[0] + x[6] * speed * phi + size * x[7]
+            return (
+                x[0]
+                - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1])
+                - rear * smooth[0]
+                + x[6] * speed * phi
+                + size * x[7]
+            )
 
         variance = n.axle_white**2 + n.axle_white_share * size**2
-        for measured, modelled, r_ in ((speed, lambda x: x[1], n.noise_speed**2), (0.0, axle, variance)):
+        for measured, modelled, r_ in (
+            (speed, lambda x: x[1], n.noise_speed**2),
+            (0.0, axle, variance),
+        ):
             row = np.array([(modelled(x + d) - modelled(x - d)) / 2e-6 for d in np.eye(8) * 1e-6])
             residual, s = measured - modelled(x), row @ p @ row + r_
             residual *= min(1.0, n.gate * np.sqrt(s) / max(abs(residual), 1e-300))
@@ -110,7 +165,11 @@ def test_filter_of_one_grip_limit_matches_plain_matrices():
 def test_filter_with_the_networks_axle_matches_plain_matrices():
     samples, _ = drive(20.0)
     model = model_of(grips=[300.0], network_start=1e12)  # so that the other filter has no weight
-    state, network, states = model.first_state(samples[0], {}), np.empty(len(samples)), np.empty((len(samples), 8))
+    state, network, states = (
+        model.first_state(samples[0], {}),
+        np.empty(len(samples)),
+        np.empty((len(samples), 8)),
+    )
     for k in range(len(samples)):
         network[k] = state.lags[kernel.PREDICTED]
         _, _, state = model.trace(samples[k : k + 1], state)
@@ -122,11 +181,17 @@ def test_filter_with_the_networks_axle_matches_plain_matrices():
 
 def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing():
     samples, _ = drive(10.0)
-    recording = Recording("a", "a", RATE, 0.0, dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True)))
+    recording = Recording(
+        "a", "a", RATE, 0.0, dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True))
+    )
     expected = load_model(pretrained_folder()).estimate([recording])[0]["vy"]
-    model = model_of(network_odds=1e12, lateral_power=0.0, longitudinal_power=0.0, minimum_speed=1.0)
+    model = model_of(
+        network_odds=1e12, lateral_power=0.0, longitudinal_power=0.0, minimum_speed=1.0
+    )
     vy = model.estimate([recording])[0]["vy"]
-    np.testing.assert_allclose(vy[30:], expected[30:], atol=2e-5)  # its weights and arithmetic are single there
+    np.testing.assert_allclose(
+        vy[30:], expected[30:], atol=2e-5
+    )  # its weights and arithmetic are single there
     samples, vy = drive(60.0)
     model = model_of(measured_ax=False)
     assert model.channels == ("yaw_rate", "vx", "ay")
@@ -138,8 +203,12 @@ def test_filters_do_not_depend_on_their_lanes():
     samples, _ = drive(20.0)
     grips, order = np.linspace(4.0, 25.0, 12), np.random.default_rng(0).permutation(12)
     models = [model_of(grips=own.tolist()) for own in (grips, grips[order])]
-    (found, states, last), (other, of_other, permuted) = (model.trace(samples, model.first_state(samples[0], {})) for model in models)
-    np.testing.assert_allclose(np.hstack([found, states]), np.hstack([other, of_other]), rtol=1e-8, atol=1e-12)
+    (found, states, last), (other, of_other, permuted) = (
+        model.trace(samples, model.first_state(samples[0], {})) for model in models
+    )
+    np.testing.assert_allclose(
+        np.hstack([found, states]), np.hstack([other, of_other]), rtol=1e-8, atol=1e-12
+    )
     np.testing.assert_allclose(last.means[:12][order], permuted.means[:12], rtol=1e-8, atol=1e-12)
     np.testing.assert_array_equal(last.covariances, last.covariances.transpose(0, 2, 1))
 
@@ -152,13 +221,19 @@ def test_tanh_of_vectors():
 def test_finds_the_rear_axle_and_tells_how_well():
     z_scores, shares, of_priors = [], [], []
     for seed in range(6):
-        truth = {"compliance": 0.004 + 0.0008 * seed, "leakage": 0.06 - 0.02 * seed, "offset": 0.1 * (seed - 2)}
+        truth = {
+            "compliance": 0.004 + 0.0008 * seed,
+            "leakage": 0.06 - 0.02 * seed,
+            "offset": 0.1 * (seed - 2),
+        }
         samples, vy = drive(90.0, seed, **truth)
         model = model_of()
         _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
         last, late = states[-1], slice(round(30.0 * RATE), None)
         known = {kernel.COMPLIANCE: truth["compliance"], kernel.LEAKAGE: truth["leakage"]}
-        z_scores += [(last[state] - value) / np.sqrt(last[8 + state]) for state, value in known.items()]
+        z_scores += [
+            (last[state] - value) / np.sqrt(last[8 + state]) for state, value in known.items()
+        ]
         steady = samples[:, 0] * (model.rear - model.compliance * samples[:, 1] ** 2)
         shares.append(np.std(states[late, kernel.V] - vy[late]) / np.std(vy[late]))
         of_priors.append(np.std(steady[late] - vy[late]) / np.std(vy[late]))
@@ -179,7 +254,9 @@ def test_a_kick_leaves_the_grip_limit_open():
 
 
 def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip():
-    straight = np.column_stack([np.zeros(1200), np.full(1200, 30.0), np.zeros(1200), np.zeros(1200)])
+    straight = np.column_stack(
+        [np.zeros(1200), np.full(1200, 30.0), np.zeros(1200), np.zeros(1200)]
+    )
     straight += np.random.default_rng(0).normal(size=straight.shape) * [0.001, 0.05, 0.03, 0.03]
     model = model_of()
     mean, deviation = model.prior
@@ -196,7 +273,9 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     np.testing.assert_array_equal(states[40:, kernel.COMPLIANCE], states[40, kernel.COMPLIANCE])
     assert states[-1, kernel.COMPLIANCE] == pytest.approx(moved[-1, kernel.COMPLIANCE], rel=1e-9)
     model = SelfCalibrating.from_config({"cg_to_rear_axle": 1.3})
-    samples = np.tile([0.3, 2.0, 0.6, 0.0], (40, 1))  # yaw rate [rad/s], speed [m/s], ay and ax [m/s²] of v' = u' = 0
+    samples = np.tile(
+        [0.3, 2.0, 0.6, 0.0], (40, 1)
+    )  # yaw rate [rad/s], speed [m/s], ay and ax [m/s²] of v' = u' = 0
     state = model.first_state(samples[0], {"vy": 0.3})
     state.means[:, kernel.REAR] = 1.0  # the inertial unit sits 0.3 m behind the centre of gravity
     state.covariances[:, kernel.REAR, kernel.REAR] = 1e-6
@@ -212,34 +291,64 @@ def test_refuses_weights_of_another_network():
 
 def test_compiled_code_is_found_again_in_the_next_process():
     numbers = SelfCalibrating.from_config({}).numbers()
-    assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), "its type is in the key of the compiled code"
+    assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), (
+        "its type is in the key of the compiled code"
+    )
 
 
 def test_smoother_matches_joint_least_squares_of_a_rolling_car():
-    rng, model = np.random.default_rng(2), model_of(smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0)
-    samples = np.column_stack([np.zeros(25), 2.0 + 0.1 * rng.normal(size=25), 0.1 * rng.normal(size=25), 0.2 * rng.normal(size=25)])
+    rng, model = (
+        np.random.default_rng(2),
+        model_of(
+            smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0
+        ),
+    )
+    samples = np.column_stack(
+        [
+            np.zeros(25),
+            2.0 + 0.1 * rng.normal(size=25),
+            0.1 * rng.normal(size=25),
+            0.2 * rng.normal(size=25),
+        ]
+    )
     n, deviation, steps = model.numbers(), model.prior[1], len(samples)
     step, decay = np.eye(4), model.decay[:4]  # of v, u and the offsets of ay and ax
     step[0, 2], step[1, 3] = -n.dt, -n.dt
     step *= decay[:, None]
-    noise = np.array([n.dt * n.noise_vy**2, n.dt * n.noise_vx**2, *np.square(deviation[2:4]) * (1.0 - decay[2:] ** 2)])
+    noise = np.array(
+        [
+            n.dt * n.noise_vy**2,
+            n.dt * n.noise_vx**2,
+            *np.square(deviation[2:4]) * (1.0 - decay[2:] ** 2),
+        ]
+    )
     middle = (np.vstack([samples[:1], samples[:-1]]) + samples) / 2.0
-    rows, values = [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]], [np.array([0.0, samples[0, 1], 0, 0])]
+    rows, values = (
+        [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]],
+        [np.array([0.0, samples[0, 1], 0, 0])],
+    )
     values[0] /= deviation[:4]
     for k in range(steps):
         moved = np.zeros((4, 4 * (steps + 1)))
         moved[:, 4 * k : 4 * k + 4], moved[:, 4 * k + 4 : 4 * k + 8] = -step, np.eye(4)
         rows.append(moved / np.sqrt(noise)[:, None])
-        values.append(np.array([n.dt * middle[k, 2], n.dt * middle[k, 3], 0.0, 0.0]) / np.sqrt(noise))
+        values.append(
+            np.array([n.dt * middle[k, 2], n.dt * middle[k, 3], 0.0, 0.0]) / np.sqrt(noise)
+        )
         measured = np.zeros((2, 4 * (steps + 1)))
         measured[0, 4 * k + 5], measured[1, 4 * k + 4] = 1.0 / n.noise_speed, 1.0 / kernel.ROLLING
         rows.append(measured)
         values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
     stacked = np.vstack(rows)
-    expected, covariance = np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0], np.linalg.inv(stacked.T @ stacked)
+    expected, covariance = (
+        np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0],
+        np.linalg.inv(stacked.T @ stacked),
+    )
     estimate, _ = model.run(samples, model.first_state(samples[0], {}))
     np.testing.assert_allclose(estimate["vy"], expected[4::4], rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(estimate["covariance"][:, 0, 0], np.diag(covariance)[4::4], rtol=1e-6)
+    np.testing.assert_allclose(
+        estimate["covariance"][:, 0, 0], np.diag(covariance)[4::4], rtol=1e-6
+    )
 
 
 def test_at_the_end_of_a_drive_smoother_and_filter_agree():
@@ -261,7 +370,9 @@ def test_smoothed_estimates_err_less_within_their_bands():
         for errors, model in ((causal, model_of()), (smooth, model_of(smoothed=True))):
             estimate, _ = model.run(samples, model.first_state(samples[0], {}))
             errors.append(np.std(estimate["vy"] - vy))
-        within.append(np.mean(np.abs(estimate["vy"] - vy) < 1.645 * np.sqrt(estimate["covariance"][:, 0, 0])))
+        within.append(
+            np.mean(np.abs(estimate["vy"] - vy) < 1.645 * np.sqrt(estimate["covariance"][:, 0, 0]))
+        )
     assert np.median(smooth) < 0.8 * np.median(causal)
     assert np.mean(within) > 0.85
 
@@ -270,5 +381,7 @@ def test_smoother_is_offline_and_refuses_online_and_c():
     model = model_of(smoothed=True)
     assert not model.causal
     for refused in (model.online, lambda: method_files(model, "double")):
-        with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
+        with pytest.raises(
+            ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"
+        ):
             refused()

@@ -13,7 +13,10 @@ from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_moti
 from vehest.vehicle.parameters import SingleTrackParameters
 
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
-CURVES = {"linear": np.array([[3.0e5], [4.0e5]]), "rational": np.array([[0.01286, 486735.0], [0.00769, 622319.0]])}
+CURVES = {
+    "linear": np.array([[3.0e5], [4.0e5]]),
+    "rational": np.array([[0.01286, 486735.0], [0.00769, 622319.0]]),
+}
 
 
 @cache
@@ -34,7 +37,13 @@ def car(kind, seconds, rate_hz, size):
         rows.append((r, lateral, steer, beta, u))
         beta += step * (lateral / u - r)
         r += step * (front_arm * front - rear_arm * rear) / TRUCK.yaw_inertia
-    return dict(zip(("yaw_rate", "ay", "steer", "sideslip_ref", "vx"), np.array(rows)[::every].T, strict=True))
+    return dict(
+        zip(
+            ("yaw_rate", "ay", "steer", "sideslip_ref", "vx"),
+            np.array(rows)[::every].T,
+            strict=True,
+        )
+    )
 
 
 def drive(kind="rational", seed=0, noise=1.0, seconds=100.0, rate_hz=50.0, size=1.0):
@@ -42,7 +51,10 @@ def drive(kind="rational", seed=0, noise=1.0, seconds=100.0, rate_hz=50.0, size=
     generator = np.random.default_rng(seed)
     levels = {"yaw_rate": 0.002, "ay": 0.1, "steer": 0.001, "sideslip_ref": 0.001, "vx": 0.0}
     true = car(kind, seconds, rate_hz, size)
-    channels = {name: samples + noise * levels[name] * generator.standard_normal(len(samples)) for name, samples in true.items()}
+    channels = {
+        name: samples + noise * levels[name] * generator.standard_normal(len(samples))
+        for name, samples in true.items()
+    }
     return Recording("known", "truck", rate_hz, 0.0, channels, "simulated")
 
 
@@ -59,11 +71,24 @@ def test_without_noise_the_forces_are_those_of_the_car_and_refusals_say_what_to_
     clean = drive(noise=0.0)
     motion = axle_motion([clean], TRUCK)
     for curve, slip, force in zip(CURVES["rational"], motion.slip, motion.force, strict=True):
-        assert np.sqrt(np.mean((axle_force("rational", curve, slip) - force) ** 2)) < 0.005 * np.abs(force).max()
+        assert (
+            np.sqrt(np.mean((axle_force("rational", curve, slip) - force) ** 2))
+            < 0.005 * np.abs(force).max()
+        )
     own = drive()
     assert "100 are needed" in refusal(lambda: axle_motion([own.cut(0.0, 1.0)], TRUCK))
     with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
-        fit_motion(axle_motion([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK))
+        fit_motion(
+            axle_motion(
+                [
+                    replace(
+                        own,
+                        channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]},
+                    )
+                ],
+                TRUCK,
+            )
+        )
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
@@ -77,7 +102,9 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
 def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
     """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
     fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
-    assert (np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]).all()
+    assert (
+        np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]
+    ).all()
     found, interval = np.array([fit.front[0], fit.rear[0]]), fit.interval[:, 0]
     np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
     np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
@@ -85,14 +112,30 @@ def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands
 
 def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     own = drive(noise=0.0)
-    wheels = {f"fy_{wheel}": np.full(len(own), value) for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))}
-    motion = axle_motion([replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True)
-    np.testing.assert_allclose(motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1))
+    wheels = {
+        f"fy_{wheel}": np.full(len(own), value)
+        for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))
+    }
+    motion = axle_motion(
+        [replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True
+    )
+    np.testing.assert_allclose(
+        motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1)
+    )
     both = fit_motion(axle_motion([drive(seed=1), drive(seed=2)], TRUCK))
     assert both.slip.shape[1] == 2 * fit_motion(axle_motion([drive(seed=1)], TRUCK)).slip.shape[1]
     own = drive()
     slow, unknown = np.array(own["vx"]), np.array(own["ay"])
     slow[:500], unknown[1000:1100] = 1.0, np.nan
-    motion = axle_motion([replace(own, channels={**own.channels, "vx": slow, "ay": unknown}, gappy=frozenset({"ay"}))], TRUCK)
+    motion = axle_motion(
+        [
+            replace(
+                own, channels={**own.channels, "vx": slow, "ay": unknown}, gappy=frozenset({"ay"})
+            )
+        ],
+        TRUCK,
+    )
     assert motion.slip.shape == motion.force.shape == (2, len(motion.block))
-    assert len(motion.block) == len(own) - 500 - 100 - 24 - 12  # the smoothing reaches 12 samples to either side
+    assert (
+        len(motion.block) == len(own) - 500 - 100 - 24 - 12
+    )  # the smoothing reaches 12 samples to either side

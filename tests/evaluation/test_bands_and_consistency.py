@@ -45,7 +45,9 @@ def part_of(rng, seconds=100.0, deviation=0.1):
     half = np.full(n, deviation * GAUSSIAN[2])
     angles = np.arctan2(vy + error, vx), np.arctan2(vy, vx)
     bands = {"vy": half, "sideslip": np.arctan2(half, vx)}
-    return Scored(np.arange(n) / 20.0, vy + error, vy, *angles, rng.uniform(0.0, 5.0, n), bands=bands)
+    return Scored(
+        np.arange(n) / 20.0, vy + error, vy, *angles, rng.uniform(0.0, 5.0, n), bands=bands
+    )
 
 
 def test_interval_score_of_a_gaussian_is_its_closed_form_and_lowest_at_the_true_width():
@@ -55,9 +57,14 @@ def test_interval_score_of_a_gaussian_is_its_closed_form_and_lowest_at_the_true_
         z = stats.norm.ppf(0.5 + 0.5 * level)
         expected = 2.0 * z + 2.0 / (1.0 - level) * 2.0 * (stats.norm.pdf(z) - z * stats.norm.sf(z))
         found = interval_score(errors, np.full_like(errors, z), level)
-        assert found.mean() == pytest.approx(expected, abs=4.0 * found.std() / math.sqrt(len(found)))
+        assert found.mean() == pytest.approx(
+            expected, abs=4.0 * found.std() / math.sqrt(len(found))
+        )
     errors = np.random.default_rng(1).standard_normal(100_000)
-    scores = [interval_score(errors, np.full_like(errors, width * GAUSSIAN[2]), 0.9).mean() for width in (0.7, 1.0, 1.4)]
+    scores = [
+        interval_score(errors, np.full_like(errors, width * GAUSSIAN[2]), 0.9).mean()
+        for width in (0.7, 1.0, 1.4)
+    ]
     assert scores[1] == min(scores)
 
 
@@ -80,7 +87,9 @@ def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
 def test_intraclass_correlation_of_planted_variances():
     rng = np.random.default_rng(2)
     labels = np.repeat(np.arange(3000), rng.integers(5, 15, 3000))
-    values = math.sqrt(0.3) * rng.standard_normal(3000)[labels] + math.sqrt(0.7) * rng.standard_normal(len(labels))
+    values = math.sqrt(0.3) * rng.standard_normal(3000)[labels] + math.sqrt(
+        0.7
+    ) * rng.standard_normal(len(labels))
     assert intraclass_correlation(values, labels) == pytest.approx(0.3, abs=0.03)
     assert intraclass_correlation(labels.astype(float), labels) == pytest.approx(1.0)
     assert math.isnan(intraclass_correlation(values, np.zeros(len(values), dtype=int)))
@@ -120,17 +129,26 @@ def test_true_bands_cover_what_they_say():
         assert figures[f"coverage_90_p10{suffix}"] < 0.9 < figures[f"coverage_90_p90{suffix}"]
         assert abs(figures[f"error_icc{suffix}"]) < 0.02
     assert figures["width_90_vy"] == pytest.approx(2.0 * 0.1 * GAUSSIAN[2])
-    assert figures["width_90"] == pytest.approx(math.degrees(figures["width_90_vy"] / 20.0), rel=1e-3)
+    assert figures["width_90"] == pytest.approx(
+        math.degrees(figures["width_90_vy"] / 20.0), rel=1e-3
+    )
     assert figures["crps_vy"] == pytest.approx(0.1 / math.sqrt(math.pi), rel=0.05)
     intervals = coverage_intervals(own, parts, 20.0)
-    assert set(intervals) == {f"coverage_{100 * level:.0f}{suffix}" for level in LEVELS for suffix in ("", "_vy")}
+    assert set(intervals) == {
+        f"coverage_{100 * level:.0f}{suffix}" for level in LEVELS for suffix in ("", "_vy")
+    }
     low, high = intervals["coverage_90"]
     assert low < figures["coverage_90"] < high
 
 
 def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
     part = part_of(np.random.default_rng(5))
-    names = {"ay_0_2": (0.0, 2.0), "ay_2_4": (2.0, 4.0), "ay_4_6": (4.0, 6.0), "ay_6_": (6.0, math.inf)}
+    names = {
+        "ay_0_2": (0.0, 2.0),
+        "ay_2_4": (2.0, 4.0),
+        "ay_4_6": (4.0, 6.0),
+        "ay_6_": (6.0, math.inf),
+    }
     masks = {name: (part.ay >= low) & (part.ay < high) for name, (low, high) in names.items()}
     found = figures_by_regime(banded([part], BANDS), [masks], 20.0)
     assert set(found) == {"ay_0_2", "ay_2_4", "ay_4_6"}
@@ -161,7 +179,8 @@ def figures_of_kalman(factor):
     estimator = estimator_class("kalman").from_config({"noise": noise})
     estimates = estimator.estimate([drive.without_references() for drive in DRIVES])
     parts = [
-        score(estimate, drive, Span("d", drive.id), Protocol(100.0, 0.0, 2.0)) for estimate, drive in zip(estimates, DRIVES, strict=True)
+        score(estimate, drive, Span("d", drive.id), Protocol(100.0, 0.0, 2.0))
+        for estimate, drive in zip(estimates, DRIVES, strict=True)
     ]
     assert parts[0].covariance_of == ("vy", "yaw_rate")
     return accuracy(parts)
@@ -173,7 +192,9 @@ def test_a_kalman_filter_is_consistent_on_its_own_model_and_not_with_half_the_no
     assert right["nis"] == pytest.approx(1.0, abs=0.05)
     assert right["coverage_1sigma"] == pytest.approx(COVERAGE[1], abs=0.05)
     assert right["coverage_2sigma"] == pytest.approx(COVERAGE[2], abs=0.03)
-    assert sure["rmse_vy"] == pytest.approx(right["rmse_vy"]), "the gain depends on ratios of noise only"
+    assert sure["rmse_vy"] == pytest.approx(right["rmse_vy"]), (
+        "the gain depends on ratios of noise only"
+    )
     assert sure["nees"] == pytest.approx(4.0 * right["nees"])
     assert sure["nis"] == pytest.approx(4.0 * right["nis"])
     assert sure["coverage_2sigma"] == pytest.approx(right["coverage_1sigma"])
@@ -184,7 +205,14 @@ def test_normalised_errors_are_those_of_a_hand_calculation_and_infinite_without_
     covariance = np.array([[[2.0, 1.0], [1.0, 3.0]], [[1e-12, 0.0], [0.0, 1e6]]])
     expected = [errors[0] @ np.linalg.inv(covariance[0]) @ errors[0] / 2.0, 9e12 / 2.0]
     np.testing.assert_allclose(normalised_error_squared(errors, covariance), expected, rtol=1e-9)
-    improper = np.array([[[0.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]])
+    improper = np.array(
+        [
+            [[0.0, 0.0], [0.0, 1.0]],
+            [[1.0, 2.0], [2.0, 1.0]],
+            [[-1.0, 0.0], [0.0, 1.0]],
+            [[1.0, 0.0], [0.0, 1.0]],
+        ]
+    )
     squared = normalised_error_squared(np.full((4, 2), 0.5), improper)
     assert np.isinf(squared[:3]).all()
     assert squared[3] == pytest.approx(0.25)

@@ -50,10 +50,27 @@ def single_track_drive(seconds=300.0, seed=0):
     r = 0.25 * np.sin(0.4 * time) + 0.15 * np.sin(1.1 * time + 1.0)
     a = u * r
     v = 1.1 * r - u * a / (10.0 * 9.81) + markov(generator, n, 0.08, 3.0)
-    ay = np.gradient(v) * RATE + u * r + markov(generator, n, 0.15, 10.0) + 0.2 * generator.standard_normal(n)
-    ax = np.gradient(u) * RATE - v * r + markov(generator, n, 0.05, 10.0) + 0.2 * generator.standard_normal(n)
+    ay = (
+        np.gradient(v) * RATE
+        + u * r
+        + markov(generator, n, 0.15, 10.0)
+        + 0.2 * generator.standard_normal(n)
+    )
+    ax = (
+        np.gradient(u) * RATE
+        - v * r
+        + markov(generator, n, 0.05, 10.0)
+        + 0.2 * generator.standard_normal(n)
+    )
     steer = (v + 1.3 * r) / u + a / (9.0 * 9.81) + markov(generator, n, 0.003, 3.0)
-    channels = {"vx": u + 0.01 * generator.standard_normal(n), "yaw_rate": r, "ay": ay, "ax": ax, "steer": steer, "vy_ref": v}
+    channels = {
+        "vx": u + 0.01 * generator.standard_normal(n),
+        "yaw_rate": r,
+        "ay": ay,
+        "ax": ax,
+        "steer": steer,
+        "vy_ref": v,
+    }
     return Recording("track", "car", RATE, 0.0, channels, "simulated")
 
 
@@ -62,7 +79,10 @@ def markov(generator, n, deviation, time_constant):
     values = np.empty(n)
     values[0] = deviation * generator.standard_normal()
     for k in range(1, n):
-        values[k] = decay * values[k - 1] + deviation * math.sqrt(1 - decay**2) * generator.standard_normal()
+        values[k] = (
+            decay * values[k - 1]
+            + deviation * math.sqrt(1 - decay**2) * generator.standard_normal()
+        )
     return values
 
 
@@ -73,7 +93,9 @@ def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent_and_a_perfect_
         assert floor.vy == pytest.approx(sigma, rel=0.04)
     noisy, drive = noisy_reference(0.05), planar_drive(400.0)
     floor = reference_floor([drive_of(noisy, Span("d", "drive"), Protocol(RATE, 0.0, 0.0))])
-    error = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]) - np.arctan2(noisy["vy_ref"], noisy["vx"]))
+    error = np.degrees(
+        np.arctan2(drive["vy_ref"], drive["vx"]) - np.arctan2(noisy["vy_ref"], noisy["vx"])
+    )
     assert floor.sideslip == pytest.approx(np.sqrt(np.mean(error**2)), rel=0.04)
 
 
@@ -83,7 +105,13 @@ def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
     v, r, u = 0.2 * np.sin(4 * np.pi * time), 0.1 * np.cos(4 * np.pi * time), np.full(4000, 20.0)
     ay = 0.8 * np.pi * np.cos(4 * np.pi * time) + u * r
     generator = np.random.default_rng(0)
-    swings = Recording("d", "car", RATE, 0.0, {"vx": u, "yaw_rate": r, "ay": ay, "vy_ref": v + 0.005 * generator.standard_normal(4000)})
+    swings = Recording(
+        "d",
+        "car",
+        RATE,
+        0.0,
+        {"vx": u, "yaw_rate": r, "ay": ay, "vy_ref": v + 0.005 * generator.standard_normal(4000)},
+    )
     drive = drive_of(swings, Span("d", "d"), PROTOCOL)
     assert white_level([drive.vy_ref]) > 0.009
     assert reference_floor([drive]).vy == pytest.approx(0.005, rel=0.1)
@@ -91,10 +119,15 @@ def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
 
 def test_coarse_or_few_samples_bound_the_floor_and_smoothing_hides_noise():
     drive = planar_drive(200.0)
-    coarse = Recording("d", "car", RATE, 0.0, {**drive.channels, "vy_ref": 0.1 * np.round(drive["vy_ref"] / 0.1)})
+    coarse = Recording(
+        "d", "car", RATE, 0.0, {**drive.channels, "vy_ref": 0.1 * np.round(drive["vy_ref"] / 0.1)}
+    )
     assert quantisation_step(coarse["vy_ref"]) == pytest.approx(0.1)
     assert quantisation_step(drive["vy_ref"]) == 0.0
-    assert reference_floor([drive_of(coarse, Span("d", "d"), PROTOCOL)]).vy >= 0.1 / math.sqrt(12) - 1e-9
+    assert (
+        reference_floor([drive_of(coarse, Span("d", "d"), PROTOCOL)]).vy
+        >= 0.1 / math.sqrt(12) - 1e-9
+    )
     noisy = noisy_reference(0.05)
     smooth = np.convolve(noisy["vy_ref"], np.full(5, 0.2), "same")
     hidden = Recording("d", "car", RATE, 0.0, {**noisy.channels, "vy_ref": smooth})
@@ -110,14 +143,19 @@ def random_model(steps, n=4, m=2, seed=1):
     A = np.eye(n) * 0.95 + 0.1 * generator.standard_normal((steps, n, n))
     Q, P = (root @ root.T + 0.1 * np.eye(n) for root in generator.standard_normal((2, n, n)))
     R = 0.1 + generator.random(m)
-    return LinearModel(A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R), P
+    return LinearModel(
+        A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R
+    ), P
 
 
 def test_bound_is_that_of_tichavsky_and_others():
     """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
     model, prior = random_model(200)
     bound = posterior_bound(model, prior)
-    inverse_Q, inverse_R = np.linalg.inv(model.process_noise), np.diag(1.0 / model.observation_noise)
+    inverse_Q, inverse_R = (
+        np.linalg.inv(model.process_noise),
+        np.diag(1.0 / model.observation_noise),
+    )
     told = [C.T @ inverse_R @ C for C in model.observation]
     information = np.linalg.inv(prior) + told[0]
     for k in range(200):
@@ -128,16 +166,23 @@ def test_bound_is_that_of_tichavsky_and_others():
             information = inverse_Q + told[k + 1] - D12.T @ np.linalg.solve(information + D11, D12)
 
 
-def test_long_drives_are_bounded_in_chunks_of_the_same_outcome_and_gaps_and_standstill_finitely(monkeypatch):
+def test_long_drives_are_bounded_in_chunks_of_the_same_outcome_and_gaps_and_standstill_finitely(
+    monkeypatch,
+):
     drive = drive_of(single_track_drive(60.0), Span("d", "track"), PROTOCOL)
     whole = cramer_rao_floor([drive], SETS[-1])
     monkeypatch.setattr(floors, "CHUNK", 97)
     chunks = cramer_rao_floor([drive], SETS[-1])
-    assert (chunks.vy, chunks.sideslip) == (pytest.approx(whole.vy, rel=1e-9), pytest.approx(whole.sideslip, rel=1e-9))
+    assert (chunks.vy, chunks.sideslip) == (
+        pytest.approx(whole.vy, rel=1e-9),
+        pytest.approx(whole.sideslip, rel=1e-9),
+    )
     drive = single_track_drive(60.0)
     vx, ay = drive["vx"].copy(), drive["ay"].copy()
     vx[400:600], ay[700:720] = 0.0, np.nan
-    gappy = Recording("d", "car", RATE, 0.0, {**drive.channels, "vx": vx, "ay": ay}, gappy=frozenset({"ay"}))
+    gappy = Recording(
+        "d", "car", RATE, 0.0, {**drive.channels, "vx": vx, "ay": ay}, gappy=frozenset({"ay"})
+    )
     floor = cramer_rao_floor([drive_of(gappy, Span("d", "d"), PROTOCOL)], SETS[-1])
     assert 0 < floor.vy < 1
     assert 0 < floor.sideslip < 104
@@ -175,9 +220,13 @@ def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_re
 
 def test_kinematics_tell_v_by_accelerations_in_bends_alone():
     drives = [drive_of(single_track_drive(), Span("d", "track"), Protocol(RATE, 0.0, 0.0))]
-    assert cramer_rao_floor(drives, SETS[0], car=False).vy == pytest.approx(reference_spread(drives).vy, rel=1e-6)
+    assert cramer_rao_floor(drives, SETS[0], car=False).vy == pytest.approx(
+        reference_spread(drives).vy, rel=1e-6
+    )
     bends = single_track_drive()
-    straight = Recording("s", "car", RATE, 0.0, {**bends.channels, "yaw_rate": np.zeros(len(bends))})
+    straight = Recording(
+        "s", "car", RATE, 0.0, {**bends.channels, "yaw_rate": np.zeros(len(bends))}
+    )
     for recording, helps in ((bends, True), (straight, False)):
         drives = [drive_of(recording, Span("d", recording.id), PROTOCOL)]
         without, with_ax = (cramer_rao_floor(drives, inputs, car=False).vy for inputs in SETS[1:3])
@@ -190,7 +239,11 @@ def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
     v, offset, white = markov(generator, n + 1, 0.8, 3.0), markov(generator, n, 0.15, 10.0), 0.3
     ay = np.diff(v) * RATE - offset - white * generator.standard_normal(n)
     channels = {"vx": np.full(n, 20.0), "yaw_rate": np.zeros(n), "ay": ay, "vy_ref": v[:-1]}
-    drives = [drive_of(Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), Protocol(RATE, 0.0, 0.0))]
+    drives = [
+        drive_of(
+            Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), Protocol(RATE, 0.0, 0.0)
+        )
+    ]
     decay, slow = math.exp(-step / 3.0), math.exp(-step / 10.0)
     own = KalmanFilter(dim_x=3, dim_z=1)  # v, v a sample earlier, offset
     own.x, own.P = np.zeros((3, 1)), np.diag([0.8**2, 0.8**2, 0.15**2])
@@ -202,7 +255,9 @@ def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
         own.predict()
         own.update(ay[k])
         errors.append(own.x[1, 0] - v[k])
-    assert cramer_rao_floor(drives, SETS[1], car=False).vy == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.1)
+    assert cramer_rao_floor(drives, SETS[1], car=False).vy == pytest.approx(
+        np.sqrt(np.mean(np.square(errors))), rel=0.1
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 1.0])
@@ -219,11 +274,21 @@ def test_drives_without_noise_or_without_motion_leave_every_bound_finite(scale):
 
 def test_inputs_of_an_estimator_decide_which_bound_it_has_if_any():
     assert inputs_of(("yaw_rate", "vx", "ay", "ax")) == {"yaw_rate", "vx", "ay", "ax"}
-    assert inputs_of(("motor_speed", "motor_current", "yaw_rate", "steer")) == {"vx", "yaw_rate", "steer"}
+    assert inputs_of(("motor_speed", "motor_current", "yaw_rate", "steer")) == {
+        "vx",
+        "yaw_rate",
+        "steer",
+    }
     assert inputs_of(("wheel_speed_fl", "yaw_rate", "handwheel")) == {"vx", "yaw_rate", "steer"}
     assert inputs_of(("vx",)) is None
     assert inputs_of(("vx", "yaw_rate", "ay", "fy_front_left")) is None
-    drives = [drive_of(single_track_drive(30.0).select(["vx", "yaw_rate", "vy_ref"]), Span("d", "track"), PROTOCOL)]
+    drives = [
+        drive_of(
+            single_track_drive(30.0).select(["vx", "yaw_rate", "vy_ref"]),
+            Span("d", "track"),
+            PROTOCOL,
+        )
+    ]
     assert cramer_rao_floor(drives, SETS[0]) is not None
     assert cramer_rao_floor(drives, SETS[1]) is None
     with pytest.raises(ValueError, match="inputs of a bound are vx, yaw_rate and some of"):

@@ -15,7 +15,13 @@ from vehest.data.splits import Span
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.lever_arm import LONGEST, lever_arm_figures
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_errors
-from vehest_papers.cnn_ukf.manoeuvres import error_distribution, group_of, kpis, kpis_by_group, manoeuvres_of
+from vehest_papers.cnn_ukf.manoeuvres import (
+    error_distribution,
+    group_of,
+    kpis,
+    kpis_by_group,
+    manoeuvres_of,
+)
 
 
 def _estimate(times, vy, rate_hz, start):
@@ -25,7 +31,14 @@ def _estimate(times, vy, rate_hz, start):
 def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
     vy_ref = np.array([1.0, -1.0, 2.0, -2.0])
     vy = vy_ref + np.array([0.1, 0.1, 0.3, 0.3])
-    part = Scored(np.arange(4.0), vy, vy_ref, np.radians([1.0, 2.0, 3.0, 4.0]), np.zeros(4), np.array([1.0, 5.0, -6.0, 0.0]))
+    part = Scored(
+        np.arange(4.0),
+        vy,
+        vy_ref,
+        np.radians([1.0, 2.0, 3.0, 4.0]),
+        np.zeros(4),
+        np.array([1.0, 5.0, -6.0, 0.0]),
+    )
     figures = accuracy([part])
     assert figures["rmse_vy"] == pytest.approx(math.sqrt((0.01 + 0.01 + 0.09 + 0.09) / 4))
     assert figures["fvu"] == pytest.approx(0.01 / 2.5)
@@ -37,22 +50,43 @@ def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
     assert figures["max_error_sideslip_nonlinear"] == pytest.approx(3.0)
     assert figures["p99_sideslip"] == pytest.approx(np.quantile([1, 2, 3, 4], 0.99))
     assert set(figures) <= set(UNITS)
-    part = Scored(np.arange(2.0), np.ones(2), np.array([1.0, 2.0]), np.radians([179.0, -170.0]), np.radians([-178.0, 170.0]), np.zeros(2))
+    part = Scored(
+        np.arange(2.0),
+        np.ones(2),
+        np.array([1.0, 2.0]),
+        np.radians([179.0, -170.0]),
+        np.radians([-178.0, 170.0]),
+        np.zeros(2),
+    )
     figures = accuracy([part])
     assert figures["max_error_sideslip"] == pytest.approx(20.0)
     assert figures["rmse_sideslip"] == pytest.approx(math.sqrt((3.0**2 + 20.0**2) / 2))
 
 
 def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
-    part = Scored(drive.time, drive["vy_ref"] + 0.5, drive["vy_ref"], drive["sideslip_ref"], drive["sideslip_ref"], drive["ay"])
+    part = Scored(
+        drive.time,
+        drive["vy_ref"] + 0.5,
+        drive["vy_ref"],
+        drive["sideslip_ref"],
+        drive["sideslip_ref"],
+        drive["ay"],
+    )
     figures = accuracy([part])
     assert figures["fvu"] == pytest.approx(0.0, abs=1e-12)
     assert figures["rmse_vy"] == pytest.approx(0.5)
     vy = np.where(drive.time < 11.5 - 1e-9, 1e6, drive["vy_ref"])
-    scored = score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol())
+    scored = score(
+        _estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol()
+    )
     assert accuracy([scored])["rmse_vy"] == 0.0
     drive = planar_drive(noise=0.3)
-    scored = score(_estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+    scored = score(
+        _estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0),
+        drive,
+        Span("d", "drive"),
+        Protocol(),
+    )
     vx = drive["vx"][30:]
     assert np.allclose(scored.sideslip_ref, np.arctan2(drive["vy_ref"][30:], vx))
     assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
@@ -67,7 +101,10 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_
     assert figures["mse_weighted"] == pytest.approx((0.2225 + 9 * 0.5064 + 4 * 0.1566) / 2)
     assert figures["mae_weighted"] == pytest.approx(sum(absolute) / 2)
     assert figures["ae99_weighted"] == pytest.approx(np.quantile(absolute, 0.99))
-    assert (figures["rmse_vx"], figures["rmse_yaw_rate"]) == (pytest.approx(math.sqrt(0.5)), pytest.approx(math.sqrt(2.0)))
+    assert (figures["rmse_vx"], figures["rmse_yaw_rate"]) == (
+        pytest.approx(math.sqrt(0.5)),
+        pytest.approx(math.sqrt(2.0)),
+    )
     assert set(figures) <= set(UNITS)
     with_vx = Scored(zero, zero, zero, zero, zero, zero, {"vx": (zero, zero)})
     without = Scored(zero, zero, zero, zero, zero, zero)
@@ -98,24 +135,37 @@ def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
     own = replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
     estimate = _estimate(own.time, vy + np.where(vx < 1.0, 0.1, 0.0), 20.0, 0.0)
     counted, without = (
-        accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])["max_error_sideslip"] for least in (0.0, 0.1)
+        accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])[
+            "max_error_sideslip"
+        ]
+        for least in (0.0, 0.1)
     )
     assert (counted > 80.0, without) == (True, 0.0)
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
-    assert "has no estimate for 1 of" in refusal(lambda: score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol()))
+    assert "has no estimate for 1 of" in refusal(
+        lambda: score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+    )
 
 
 def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(drive):
     without = drive.select([name for name in drive.channels if name != "ay"])
     estimate = _estimate(drive.time, drive["vy_ref"] + 0.1 * np.sin(drive.time), 20.0, 0.0)
-    figures, known = (accuracy([score(estimate, own, Span("d", "drive", 10.0, 30.0), Protocol())]) for own in (without, drive))
+    figures, known = (
+        accuracy([score(estimate, own, Span("d", "drive", 10.0, 30.0), Protocol())])
+        for own in (without, drive)
+    )
     blank = {"mse_sideslip_nonlinear", "max_error_sideslip_nonlinear"}
     assert all(math.isnan(figures[name]) for name in blank)
     assert {name: value for name, value in figures.items() if name not in blank} == {
         name: value for name, value in known.items() if name not in blank
     }
-    part = score(_estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0), without, Span("d", "drive"), Protocol())
+    part = score(
+        _estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0),
+        without,
+        Span("d", "drive"),
+        Protocol(),
+    )
     indicators = kpis({"slalom": [part]})
     assert indicators.mse > 0
     assert math.isnan(indicators.mse_nonlinear)
@@ -129,7 +179,11 @@ PROTOCOL = Protocol(rate_hz=RATE, skip_seconds=1.5)
 def drive(point="unknown"):
     time = np.arange(N) / RATE
     yaw_rate = 0.8 * np.sin(0.9 * time) + 0.1
-    channels = {"vx": 12.0 + np.sin(0.3 * time), "yaw_rate": yaw_rate, "vy_ref": 0.4 * np.cos(0.7 * time) - 0.3 * yaw_rate}
+    channels = {
+        "vx": 12.0 + np.sin(0.3 * time),
+        "yaw_rate": yaw_rate,
+        "vy_ref": 0.4 * np.cos(0.7 * time) - 0.3 * yaw_rate,
+    }
     derived = {} if point is None else {"derived": {"reference_point": point}}
     return Recording("drive", "car", RATE, 0.0, channels, provenance=derived)
 
@@ -151,18 +205,26 @@ def test_a_planted_lever_arm_is_found_and_leaves_no_error_and_nothing_is_given_w
     for x in (-0.4, 0.0, 0.27):
         found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
         assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
-        assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+        assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx(
+            [0.0, 0.0, 0.0], abs=1e-9
+        )
     for recording in (drive(None), drive({"x": 0.0, "y": 0.0})):
         assert figures(recording, recording["vy_ref"]) == {}
 
 
 def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
     recording = drive()
-    vy = recording["vy_ref"] + 0.2 * recording["yaw_rate"] + np.random.default_rng(0).normal(0.0, 0.1, N)
+    vy = (
+        recording["vy_ref"]
+        + 0.2 * recording["yaw_rate"]
+        + np.random.default_rng(0).normal(0.0, 0.1, N)
+    )
     part = scored(recording, vy)
     yaw_rate = recording["yaw_rate"][-len(part.vy) :]
     searched = optimize.minimize_scalar(
-        lambda x: np.mean((part.vy - part.vy_ref - x * yaw_rate) ** 2), bounds=(-0.5, 0.5), method="bounded"
+        lambda x: np.mean((part.vy - part.vy_ref - x * yaw_rate) ** 2),
+        bounds=(-0.5, 0.5),
+        method="bounded",
     )
     found = figures(recording, vy)
     assert found["lever_arm"] == pytest.approx(searched.x, abs=1e-4)
@@ -193,8 +255,14 @@ SET = {"test_slalom_18_on_001": [CALM], "test_j_turn_off_002": [HARD]}
 
 def test_errors_are_means_over_samples_and_largest_ones_over_manoeuvres():
     figures = accuracy([CALM, HARD])
-    assert kpis(SET).mse == pytest.approx(figures["mse_sideslip"]) == pytest.approx((1.75 + 20.0) / 8)
-    assert kpis(SET).mse_nonlinear == pytest.approx(figures["mse_sideslip_nonlinear"]) == pytest.approx(10.0)
+    assert (
+        kpis(SET).mse == pytest.approx(figures["mse_sideslip"]) == pytest.approx((1.75 + 20.0) / 8)
+    )
+    assert (
+        kpis(SET).mse_nonlinear
+        == pytest.approx(figures["mse_sideslip_nonlinear"])
+        == pytest.approx(10.0)
+    )
     assert kpis(SET).max_error == pytest.approx(0.5 * (1.0 + 4.0))
     assert kpis(SET).max_error_nonlinear == pytest.approx(4.0)  # the calm one has no such sample
     assert np.isnan(kpis({"calm": [CALM]}).max_error_nonlinear)
@@ -205,7 +273,9 @@ def test_manoeuvres_are_recordings_grouped_by_their_names():
     together = manoeuvres_of(spans, [CALM, HARD])
     assert kpis(together).manoeuvres == 1
     assert kpis(together).max_error == pytest.approx(4.0)
-    assert "1 scored parts do not belong to 2 ranges" in refusal(lambda: manoeuvres_of(spans, [CALM]))
+    assert "1 scored parts do not belong to 2 ranges" in refusal(
+        lambda: manoeuvres_of(spans, [CALM])
+    )
     assert group_of("test_lane_change_2_off_001") == "lane change"
     assert group_of("20140222_01") == "other"
     groups = kpis_by_group(SET | {"train_slalom_30_off_003": [HARD]})
@@ -215,9 +285,15 @@ def test_manoeuvres_are_recordings_grouped_by_their_names():
 
 
 def test_distribution_counts_errors_in_bins_of_a_quarter_of_a_degree():
-    found = error_distribution([driven_by([0.6, -0.6, 0.1, 0.7], [0.0, 5.0, -6.0, 1.0])], nonlinear_only=False)
+    found = error_distribution(
+        [driven_by([0.6, -0.6, 0.1, 0.7], [0.0, 5.0, -6.0, 1.0])], nonlinear_only=False
+    )
     np.testing.assert_allclose(found.edges, [-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75])
     np.testing.assert_array_equal(found.counts, [1, 0, 0, 1, 0, 2])
     hard = error_distribution([CALM, HARD])
-    assert (hard.counts.sum(), hard.mean, hard.deviation) == (2, pytest.approx(-1.0), pytest.approx(3.0))
+    assert (hard.counts.sum(), hard.mean, hard.deviation) == (
+        2,
+        pytest.approx(-1.0),
+        pytest.approx(3.0),
+    )
     assert "no sample has a lateral acceleration" in refusal(lambda: error_distribution([CALM]))

@@ -17,7 +17,13 @@ def moved(x, u):
 def along(observation, *, transition=moved, states=None, sizes=(1.0, 1.0), noise=(1.0,), steps=2):
     states = np.zeros((5, 2)) if states is None else states
     return observability_along(
-        transition, observation, states, np.zeros((len(states), 1)), sizes=np.array(sizes), noise=np.array(noise), steps=steps
+        transition,
+        observation,
+        states,
+        np.zeros((len(states), 1)),
+        sizes=np.array(sizes),
+        noise=np.array(noise),
+        steps=steps,
     )
 
 
@@ -27,13 +33,18 @@ def test_singular_values_of_a_linear_model_in_closed_form_with_units_and_blindne
     seen = along(lambda x, u: x[:1])
     np.testing.assert_allclose(seen.smallest, np.sqrt((2 + STEP**2 - root) / 2), rtol=1e-12)
     # two positions with noise 1: the first is known to 1, their difference over τ to √2/τ
-    np.testing.assert_allclose(seen.deviation, np.tile([1.0, np.sqrt(2) / STEP], (4, 1)), rtol=1e-12)
+    np.testing.assert_allclose(
+        seen.deviation, np.tile([1.0, np.sqrt(2) / STEP], (4, 1)), rtol=1e-12
+    )
     blind = along(lambda x, u: x[1:])
     assert (blind.smallest == 0.0).all()
     assert (blind.rank == 1).all()
     assert np.isinf(blind.deviation[:, 0]).all()
     np.testing.assert_allclose(blind.deviation[:, 1], np.sqrt(0.5))
-    plain, scaled = along(lambda x, u: x[:1]), along(lambda x, u: x[:1], sizes=(2.0, 2.0), noise=(0.5,))
+    plain, scaled = (
+        along(lambda x, u: x[:1]),
+        along(lambda x, u: x[:1], sizes=(2.0, 2.0), noise=(0.5,)),
+    )
     np.testing.assert_allclose(scaled.smallest, 4.0 * plain.smallest)
     np.testing.assert_allclose(scaled.deviation, plain.deviation / 4.0)
 

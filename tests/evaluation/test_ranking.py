@@ -35,7 +35,9 @@ def scored(error, vy_ref=None):
 
 
 def coloured(generator, n, memory=0.95):
-    return signal.lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(n + 400))[400:]
+    return signal.lfilter(
+        [np.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(n + 400)
+    )[400:]
 
 
 def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
@@ -46,9 +48,16 @@ def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
     n = segments.samples.sum()
     assert n == 425
     assert list(segments.piece) == [0.0] * 17 + [1.0] * 5
-    assert np.sqrt(segments.squared_error_vy.sum() / n) == pytest.approx(figures["rmse_vy"], rel=1e-12)
-    assert np.sqrt(segments.squared_error_sideslip.sum() / n) == pytest.approx(figures["rmse_sideslip"], rel=1e-12)
-    sums = [getattr(segments, name) for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref", "samples")]
+    assert np.sqrt(segments.squared_error_vy.sum() / n) == pytest.approx(
+        figures["rmse_vy"], rel=1e-12
+    )
+    assert np.sqrt(segments.squared_error_sideslip.sum() / n) == pytest.approx(
+        figures["rmse_sideslip"], rel=1e-12
+    )
+    sums = [
+        getattr(segments, name)
+        for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref", "samples")
+    ]
     assert unexplained_interval(*sums).value == pytest.approx(figures["fvu"], rel=1e-9)
     write_segments(tmp_path / "blocks.csv", {"test": segments})
     back = read_segments(tmp_path / "blocks.csv")["test"]
@@ -64,14 +73,18 @@ def test_block_length_is_that_of_another_library(memory):
     expected = float(optimal_block_length(values)["circular"].iloc[0])
     covariances = _pooled_covariances([values])
     window = _window(covariances, 900)
-    assert _length(covariances, min(window + 2, len(covariances) - 1), 900) == pytest.approx(expected, rel=1e-9)
+    assert _length(covariances, min(window + 2, len(covariances) - 1), 900) == pytest.approx(
+        expected, rel=1e-9
+    )
     assert politis_white_length([values]) == _length(covariances, window, 900)
 
 
 def test_many_ranges_are_blocks_few_are_cut_and_equal_values_are_blocks_of_their_own():
     generator = np.random.default_rng(1)
     many = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
-    assert list(block_labels(many, many.squared_error_vy[None])) == [label for label in range(9) for _ in range(5)]
+    assert list(block_labels(many, many.squared_error_vy[None])) == [
+        label for label in range(9) for _ in range(5)
+    ]
     few = segments_of([scored(coloured(generator, 4000)) for _ in range(2)], RATE)
     labels = block_labels(few, few.squared_error_vy[None])
     assert 2 < labels.max() + 1 < 400
@@ -86,7 +99,11 @@ def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
     for _ in range(200):
         segments = segments_of([scored(coloured(generator, 6000, memory))], RATE)
         labels = block_labels(segments, segments.squared_error_vy[None])
-        found = root_interval(block_sums(segments.squared_error_vy[None], labels), block_sums(segments.samples, labels), n_resamples=400)
+        found = root_interval(
+            block_sums(segments.squared_error_vy[None], labels),
+            block_sums(segments.samples, labels),
+            n_resamples=400,
+        )
         covered.append(found.low <= 1.0 <= found.high)
     assert 0.90 <= np.mean(covered) <= 0.99
 
@@ -101,13 +118,18 @@ def candidates(generator, **levels):
     """Three seeds each with errors of these sizes, partly common, over one drive of 300 s."""
     common = coloured(generator, 6000)
     return {
-        (name, name): [segments_of([scored(level * (0.6 * common + 0.8 * coloured(generator, 6000)))], RATE) for _ in range(3)]
+        (name, name): [
+            segments_of([scored(level * (0.6 * common + 0.8 * coloured(generator, 6000)))], RATE)
+            for _ in range(3)
+        ]
         for name, level in levels.items()
     }
 
 
 def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
-    found = rank(candidates(np.random.default_rng(3), good=0.1, other=0.3, zero=2.0, static_map=1.0), RATE)
+    found = rank(
+        candidates(np.random.default_rng(3), good=0.1, other=0.3, zero=2.0, static_map=1.0), RATE
+    )
     assert found.winner == ("good", "good")
     assert found.order[0] == ("good", "good")
     assert found.beats(("other", "other"), "zero")
@@ -126,7 +148,10 @@ def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
     without = rank(candidates(np.random.default_rng(5), a=0.1, b=3.0, zero=5.0), RATE)
     assert without.winner is None
     assert without.missing_baselines == ["static_map"]
-    short = {name: [segments_of([scored(0.1 * np.ones(40))], RATE)] for name in (("a", "a"), ("zero", "zero"))}
+    short = {
+        name: [segments_of([scored(0.1 * np.ones(40))], RATE)]
+        for name in (("a", "a"), ("zero", "zero"))
+    }
     found = rank(short, RATE)
     assert found.n_blocks < 3
     assert found.winner is None

@@ -22,12 +22,21 @@ def stepped_drive():
     time = np.arange(600) / RATE
     ay = np.interp(time, [0, 10, 11.2, 20, 21.5, 30], [0, 0, 3, 3, 7, 7])
     vy = 0.1 * np.sin(time)
-    return Recording("steps", "car", RATE, 0.0, {"vx": np.full(600, 20.0), "yaw_rate": ay / 20.0, "ay": ay, "vy_ref": vy}, "simulated")
+    return Recording(
+        "steps",
+        "car",
+        RATE,
+        0.0,
+        {"vx": np.full(600, 20.0), "yaw_rate": ay / 20.0, "ay": ay, "vy_ref": vy},
+        "simulated",
+    )
 
 
 def estimate_with(recording, error):
     vy = recording["vy_ref"] + error
-    return Estimate(recording.id, "test", RATE, 0.0, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
+    return Estimate(
+        recording.id, "test", RATE, 0.0, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])}
+    )
 
 
 def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
@@ -92,7 +101,10 @@ def test_evaluation_writes_regimes_as_subsets_and_prints_figures_of_all_samples_
     printed = json.loads(out)
     with open(Path(printed["folder"]) / "metrics.csv", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["test_set"] == "test"]
-    by_subset = {subset: {row["metric"]: float(row["value"]) for row in rows if row["subset"] == subset} for subset in ("all", "turning")}
+    by_subset = {
+        subset: {row["metric"]: float(row["value"]) for row in rows if row["subset"] == subset}
+        for subset in ("all", "turning")
+    }
     assert printed["rmse_sideslip.test"] == by_subset["all"]["rmse_sideslip"]
     assert set(by_subset["turning"]) == {"rmse_vy", "rmse_sideslip", "share"}
     assert {"floor_reference", "floor_cramer_rao"} <= set(by_subset["all"])

@@ -14,13 +14,27 @@ from vehest.data.store import read_estimate
 from vehest.evaluation.metrics import Protocol, reference_state, sequences
 from vehest.run.evaluate import protocol_from_config
 
-PAPER = {"rate_hz": 100, "warm_up_seconds": 0, "skip_seconds": 2, "sequence_seconds": 10, "initial_state": True}
-GIVEN = ["estimator=kalman", "estimator.noise.yaw_rate=0.01", "estimator.noise.ay=0.5", "estimator.noise.steer=0.01"]
+PAPER = {
+    "rate_hz": 100,
+    "warm_up_seconds": 0,
+    "skip_seconds": 2,
+    "sequence_seconds": 10,
+    "initial_state": True,
+}
+GIVEN = [
+    "estimator=kalman",
+    "estimator.noise.yaw_rate=0.01",
+    "estimator.noise.ay=0.5",
+    "estimator.noise.steer=0.01",
+]
 
 
 def recording(seconds, start_time=100.0):
     time = np.arange(round(100.0 * seconds)) / 100.0
-    channels = {name: np.sin(time + shift) for shift, name in enumerate(("vx_ref", "vy_ref", "yaw_rate_ref"))}
+    channels = {
+        name: np.sin(time + shift)
+        for shift, name in enumerate(("vx_ref", "vy_ref", "yaw_rate_ref"))
+    }
     return Recording("r", "car", 100.0, start_time, channels)
 
 
@@ -28,13 +42,22 @@ def test_ranges_are_cut_from_their_starts_where_the_reference_state_is_taken_and
     own = recording(35.0)
     spans = [Span("d", "r"), Span("d", "r", 103.0, 114.0), Span("d", "r", 100.0, 105.0)]
     pieces = sequences(spans, lambda span: own, Protocol(sequence_seconds=10.0, rate_hz=100.0))
-    assert [(piece.start, piece.stop) for piece in pieces] == [(100.0, 110.0), (110.0, 120.0), (120.0, 130.0), (103.0, 113.0)]
+    assert [(piece.start, piece.stop) for piece in pieces] == [
+        (100.0, 110.0),
+        (110.0, 120.0),
+        (120.0, 130.0),
+        (103.0, 113.0),
+    ]
     assert {len(own.cut(piece.start, piece.stop)) for piece in pieces} == {1000}
     with pytest.raises(DataError, match="lasts as long as a sequence of 10 s"):
         sequences(spans[2:], lambda span: own, Protocol(sequence_seconds=10.0, rate_hz=100.0))
     own = recording(5.0)
     state = reference_state(own, Span("d", "r", 101.0, 103.0))
-    assert state == {"vx": own["vx_ref"][100], "vy": own["vy_ref"][100], "yaw_rate": own["yaw_rate_ref"][100]}
+    assert state == {
+        "vx": own["vx_ref"][100],
+        "vy": own["vy_ref"][100],
+        "yaw_rate": own["yaw_rate_ref"][100],
+    }
     with pytest.raises(DataError, match="recording 'r' has no 'yaw_rate_ref' at 100 s"):
         reference_state(own.select(["vx_ref", "vy_ref"]), Span("d", "r"))
 
@@ -58,7 +81,13 @@ def steered(place):
     """A split with tests only: one range of 30 s and one of 13 s."""
     place.add_steered()
     ranges = [{"recording": "second"}, {"recording": "first", "start": 5, "stop": 18}]
-    split = {"name": "whole", "dataset": "steered", "train": [], "validation": [], "tests": {"test": ranges}}
+    split = {
+        "name": "whole",
+        "dataset": "steered",
+        "train": [],
+        "validation": [],
+        "tests": {"test": ranges},
+    }
     (Path("conf") / "split" / "whole.yaml").write_text(yaml.safe_dump(split))
     return place
 
@@ -66,7 +95,9 @@ def steered(place):
 def test_each_sequence_is_estimated_anew_from_its_true_state(steered):
     arguments = [*GIVEN, "split=whole", "tracking=none"]
     assert steered("train", *arguments)[0] == 0
-    code, _, err = steered("eval", *arguments, *(f"evaluation.{key}={value}" for key, value in PAPER.items()))
+    code, _, err = steered(
+        "eval", *arguments, *(f"evaluation.{key}={value}" for key, value in PAPER.items())
+    )
     assert code == 0, err
     (metrics,) = Path("outputs").rglob("evaluate/*/metrics.csv")
     with open(metrics, encoding="utf-8") as stream:
@@ -74,7 +105,16 @@ def test_each_sequence_is_estimated_anew_from_its_true_state(steered):
     assert figures["n_sequences"] == 4
     assert {"rmse_yaw_rate", "nees", "nis", "coverage_1sigma", "coverage_2sigma"} <= set(figures)
     assert not {"rmse_vx", "mse_weighted"} & set(figures), "the filter takes vx as measured"
-    estimates = [read_estimate(metrics.parent / "test" / f"{position}.parquet") for position in range(4)]
-    assert [(len(own), own.start_time) for own in estimates] == [(1000, 0.0), (1000, 10.0), (1000, 20.0), (1000, 5.0)]
+    estimates = [
+        read_estimate(metrics.parent / "test" / f"{position}.parquet") for position in range(4)
+    ]
+    assert [(len(own), own.start_time) for own in estimates] == [
+        (1000, 0.0),
+        (1000, 10.0),
+        (1000, 20.0),
+        (1000, 5.0),
+    ]
     for own in estimates:
-        assert np.sqrt(own.covariance[0].diagonal()).max() < 1e-3, "the state was known at the first sample"
+        assert np.sqrt(own.covariance[0].diagonal()).max() < 1e-3, (
+            "the state was known at the first sample"
+        )

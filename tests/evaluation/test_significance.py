@@ -26,7 +26,9 @@ def losses(generator, n_seeds, seed_level=0.0, own_noise=False):
 
 
 def compared(first, second, block_seconds=None, n_resamples=400):
-    return paired_difference(first, second, LABELS, rate_hz=100.0, block_seconds=block_seconds, n_resamples=n_resamples)
+    return paired_difference(
+        first, second, LABELS, rate_hz=100.0, block_seconds=block_seconds, n_resamples=n_resamples
+    )
 
 
 @pytest.mark.parametrize(("n_seeds", "seed_level"), [((1, 1), 0.0), ((3, 3), 0.5), ((3, 5), 1.5)])
@@ -51,19 +53,26 @@ def test_a_shift_is_found_although_sequences_differ_more_and_one_lucky_training_
     first, second = losses(generator, 3) * 0.01, losses(generator, 1) * 0.01
     first[0] -= 1.0
     assert compared(first, second).mean.p_value > 0.2
-    assert compared(first[:1], second).mean.p_value < 0.01, "but one training alone is as good as it is"
+    assert compared(first[:1], second).mean.p_value < 0.01, (
+        "but one training alone is as good as it is"
+    )
 
 
 def test_one_seed_and_white_noise_are_a_paired_t_test():
     generator = np.random.default_rng(3)
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
-    result = paired_difference(first, second, sequence_labels([60]), rate_hz=1.0, block_seconds=1.0, n_resamples=40_000)
+    result = paired_difference(
+        first, second, sequence_labels([60]), rate_hz=1.0, block_seconds=1.0, n_resamples=40_000
+    )
     known = stats.ttest_rel(first[0], second[0])
     low, high = known.confidence_interval()
     assert result.root.dof == pytest.approx(59.0)
     assert result.mean.value == pytest.approx(first.mean() - second.mean())
-    assert (result.mean.low, result.mean.high) == (pytest.approx(low, abs=0.01), pytest.approx(high, abs=0.01))
+    assert (result.mean.low, result.mean.high) == (
+        pytest.approx(low, abs=0.01),
+        pytest.approx(high, abs=0.01),
+    )
     assert result.mean.p_value == pytest.approx(known.pvalue, rel=0.1)
 
 
@@ -72,7 +81,9 @@ def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ():
     result = paired_difference(same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2)
     assert result.mean.dof == 2 + 4 - 1
     assert (result.mean.value, result.mean.p_value) == (0.0, 1.0)
-    assert result == paired_difference(same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2)
+    assert result == paired_difference(
+        same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,7 +105,9 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
     sizes = generator.uniform(20.0, 40.0, 12)
     sums = [sizes * generator.gamma(2.0, 1.0, (seeds, 12)) for seeds in (3, 3, 1, 2)]
     pairs = [(sums[0], other) for other in (*sums[1:], 1.1 * sums[0])]
-    assert differences_of_blocks(pairs, sizes, n_resamples=400) == [difference_of_blocks(*pair, sizes, n_resamples=400) for pair in pairs]
+    assert differences_of_blocks(pairs, sizes, n_resamples=400) == [
+        difference_of_blocks(*pair, sizes, n_resamples=400) for pair in pairs
+    ]
     assert root_intervals(sums, sizes) == [root_interval(own, sizes) for own in sums]
 
 
@@ -104,9 +117,15 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides
     seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]
     assert _degrees_of_freedom([even, even], sizes, seeds) == pytest.approx(4.0)
     blocks = np.tile(np.tile([-1.0, 1.0], 20), (3, 1))
-    assert _degrees_of_freedom([blocks, even], sizes, [np.zeros(3), np.zeros(3)]) == pytest.approx(39.0)
+    assert _degrees_of_freedom([blocks, even], sizes, [np.zeros(3), np.zeros(3)]) == pytest.approx(
+        39.0
+    )
     generator = np.random.default_rng(1)
     sizes, own, other = generator.uniform(0.5, 1.5, 40), *generator.standard_normal((2, 40))
     a, b = float(np.var((own - other) / sizes.mean(), ddof=1)) / 40.0, 1.0 / 3.0
-    found = _degrees_of_freedom([np.tile(2.0 * sizes + own, (3, 1)), np.tile(other, (3, 1))], sizes, [seeds[0] + 2.0, seeds[1]])
+    found = _degrees_of_freedom(
+        [np.tile(2.0 * sizes + own, (3, 1)), np.tile(other, (3, 1))],
+        sizes,
+        [seeds[0] + 2.0, seeds[1]],
+    )
     assert found == pytest.approx((a + 2.0 * b) ** 2 / (a**2 / 39.0 + 2.0 * b**2 / 2.0))

@@ -7,7 +7,13 @@ import pytest
 from refusals import refusal
 
 from conftest import planar_drive
-from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest_papers.kit.spectra import (
+    decibels,
+    lateral_velocity_rate,
+    mean_bias,
+    periodogram,
+    process_noise,
+)
 
 RATE = 20.0
 
@@ -16,7 +22,9 @@ def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_
     """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
     own = periodogram([noise], RATE)
-    assert own.density[1:-1].mean() == pytest.approx(0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * own.n_segments))
+    assert own.density[1:-1].mean() == pytest.approx(
+        0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * own.n_segments)
+    )
     # Parseval: for noise of any colour, up to what the segments' ends weigh.
     noise = np.random.default_rng(1).standard_normal(80_000)
     coloured = np.convolve(noise, np.ones(6) / 6, mode="valid")
@@ -34,14 +42,20 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
     apart = [periodogram([samples], RATE) for samples in (long, short)]
     together = periodogram([long, short], RATE)
     assert [own.n_segments for own in (*apart, together)] == [7, 1, 8]
-    np.testing.assert_allclose(together.density, (7 * apart[0].density + apart[1].density) / 8, rtol=1e-12)
+    np.testing.assert_allclose(
+        together.density, (7 * apart[0].density + apart[1].density) / 8, rtol=1e-12
+    )
 
 
 def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
     hz, time = 1.0, drive.time
     waving = replace(drive, channels={**drive.channels, "vy_ref": np.sin(2 * np.pi * hz * time)})
     shrunk = np.sin(2 * np.pi * hz / RATE) / (2 * np.pi * hz / RATE)
-    np.testing.assert_allclose(lateral_velocity_rate(waving), shrunk * 2 * np.pi * hz * np.cos(2 * np.pi * hz * time[1:-1]), atol=1e-9)
+    np.testing.assert_allclose(
+        lateral_velocity_rate(waving),
+        shrunk * 2 * np.pi * hz * np.cos(2 * np.pi * hz * time[1:-1]),
+        atol=1e-9,
+    )
     assert shrunk == pytest.approx(0.98, abs=0.005)
     # The central difference of a drive that obeys the kinematics errs by a sixth of the third derivative, 3e-4 m/s² here.
     drive = planar_drive()
@@ -58,10 +72,16 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
 
 def test_level_is_the_mean_of_a_third_of_an_octave_and_what_cannot_be_read_is_refused():
     own = periodogram([np.random.default_rng(4).standard_normal(2048)], RATE)
-    inside = [density for hz, density in zip(own.frequency, own.density, strict=True) if 0.8909 <= hz <= 1.1225]
+    inside = [
+        density
+        for hz, density in zip(own.frequency, own.density, strict=True)
+        if 0.8909 <= hz <= 1.1225
+    ]
     assert own.level(1.0) == pytest.approx(np.mean(inside))
     assert decibels(10.0 * own.level(1.0), own.level(1.0)) == pytest.approx(10.0)
     assert "has no line at 15 Hz" in refusal(lambda: own.level(15.0))
-    assert "series 1 lasts 25.0 s" in refusal(lambda: periodogram([np.zeros(600), np.zeros(500)], RATE))
+    assert "series 1 lasts 25.0 s" in refusal(
+        lambda: periodogram([np.zeros(600), np.zeros(500)], RATE)
+    )
     assert "series 0 has gaps" in refusal(lambda: periodogram([np.full(600, np.nan)], RATE))
     assert "at least one" in refusal(lambda: periodogram([], RATE))

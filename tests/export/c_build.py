@@ -80,7 +80,17 @@ def built(estimator, precision, folder, compiler="gcc"):
     write(method_files(estimator, precision) | {"replay.c": REPLAY}, folder)
     flags = [*FLAGS, *(["-Wdouble-promotion"] if precision == "float" else [])]
     library = folder / f"{compiler}.so"
-    command = [compiler, *flags, "-fPIC", "-shared", "vehest_method.c", "replay.c", "-lm", "-o", str(library)]
+    command = [
+        compiler,
+        *flags,
+        "-fPIC",
+        "-shared",
+        "vehest_method.c",
+        "replay.c",
+        "-lm",
+        "-o",
+        str(library),
+    ]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return Library(ctypes.CDLL(str(library)), precision)

@@ -23,7 +23,15 @@ from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
 
 FAMILIES = exportable()
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-ffp-contract=off"]
+STRICT = [
+    "-std=c99",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-pedantic",
+    "-Wconversion",
+    "-ffp-contract=off",
+]
 WEIGHTS = {"variance": 1.2, "one": 0.01, "vx": 1e-5, "ay": 0.001, "vy": 0.02, "yaw_rate_vx": 0.001}
 LARGEST = {"vx": 20.0, "ax": 3.0, "ay": 5.0, "yaw_rate_vx": 5.0, "steer_vx": 1.0, "vy": 0.5}
 SECONDS = 120.0  # after which a program is taken to hang
@@ -55,7 +63,13 @@ def drive(estimator, seed, seconds=40.0):
     else:
         own = planar_drive(seconds, rate, seed=seed, noise=0.02)
     generator = np.random.default_rng(seed)
-    return replace(own, channels={name: values + 1e-3 * generator.standard_normal(len(own)) for name, values in own.channels.items()})
+    return replace(
+        own,
+        channels={
+            name: values + 1e-3 * generator.standard_normal(len(own))
+            for name, values in own.channels.items()
+        },
+    )
 
 
 @cache
@@ -65,7 +79,9 @@ def trust(name):
     drives, rate = [drive(estimator, seed) for seed in (1, 2)], estimator.settings.rate_hz
     own = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
     about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
-    bands = Bands(*about, estimator.channels, estimator.horizon_steps, LARGEST, own, replace(own, floor=0.001))
+    bands = Bands(
+        *about, estimator.channels, estimator.horizon_steps, LARGEST, own, replace(own, floor=0.001)
+    )
     health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
 
@@ -74,13 +90,27 @@ def faulted(estimator, rate_hz, seconds=30.0, seed=0):
     """A drive with a fault of any kind in any channel every few seconds, at a rate."""
     plain, generator = drive(estimator, seed + 3, seconds), np.random.default_rng(seed)
     times = np.arange(0.0, seconds - 0.1, 1.0 / rate_hz)
-    samples = {name: np.interp(times, np.arange(len(plain)) / plain.rate_hz, plain[name]) for name in estimator.channels}
+    samples = {
+        name: np.interp(times, np.arange(len(plain)) / plain.rate_hz, plain[name])
+        for name in estimator.channels
+    }
     at, number = 2.0, 0
     while at < seconds - 2.0:
         channel = str(generator.choice(estimator.channels))
         kind = str(generator.choice([kind for kind in KINDS if applies(kind, channel)]))
-        fault = Fault(kind, channel, SEVERITIES[generator.integers(3)], at, generator.uniform(0.2, 1.5), number)
-        samples, at, number = inject(samples, rate_hz, fault), at + generator.uniform(0.8, 3.0), number + 1
+        fault = Fault(
+            kind,
+            channel,
+            SEVERITIES[generator.integers(3)],
+            at,
+            generator.uniform(0.2, 1.5),
+            number,
+        )
+        samples, at, number = (
+            inject(samples, rate_hz, fault),
+            at + generator.uniform(0.8, 3.0),
+            number + 1,
+        )
     return samples
 
 
@@ -95,7 +125,9 @@ class Export:
     trusted: bool = True
 
     def stepper(self):
-        return GuardedStepper(model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz)
+        return GuardedStepper(
+            model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz
+        )
 
     def write(self):
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -111,8 +143,12 @@ class Export:
             times = np.full(len(next(iter(samples.values()))), np.nan)
         else:
             times, samples = drive_for(stepper)
-        (self.folder / "in.csv").write_text(table_text(("time", *samples), np.column_stack([times, *samples.values()])))
-        (self.folder / "expected.csv").write_text(table_text(COLUMNS, replayed(stepper, times, samples)))
+        (self.folder / "in.csv").write_text(
+            table_text(("time", *samples), np.column_stack([times, *samples.values()]))
+        )
+        (self.folder / "expected.csv").write_text(
+            table_text(COLUMNS, replayed(stepper, times, samples))
+        )
 
     @property
     def sources(self):
@@ -120,7 +156,9 @@ class Export:
 
     def build(self, compiler, *options, main="main.c", out="main"):
         flags = [*STRICT, *(["-Wdouble-promotion"] if self.precision == "float" else [])]
-        command([tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder)
+        command(
+            [tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder
+        )
         return self.folder / out
 
     def agreement(self, *, faults=False):
@@ -136,7 +174,10 @@ class Export:
 
     def compared(self):
         """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
-        own, wanted = (np.genfromtxt(self.folder / name, delimiter=",", skip_header=1) for name in ("out.csv", "expected.csv"))
+        own, wanted = (
+            np.genfromtxt(self.folder / name, delimiter=",", skip_header=1)
+            for name in ("out.csv", "expected.csv")
+        )
         # an offset and a scale of one lone channel are the same to the last digits
         judged = slice(4, None if self.precision == "double" else 5)
         same = (own[:, judged] == wanted[:, judged]).all(1)
@@ -146,6 +187,8 @@ class Export:
 
 def command(words, folder, seconds=SECONDS):
     """Run a program that has to succeed; what it said."""
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False)
+    done = subprocess.run(
+        words, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False
+    )
     assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout}{done.stderr}"
     return done.stdout + done.stderr

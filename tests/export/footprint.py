@@ -32,7 +32,11 @@ class Target:
 
 
 HOST = Target("this machine")
-CORTEX_M4F = Target("Cortex-M4F", "arm-none-eabi-", ("-O2", "-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"))
+CORTEX_M4F = Target(
+    "Cortex-M4F",
+    "arm-none-eabi-",
+    ("-O2", "-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
+)
 TARGETS = (HOST, CORTEX_M4F)
 
 
@@ -59,7 +63,9 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
         sources = [name for name in files if name.endswith(".c") and name != "main.c"]
         for name in (*sources, *(name for name in files if name.endswith(".h"))):
             (folder / name).write_text(files[name], encoding="utf-8")
-        (folder / "probe.c").write_text('#include "vehest_estimator.h"\nchar probe[sizeof(vehest_state)];\n', encoding="utf-8")
+        (folder / "probe.c").write_text(
+            '#include "vehest_estimator.h"\nchar probe[sizeof(vehest_state)];\n', encoding="utf-8"
+        )
         try:
             options = [*STRICT, *target.options, "-fcallgraph-info=su"]
             _run([target.compiler, *options, "-c", *sources, "probe.c"], folder)
@@ -69,14 +75,20 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
             symbols = _run([f"{target.prefix}nm", "-S", "probe.o"], folder)
         except (OSError, subprocess.SubprocessError):
             return None
-        graphs = [(folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources]
+        graphs = [
+            (folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources
+        ]
     stack, library = worst_stack(graphs, ENTRIES)
-    state = int(next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16)
+    state = int(
+        next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16
+    )
     return Footprint(target.title, version, state, *sections, stack, library)
 
 
 def _run(command: list[str], folder: Path) -> str:
-    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS).stdout
+    return subprocess.run(
+        command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS
+    ).stdout
 
 
 def _sections(said: str) -> tuple[int, int, int]:
@@ -113,4 +125,6 @@ def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tup
         return own.get(function, 0) + max(below, default=0)
 
     stack = max(deepest(entry, ()) for entry in entries)
-    return stack, tuple(sorted(name for name in known - own.keys() if not name.startswith("__indirect")))
+    return stack, tuple(
+        sorted(name for name in known - own.keys() if not name.startswith("__indirect"))
+    )

@@ -53,20 +53,38 @@ def trust_by_hand():
         standstill=(2.0, 0.05, 0.5),
         spin=(0.8, 12.0),
         speeds=(5.0, 10.0, 20.0, 30.0, 40.0),
-        levels=((0.5, 0.5, 0.5), (0.8, 0.8, 0.8), (1.0, 1.0, 1.0), (1.2, 1.2, 1.2), (1.5, 1.5, 1.5)),
+        levels=(
+            (0.5, 0.5, 0.5),
+            (0.8, 0.8, 0.8),
+            (1.0, 1.0, 1.0),
+            (1.2, 1.2, 1.2),
+            (1.5, 1.5, 1.5),
+        ),
         healthy=((0.01, 0.0, 0.02),),
         heaviest=((10.0, 20.0, 30.0),),
         limits=tuple(4.0 + 0.25 * number for number in range(22)),
     )
-    own = {name: ChannelLimits(-size, size, size / 4.0, 0.5) for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)}
-    v, angle = (Quantity(WEIGHTS, floor, (0.5, 1.0, 1.75, 2.5), (False,) * 4, 10.0) for floor in (0.02, 0.001))
-    bands = Bands(("car",), ("set",), ("a",), ("b",), "range", 10, 100.0, channels, 0, LARGEST, v, angle)
+    own = {
+        name: ChannelLimits(-size, size, size / 4.0, 0.5)
+        for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)
+    }
+    v, angle = (
+        Quantity(WEIGHTS, floor, (0.5, 1.0, 1.75, 2.5), (False,) * 4, 10.0)
+        for floor in (0.02, 0.001)
+    )
+    bands = Bands(
+        ("car",), ("set",), ("a",), ("b",), "range", 10, 100.0, channels, 0, LARGEST, v, angle
+    )
     return Trust(About("kinematic"), bands, GuardLimits(own, 120.0, 1.0), health)
 
 
 def methods(families):
     """Name of a file -> the C of a family's method."""
-    return {f"{name}/{file}": text for name in families for file, text in method_files(by_hand(name), "double").items()}
+    return {
+        f"{name}/{file}": text
+        for name in families
+        for file, text in method_files(by_hand(name), "double").items()
+    }
 
 
 def contract():
@@ -99,7 +117,9 @@ def differences(text, golden):
 def _alike(own, other):
     if NUMBER.sub("#", own) != NUMBER.sub("#", other):
         return False
-    numbers = [[float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)]
+    numbers = [
+        [float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)
+    ]
     return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
 
 

@@ -25,7 +25,9 @@ _ROW = re.compile(r"^\| (\d+\.\d+) \| (\d+) \|", re.MULTILINE)
 
 
 def version():
-    return subprocess.run(["cppcheck", "--version"], capture_output=True, text=True, check=True).stdout.strip()
+    return subprocess.run(
+        ["cppcheck", "--version"], capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 def found(home):
@@ -34,10 +36,22 @@ def found(home):
     rules = Counter()
     others = []
     for folder in sorted(home.iterdir()):
-        words = ["cppcheck", "--std=c99", "--enable=warning,portability", "--addon=misra", "--quiet"]
+        words = [
+            "cppcheck",
+            "--std=c99",
+            "--enable=warning,portability",
+            "--addon=misra",
+            "--quiet",
+        ]
         words += ["--template={id} {file}:{line} {message}"]
-        words += ["--suppress=missingIncludeSystem", f"-I{home / 'kinematic'}", *(str(path) for path in sorted(folder.glob("vehest_*.c")))]
-        said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=600.0).stderr
+        words += [
+            "--suppress=missingIncludeSystem",
+            f"-I{home / 'kinematic'}",
+            *(str(path) for path in sorted(folder.glob("vehest_*.c"))),
+        ]
+        said = subprocess.run(
+            words, capture_output=True, text=True, check=True, timeout=600.0
+        ).stderr
         for line in said.splitlines():
             kind, _, rest = line.partition(" ")
             if kind.startswith("misra-c2012-"):
@@ -55,7 +69,9 @@ def documented(text):
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as home:
         rules, others = found(Path(home))
-    for rule, count in sorted(rules.items(), key=lambda own: [int(part) for part in own[0].split(".")]):
+    for rule, count in sorted(
+        rules.items(), key=lambda own: [int(part) for part in own[0].split(".")]
+    ):
         print(f"| {rule} | {count} |")
     for line in others:
         print(line, file=sys.stderr)

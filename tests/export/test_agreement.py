@@ -8,7 +8,9 @@ from vehest.export.program import TOLERANCES
 
 pytestmark = pytest.mark.export
 
-NOT_IN_FLOAT = ("learned_ukf",)  # its drive has a motor speed that follows vx to more digits than a float has: health sees rounding
+NOT_IN_FLOAT = (
+    "learned_ukf",
+)  # its drive has a motor speed that follows vx to more digits than a float has: health sees rounding
 IN_FAULTS = 1e-7  # of bands beside faults: Python's own covariances lose digits there, which square roots in C keep
 
 
@@ -48,7 +50,9 @@ def test_a_model_that_was_never_calibrated_has_the_limits_of_any_car_and_no_band
     assert np.isnan(np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)[:, 2:4]).all()
 
 
-def test_samples_that_a_clock_shows_to_be_missing_are_those_that_vehest_missing_stands_for(tmp_path):
+def test_samples_that_a_clock_shows_to_be_missing_are_those_that_vehest_missing_stands_for(
+    tmp_path,
+):
     export = Export("kalman", "double", tmp_path).write()
     export.build("gcc", "-O2")
     export.vectors()
@@ -56,7 +60,11 @@ def test_samples_that_a_clock_shows_to_be_missing_are_those_that_vehest_missing_
     (tmp_path / "in.csv").write_text("\n".join([rows[0], *rows[1:200], *rows[210:400]]) + "\n")
     command(["./main", "in.csv", "jumped.csv"], tmp_path)
     gap = [line.split(",")[0] + ",nan" * (len(line.split(",")) - 1) for line in rows[200:210]]
-    (tmp_path / "in.csv").write_text("\n".join([rows[0], *rows[1:200], *gap, *rows[210:400]]) + "\n")
+    (tmp_path / "in.csv").write_text(
+        "\n".join([rows[0], *rows[1:200], *gap, *rows[210:400]]) + "\n"
+    )
     command(["./main", "in.csv", "filled.csv"], tmp_path)
-    jumped, filled = ((tmp_path / name).read_text().splitlines() for name in ("jumped.csv", "filled.csv"))
+    jumped, filled = (
+        (tmp_path / name).read_text().splitlines() for name in ("jumped.csv", "filled.csv")
+    )
     assert jumped[:200] + jumped[200:] == filled[:200] + filled[210:]

@@ -38,17 +38,25 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
     export_model(model("zero"), None, out)
     assert not (out / "vehest_health.c").exists()
     (out / "mine.c").write_text("")
-    assert "holds 'mine.c', which is no part of an export" in refusal(lambda: export_model(model("zero"), None, out), ConfigurationError)
+    assert "holds 'mine.c', which is no part of an export" in refusal(
+        lambda: export_model(model("zero"), None, out), ConfigurationError
+    )
     other = tmp_path / "project"
     other.mkdir()
     (other / "main.c").write_text("int main(void) { return 0; }")
-    assert "holds 'main.c'" in refusal(lambda: export_model(model("zero"), None, other), ConfigurationError)
+    assert "holds 'main.c'" in refusal(
+        lambda: export_model(model("zero"), None, other), ConfigurationError
+    )
     assert [path.name for path in other.iterdir()] == ["main.c"]
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"precision": "half"}, "double or float"), ({"bus_rate_hz": 10.0}, "too slow"), ({"bus_rate_hz": float("nan")}, "too slow")],
+    [
+        ({"precision": "half"}, "double or float"),
+        ({"bus_rate_hz": 10.0}, "too slow"),
+        ({"bus_rate_hz": float("nan")}, "too slow"),
+    ],
 )
 def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, words):
     with pytest.raises(ConfigurationError, match=words):
@@ -59,10 +67,14 @@ def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, w
 def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(tmp_path):
     own = trust("kalman")
     health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
-    with pytest.raises(ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"):
+    with pytest.raises(
+        ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"
+    ):
         export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
-    assert "cannot be exported" in refusal(lambda: export_model(fitted("factor_graph"), None, tmp_path / "c"), ConfigurationError)
+    assert "cannot be exported" in refusal(
+        lambda: export_model(fitted("factor_graph"), None, tmp_path / "c"), ConfigurationError
+    )
 
 
 def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path):
@@ -70,13 +82,34 @@ def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path
     folder.mkdir()
     save_model(model("kinematic"), folder)
     write_trust(trust("kinematic"), folder)
-    words = [sys.executable, "-m", "vehest", "export", str(folder), "-o", str(tmp_path / "c"), "--precision", "float", "--bus-rate", "500"]
-    done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "VEHEST_OUTPUT": str(tmp_path)}, check=False)
+    words = [
+        sys.executable,
+        "-m",
+        "vehest",
+        "export",
+        str(folder),
+        "-o",
+        str(tmp_path / "c"),
+        "--precision",
+        "float",
+        "--bus-rate",
+        "500",
+    ]
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "VEHEST_OUTPUT": str(tmp_path)},
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert f"out: {tmp_path / 'c'}" in done.stdout
     again = subprocess.run([*words[:-1], "1"], capture_output=True, text=True, check=False)
     assert again.returncode == 2
-    assert again.stderr == "error: samples at 1 Hz are too slow for an estimator that works at 100 Hz\n"
+    assert (
+        again.stderr
+        == "error: samples at 1 Hz are too slow for an estimator that works at 100 Hz\n"
+    )
 
 
 def test_every_file_of_the_patented_method_says_so(tmp_path):

@@ -15,7 +15,9 @@ def test_the_c_of_models_set_by_hand_is_that_of_the_golden_files():
     found = sources()
     for name, text in found.items():
         changed = differences(text, (FOLDER / name).read_text(encoding="utf-8"))
-        assert not changed, f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look at what git shows"
+        assert not changed, (
+            f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look at what git shows"
+        )
     held = {str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*") if path.is_file()}
     assert held == set(found)
 
@@ -34,5 +36,9 @@ def test_each_broken_rule_is_explained_with_its_count(tmp_path):
     rules, others = found(tmp_path)
     if "-" in rules or not rules:
         pytest.skip("cppcheck has no MISRA addon")
-    assert dict(rules) == documented((Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8"))
-    assert not [line for line in others if "whitened" not in line]  # a triangle that is written before it is read, row by row
+    assert dict(rules) == documented(
+        (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
+    )
+    assert not [
+        line for line in others if "whitened" not in line
+    ]  # a triangle that is written before it is read, row by row

@@ -43,7 +43,10 @@ VARIANTS = [
     ("ksnn", {"n_hidden": 2, "n_local": 1, "window": 7}),
     ("velocity_gru", {"inputs": ["yaw_rate", "ay"], "outputs": ["vy"]}),
     ("velocity_lstm", {"outputs": ["vy", "vx"], "inputs": ["ay", "yaw_rate"], "n_dense": 5}),
-    ("rational_ekf", {"tyres": "linear", "curves": {"c2_front": 0.7e5, "c2_rear": 1.2e5}, "gate": 2.0}),
+    (
+        "rational_ekf",
+        {"tyres": "linear", "curves": {"c2_front": 0.7e5, "c2_rear": 1.2e5}, "gate": 2.0},
+    ),
     ("rational_ekf", {"tyres": "rational"}),
     ("rational_ekf", {"tyres": "rational_friction", "adapt_above": 2.0, "gate": 3.0}),
     ("rational_ekf", {"adapt_above": 2.0}),
@@ -59,11 +62,20 @@ VARIANTS = [
     ("learned_ukf", {"dynamics": "tyre_network", "gate": 2.0, "scaled": False}),
 ]
 
-pytestmark = [pytest.mark.export, pytest.mark.skipif(not COMPILERS, reason="there is neither gcc nor clang")]
+pytestmark = [
+    pytest.mark.export,
+    pytest.mark.skipif(not COMPILERS, reason="there is neither gcc nor clang"),
+]
 each_variant = pytest.mark.parametrize(
-    "variant", VARIANTS, ids=lambda own: "-".join([own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)])
+    "variant",
+    VARIANTS,
+    ids=lambda own: "-".join(
+        [own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)]
+    ),
 )
-Case = namedtuple("Case", "estimator in_float64 rows")  # an estimator as it was trained, the same in float64, rows of its channels
+Case = namedtuple(
+    "Case", "estimator in_float64 rows"
+)  # an estimator as it was trained, the same in float64, rows of its channels
 
 
 def case_of(name, config):
@@ -75,7 +87,9 @@ def case_of(name, config):
 def _case(name, config):
     given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
     estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
-    on_dugoff = name in ON_DUGOFF and np.stack([dugoff_channels()[own] for own in estimator.channels], axis=1)
+    on_dugoff = name in ON_DUGOFF and np.stack(
+        [dugoff_channels()[own] for own in estimator.channels], axis=1
+    )
     rows = on_dugoff if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
 
@@ -108,10 +122,19 @@ def dugoff_channels():
     steer = np.minimum(0.2, 17.0 / np.square(vx)) * np.sin(1.7 * time)  # about 6 m/s² at speed
     vy, _, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
     channels = {"vx": vx, "steer": steer, "ax": ax, "sideslip_ref": np.arctan2(vy, vx)}
-    channels |= {"ay": ay + 0.06 * generator.standard_normal(n), "yaw_rate": yaw_rate + 0.002 * generator.standard_normal(n)}
-    for axis, loads in (("x", (0.0, 0.0)), ("y", (0.5 * front, 0.5 * rear)), ("z", (4800.0, 4800.0))):
+    channels |= {
+        "ay": ay + 0.06 * generator.standard_normal(n),
+        "yaw_rate": yaw_rate + 0.002 * generator.standard_normal(n),
+    }
+    for axis, loads in (
+        ("x", (0.0, 0.0)),
+        ("y", (0.5 * front, 0.5 * rear)),
+        ("z", (4800.0, 4800.0)),
+    ):
         for corner in ("fl", "fr", "rl", "rr"):
-            channels[f"f{axis}_{corner}"] = loads[corner[0] == "r"] + 70.0 * generator.standard_normal(n)
+            channels[f"f{axis}_{corner}"] = loads[
+                corner[0] == "r"
+            ] + 70.0 * generator.standard_normal(n)
     return channels
 
 
@@ -129,7 +152,9 @@ def disturbed(estimator, rows):
     for name in estimator.skippable:
         if name in estimator.channels:
             rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
-    needed = [column for column, name in enumerate(estimator.channels) if name not in estimator.skippable]
+    needed = [
+        column for column, name in enumerate(estimator.channels) if name not in estimator.skippable
+    ]
     at = 2 * len(rows) // 3
     if needed and estimator.refuses:
         rows[at, needed[0]] = np.nan
@@ -142,7 +167,11 @@ def disturbed(estimator, rows):
 
 def stepped(estimator, rows):
     """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
-    out, fine, stepper = np.full((len(rows), len(OUTPUTS)), np.nan), np.ones(len(rows), bool), estimator.online()
+    out, fine, stepper = (
+        np.full((len(rows), len(OUTPUTS)), np.nan),
+        np.ones(len(rows), bool),
+        estimator.online(),
+    )
     for k, row in enumerate(rows):
         try:
             found = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
@@ -161,10 +190,17 @@ def check(library, estimator, rows, largest):
     np.testing.assert_array_equal(np.isnan(said), np.isnan(wanted))
     assert np.isfinite(wanted[:, 0]).sum() > 0.4 * len(rows)
     np.testing.assert_allclose(said[:, :3], wanted[:, :3], rtol=0.0, atol=largest)
-    np.testing.assert_allclose(said[:, 3], wanted[:, 3], rtol=3e-3 if library.precision == "float" else 1e-7, atol=largest * 1e-2)
+    np.testing.assert_allclose(
+        said[:, 3],
+        wanted[:, 3],
+        rtol=3e-3 if library.precision == "float" else 1e-7,
+        atol=largest * 1e-2,
+    )
 
 
-each_precision = pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
+each_precision = pytest.mark.parametrize(
+    ("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)]
+)
 
 
 @each_variant
@@ -172,19 +208,33 @@ each_precision = pytest.mark.parametrize(("precision", "largest"), [("double", D
 def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest, tmp_path):
     """Filters have no float32 in Python but in networks, so that float in C is held against float64."""
     case = case_of(*variant)
-    check(built(case.estimator, precision, tmp_path), case.in_float64 if precision == "double" else case.estimator, case.rows, largest)
+    check(
+        built(case.estimator, precision, tmp_path),
+        case.in_float64 if precision == "double" else case.estimator,
+        case.rows,
+        largest,
+    )
 
 
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
-@pytest.mark.parametrize("variant", [own for own in VARIANTS if own[0] not in ("zero", "static_map")][::3], ids=lambda own: own[0])
+@pytest.mark.parametrize(
+    "variant",
+    [own for own in VARIANTS if own[0] not in ("zero", "static_map")][::3],
+    ids=lambda own: own[0],
+)
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_clang_takes_it_without_a_warning_and_computes_the_same(variant, precision, tmp_path):
     case = case_of(*variant)
-    said = [built(case.estimator, precision, tmp_path, compiler)(case.rows)[0] for compiler in ("clang", COMPILERS[0])]
+    said = [
+        built(case.estimator, precision, tmp_path, compiler)(case.rows)[0]
+        for compiler in ("clang", COMPILERS[0])
+    ]
     np.testing.assert_allclose(*said, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
 
 
-def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(tmp_path, monkeypatch):
+def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     install_examples(tmp_path / "site", monkeypatch)
     estimator = estimator_class("sliding_mode").from_config({"gain": 4.0, "threshold": 0.05})
@@ -199,20 +249,32 @@ def test_every_family_but_the_factor_graph_can_be_exported():
 
 def test_what_cannot_be_exported_is_said_in_one_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
-    assert "cannot run along with a drive" in refusal(lambda: method_files(offline, "double"), ConfigurationError)
-    unscented = estimator_class("rational_ekf").from_config(
-        {"filter": "unscented", "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01}, "curves": CURVES}
+    assert "cannot run along with a drive" in refusal(
+        lambda: method_files(offline, "double"), ConfigurationError
     )
-    assert "has no C; train it with filter=extended" in refusal(lambda: method_files(unscented, "double"), ConfigurationError)
+    unscented = estimator_class("rational_ekf").from_config(
+        {
+            "filter": "unscented",
+            "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01},
+            "curves": CURVES,
+        }
+    )
+    assert "has no C; train it with filter=extended" in refusal(
+        lambda: method_files(unscented, "double"), ConfigurationError
+    )
 
 
 CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
 
 
 def test_a_value_that_float_cannot_hold_is_refused():
-    kalman = estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 0.01}})
+    kalman = estimator_class("kalman").from_config(
+        {"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 0.01}}
+    )
     kalman.values["steer"] = 1e36
-    with pytest.raises(ConfigurationError, match=r"no float number; fit it anew, or export with precision double"):
+    with pytest.raises(
+        ConfigurationError, match=r"no float number; fit it anew, or export with precision double"
+    ):
         method_files(kalman, "float")
     assert "1e+39" in method_files(kalman, "double")["vehest_method.c"]
 
@@ -232,7 +294,9 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
 
     A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more than elsewhere.
     """
-    hard = copy.deepcopy(case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator)
+    hard = copy.deepcopy(
+        case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator
+    )
     hard.settings = replace(hard.settings, gate=None)
     with torch.no_grad():
         hard.filter.observation_noise.factor.mul_(0.002)
@@ -240,9 +304,14 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
     rows[:, 1:5] *= 3.0
     stepper, wanted, repaired, lifted = widened(hard).online(), [], 0, 0
     for row in rows:
-        wanted.append(list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3])
+        wanted.append(
+            list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3]
+        )
         tape = stepper._filter._tape
-        repaired, lifted = repaired + bool(tape.repaired[0, 0]), lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
+        repaired, lifted = (
+            repaired + bool(tape.repaired[0, 0]),
+            lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0),
+        )
     assert repaired > 20
     assert lifted > 0
     said, _ = built(hard, "double", tmp_path)(rows)
@@ -261,20 +330,33 @@ REAL = {  # as they were fitted to the rest of the recording
     "kalman": {"noise": {"yaw_rate": 0.00445, "ay": 0.995, "steer": 7.17e-4}},
     "rational_ekf": {
         "noise": {"yaw_rate": 0.01355, "ay": 0.835, "steer": 0.0243, "tyres": 1e-4},
-        "curves": {"c1_front": 0.00865, "c2_front": 65392.0, "c1_rear": 0.00512, "c2_rear": 112033.0},
+        "curves": {
+            "c1_front": 0.00865,
+            "c2_front": 65392.0,
+            "c1_rear": 0.00512,
+            "c2_rear": 112033.0,
+        },
     },
     "dugoff_ukf": {
         "inputs": "imu",
         "noise": {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "ay": 1.154, "yaw_rate": 0.00663},
         "tyres": dict(zip(TYRES, (64008.0, 1.2256, 2e-6, 104676.0, 1.3725, 0.05), strict=True)),
-        "car": {"mass": 982.0, "yaw_inertia": 1605.4145, "cg_to_front_axle": 1.33, "cg_to_rear_axle": 1.07, "cg_height": 0.45},
+        "car": {
+            "mass": 982.0,
+            "yaw_inertia": 1605.4145,
+            "cg_to_front_axle": 1.33,
+            "cg_to_rear_axle": 1.07,
+            "cg_height": 0.45,
+        },
     },
 }
 
 
 @pytest.mark.parametrize("name", list(REAL))
 @each_precision
-def test_filters_agree_over_the_real_ferraris_test_range(name, precision, largest, data_root, tmp_path):
+def test_filters_agree_over_the_real_ferraris_test_range(
+    name, precision, largest, data_root, tmp_path
+):
     estimator = estimator_class(name).from_config(REAL[name])
     if name == "luenberger":
         estimator.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
@@ -286,15 +368,28 @@ def test_filters_agree_over_the_real_ferraris_test_range(name, precision, larges
 def small_car(data_root, dynamics):
     """Trained on real drives of the small car, for seconds, and another drive of it."""
     train, validation, test = (real_drive(data_root, name, "f1tenth") for name in DRIVES)
-    estimator = estimator_class("learned_ukf").from_config({"dynamics": dynamics, "width": 8, "through_filter": False})
+    estimator = estimator_class("learned_ukf").from_config(
+        {"dynamics": dynamics, "width": 8, "through_filter": False}
+    )
     estimator.seed(0)
-    phases = [PhaseSettings(learning_rate=5e-3, max_epochs=5), *[PhaseSettings(learning_rate=1e-3, max_epochs=1)] * 2]
-    training = ThroughFilterSettings(phases[0], 100, *phases[1:], steps=50, validation_steps=100, validation_drop_steps=20)
+    phases = [
+        PhaseSettings(learning_rate=5e-3, max_epochs=5),
+        *[PhaseSettings(learning_rate=1e-3, max_epochs=1)] * 2,
+    ]
+    training = ThroughFilterSettings(
+        phases[0], 100, *phases[1:], steps=50, validation_steps=100, validation_drop_steps=20
+    )
     estimator.fit(FitData([train], [validation]), training)
-    return Case(estimator, widened(estimator), test.without_references().stack(estimator.channels)[:2000])
+    return Case(
+        estimator, widened(estimator), test.without_references().stack(estimator.channels)[:2000]
+    )
 
 
-DRIVES = ("iros_hoons_1_with_friction_run_0", "iros_hoons_1_with_friction_run_1", "hoons_all_test_run_4")
+DRIVES = (
+    "iros_hoons_1_with_friction_run_0",
+    "iros_hoons_1_with_friction_run_1",
+    "hoons_all_test_run_4",
+)
 LEARNT = pytest.mark.parametrize("dynamics", ["pacejka", "friction_tyre_network"])
 
 
@@ -305,15 +400,26 @@ def test_learned_filters_agree_over_a_real_drive_of_the_small_car(dynamics, data
 
 
 @LEARNT
-def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(dynamics, data_root, tmp_path):
+def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(
+    dynamics, data_root, tmp_path
+):
     """A network that learnt for seconds makes a filter that forgets slowly, and its largest error from rounding is a matter of chance.
 
     Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in Python and in C alike; the median
     hardly moves. So both are compared over nine such drives.
     """
     case, generator = small_car(data_root, dynamics), np.random.default_rng(0)
-    library, exact = built(case.estimator, "float", tmp_path), stepped(case.in_float64, case.rows)[0][:, 0]
-    drives = [case.rows, *(case.rows * (1.0 + 2.0**-24 * generator.choice([-1.0, 1.0], case.rows.shape)) for _ in range(8))]
+    library, exact = (
+        built(case.estimator, "float", tmp_path),
+        stepped(case.in_float64, case.rows)[0][:, 0],
+    )
+    drives = [
+        case.rows,
+        *(
+            case.rows * (1.0 + 2.0**-24 * generator.choice([-1.0, 1.0], case.rows.shape))
+            for _ in range(8)
+        ),
+    ]
     python = np.abs([stepped(case.estimator, rows)[0][:, 0] - exact for rows in drives])
     c = np.abs([library(rows)[0][:, 0] - exact for rows in drives])
     assert np.median(c) <= 3.0 * np.median(python)

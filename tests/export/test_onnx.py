@@ -15,7 +15,9 @@ pytestmark = pytest.mark.export
 
 onnx = pytest.importorskip("onnx", reason="ONNX files need onnx: pip install 'vehest[export]'")
 pytest.importorskip("onnxscript", reason="ONNX files need onnxscript: pip install 'vehest[export]'")
-onnxruntime = pytest.importorskip("onnxruntime", reason="ONNX files are run in onnxruntime: pip install 'vehest[export]'")
+onnxruntime = pytest.importorskip(
+    "onnxruntime", reason="ONNX files are run in onnxruntime: pip install 'vehest[export]'"
+)
 
 VARIANTS = [
     *((name, {"window": 8} if name in ("ksnn", "gru", "lstm") else {}) for name in NETWORKS),
@@ -32,15 +34,35 @@ class OnnxStepper:
     def __init__(self, path):
         self.session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         self.about = self.session.get_modelmeta().custom_metadata_map
-        self.dtype = np.float64 if self.session.get_inputs()[0].type == "tensor(double)" else np.float32
-        starts = {name.removeprefix("start_"): json.loads(text) for name, text in self.about.items() if name.startswith("start_")}
-        self.state = {f"state_{name}": np.array(values, self.dtype) for name, values in starts.items()}
+        self.dtype = (
+            np.float64 if self.session.get_inputs()[0].type == "tensor(double)" else np.float32
+        )
+        starts = {
+            name.removeprefix("start_"): json.loads(text)
+            for name, text in self.about.items()
+            if name.startswith("start_")
+        }
+        self.state = {
+            f"state_{name}": np.array(values, self.dtype) for name, values in starts.items()
+        }
         self.names = [output.name for output in self.session.get_outputs()]
 
     def step(self, row):
-        said = dict(zip(self.names, self.session.run(None, {"sample": row.astype(self.dtype), **self.state}), strict=True))
-        self.state = {name.replace("next_", "state_"): values for name, values in said.items() if name.startswith("next_")}
-        return {name: float(values) for name, values in said.items() if not name.startswith("next_")}
+        said = dict(
+            zip(
+                self.names,
+                self.session.run(None, {"sample": row.astype(self.dtype), **self.state}),
+                strict=True,
+            )
+        )
+        self.state = {
+            name.replace("next_", "state_"): values
+            for name, values in said.items()
+            if name.startswith("next_")
+        }
+        return {
+            name: float(values) for name, values in said.items() if not name.startswith("next_")
+        }
 
 
 @pytest.mark.parametrize(("name", "config"), VARIANTS, ids=lambda own: str(own))
@@ -55,7 +77,9 @@ def test_a_network_runs_in_onnxruntime_as_in_python(name, config, dtype, largest
     wanted = stepped(estimator, rows)[0]
     for column, quantity in ((0, "vy"), (1, "vx")):
         if quantity in said[0]:
-            np.testing.assert_allclose([own[quantity] for own in said], wanted[:, column], rtol=0.0, atol=largest)
+            np.testing.assert_allclose(
+                [own[quantity] for own in said], wanted[:, column], rtol=0.0, atol=largest
+            )
     assert np.isnan([own["vy"] for own in said]).sum() == estimator.warm_up_steps
 
 
@@ -65,13 +89,28 @@ def test_a_file_says_what_it_is(tmp_path):
     model = onnx.load(tmp_path / "model.onnx")
     about = {entry.key: entry.value for entry in model.metadata_props}
     assert [own.version for own in model.opset_import] == [OPSET]
-    assert json.loads(about["channels"]) == {"yaw_rate": "rad/s", "vx": "m/s", "ay": "m/s²", "ax": "m/s²"}
+    assert json.loads(about["channels"]) == {
+        "yaw_rate": "rad/s",
+        "vx": "m/s",
+        "ay": "m/s²",
+        "ax": "m/s²",
+    }
     assert json.loads(about["outputs"]) == {"vy": "m/s"}
     assert (about["rate_hz"], about["horizon_steps"]) == ("20.0", "1")
     assert "PCT/IT2023/050058" in about["licence"]
-    assert b"onnx_model.py" not in (tmp_path / "model.onnx").read_bytes(), "no paths of the machine that wrote it"
+    assert b"onnx_model.py" not in (tmp_path / "model.onnx").read_bytes(), (
+        "no paths of the machine that wrote it"
+    )
 
 
 def test_what_is_no_network_is_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="estimator 'kalman' is no network that ONNX could hold; these are: ksnn, gru"):
-        write_onnx(estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 1e-3}}), tmp_path / "model.onnx")
+    with pytest.raises(
+        ConfigurationError,
+        match="estimator 'kalman' is no network that ONNX could hold; these are: ksnn, gru",
+    ):
+        write_onnx(
+            estimator_class("kalman").from_config(
+                {"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 1e-3}}
+            ),
+            tmp_path / "model.onnx",
+        )

@@ -11,11 +11,38 @@ from vehest.export.program import TOLERANCES, program_files
 pytestmark = pytest.mark.export
 PRECISIONS = ("double", "float")
 MOST_STACK = 6 * 1024  # bytes
-LIBRARY = {"sqrt", "exp", "log", "log10", "log1p", "pow", "sin", "cos", "tan", "atan", "atan2", "tanh", "floor", "rint", "fabs"}
+LIBRARY = {
+    "sqrt",
+    "exp",
+    "log",
+    "log10",
+    "log1p",
+    "pow",
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "tanh",
+    "floor",
+    "rint",
+    "fabs",
+}
 MERGED = {"sincos"}  # what gcc makes of both of an angle
 MEMORY = {"memset", "memcpy", "memmove"}
 ARM = [*CORTEX_M4F.options, "-ffp-contract=off"]
-BOARD = ["qemu-system-arm", "-machine", "mps2-an386", "-icount", "shift=0", "-nographic", "-monitor", "none", "-serial", "none"]
+BOARD = [
+    "qemu-system-arm",
+    "-machine",
+    "mps2-an386",
+    "-icount",
+    "shift=0",
+    "-nographic",
+    "-monitor",
+    "none",
+    "-serial",
+    "none",
+]
 MIPS = "mips-linux-gnu-gcc"
 
 
@@ -46,7 +73,13 @@ def test_a_million_senseless_samples_break_neither_memory_nor_contract(tmp_path,
 
 def _fuzz(export, place, steps, *options):
     export.write()
-    options = ("-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-I.", *options)
+    options = (
+        "-g",
+        "-fsanitize=address,undefined,float-cast-overflow",
+        "-fno-sanitize-recover=all",
+        "-I.",
+        *options,
+    )
     program = export.build("gcc", *options, main=str(place / "fuzz.c"), out="fuzz")
     assert f"{steps} steps" in command([str(program), str(steps), "7"], export.folder, 3600.0)
 
@@ -66,9 +99,17 @@ def test_the_stack_is_bounded_and_nothing_is_allocated(tmp_path, family, precisi
 
 
 def test_the_deepest_chain_of_calls_counts_and_recursion_is_refused():
-    node, edge = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:1\\n{1} bytes (static)" }}', 'edge: {{ sourcename: "{0}" targetname: "{1}" }}'
-    nodes = [node.format(*own) for own in (("main", 16), ("left", 100), ("right", 40), ("leaf", 70))]
-    edges = [edge.format(*own) for own in (("main", "left"), ("main", "right"), ("right", "leaf"), ("leaf", "sqrt"))]
+    node, edge = (
+        'node: {{ title: "{0}" label: "{0}\\nx.c:1:1\\n{1} bytes (static)" }}',
+        'edge: {{ sourcename: "{0}" targetname: "{1}" }}',
+    )
+    nodes = [
+        node.format(*own) for own in (("main", 16), ("left", 100), ("right", 40), ("leaf", 70))
+    ]
+    edges = [
+        edge.format(*own)
+        for own in (("main", "left"), ("main", "right"), ("right", "leaf"), ("leaf", "sqrt"))
+    ]
     graph = "\n".join([*nodes, 'node: { title: "sqrt" label: "sqrt" }', *edges])
     assert worst_stack([graph], ["main"]) == (126, ("sqrt",))
     with pytest.raises(RecursionError, match="calls itself"):
@@ -105,9 +146,25 @@ def run_on_board(export, board):
     command([compiler, *options, "-include", str(board / "count.h"), "-c", "main.c"], export.folder)
     command([compiler, "-std=gnu99", *ARM, "-I.", "-c", str(board / "board.c")], export.folder)
     objects = ["main.o", "board.o", *(name.replace(".c", ".o") for name in export.sources)]
-    command([compiler, *ARM, "--specs=rdimon.specs", "-T", str(board / "board.ld"), *objects, "-lm", "-o", "main.elf"], export.folder)
+    command(
+        [
+            compiler,
+            *ARM,
+            "--specs=rdimon.specs",
+            "-T",
+            str(board / "board.ld"),
+            *objects,
+            "-lm",
+            "-o",
+            "main.elf",
+        ],
+        export.folder,
+    )
     arguments = "enable=on,target=native,arg=main,arg=in.csv,arg=out.csv"
-    return command([emulator, *BOARD[1:], "-semihosting-config", arguments, "-kernel", "main.elf"], export.folder)
+    return command(
+        [emulator, *BOARD[1:], "-semihosting-config", arguments, "-kernel", "main.elf"],
+        export.folder,
+    )
 
 
 def test_sizes_are_those_of_the_linked_objects(tmp_path):

@@ -38,7 +38,19 @@ from vehest.trust.watch import STARTED
 SETTLE, LASTS, COMES_BACK, RECOVERS = 4.0, 4.0, 8.0, 3.0  # s
 TIMES_USUAL = 2.0
 
-HEADER = ["data", "kind", "estimator", "rate_hz", "fault", "channel", "severity", "finite", "exceptions", "within_speed", "starts"]
+HEADER = [
+    "data",
+    "kind",
+    "estimator",
+    "rate_hz",
+    "fault",
+    "channel",
+    "severity",
+    "finite",
+    "exceptions",
+    "within_speed",
+    "starts",
+]
 HEADER += ["usual_error_deg", "error_while_faulted_deg", "error_after_deg", "recovered"]
 
 CAR = "estimator.car={mass: 982, yaw_inertia: 1605.4145, cg_to_front_axle: 1.33, cg_to_rear_axle: 1.07, cg_height: 0.45}"
@@ -56,14 +68,37 @@ FERRARI = {
     "ksnn": ("estimator.n_local=2", "estimator.n_hidden=2", "training.max_epochs=30"),
     "gru": ("estimator.n_states=5", "training.max_epochs=30"),
     "lstm": ("estimator.n_states=5", "training.max_epochs=30"),
-    "velocity_gru": ("estimator.inputs=[vx,yaw_rate,ay,ax]", "estimator.outputs=[vx,vy]", "training.phase.max_epochs=20"),
-    "velocity_lstm": ("estimator.inputs=[vx,yaw_rate,ay,ax]", "estimator.outputs=[vx,vy]", "training.phase.max_epochs=20"),
+    "velocity_gru": (
+        "estimator.inputs=[vx,yaw_rate,ay,ax]",
+        "estimator.outputs=[vx,vy]",
+        "training.phase.max_epochs=20",
+    ),
+    "velocity_lstm": (
+        "estimator.inputs=[vx,yaw_rate,ay,ax]",
+        "estimator.outputs=[vx,vy]",
+        "training.phase.max_epochs=20",
+    ),
     "dugoff_ukf": ("estimator.inputs=imu", CAR, *(f"training.{word}" for word in SHORT)),
     "sideslip_ffnn": ("estimator.inputs=imu", "training.phase.max_epochs=20"),
-    "cnn_ukf": (*IDENTIFIED, "training.pre_training.max_epochs=10", "training.end_to_end.max_epochs=1"),
-    "ensemble_ukf": (*IDENTIFIED, "training.scaling_trials=5", "estimator.members=3", "training.phase.max_epochs=10"),
+    "cnn_ukf": (
+        *IDENTIFIED,
+        "training.pre_training.max_epochs=10",
+        "training.end_to_end.max_epochs=1",
+    ),
+    "ensemble_ukf": (
+        *IDENTIFIED,
+        "training.scaling_trials=5",
+        "estimator.members=3",
+        "training.phase.max_epochs=10",
+    ),
 }
-SMALL_CAR = {"learned_ukf": ("estimator.dynamics=pacejka", "training.one_step.max_epochs=60", "training.noise.max_epochs=3")}
+SMALL_CAR = {
+    "learned_ukf": (
+        "estimator.dynamics=pacejka",
+        "training.one_step.max_epochs=60",
+        "training.noise.max_epochs=3",
+    )
+}
 SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
 Ground = namedtuple("Ground", "data kind train validation trial families")
 """Where families are tried: ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
@@ -71,14 +106,33 @@ Ground = namedtuple("Ground", "data kind train validation trial families")
 
 def grounds():
     """A simulated drive always, the real ones where the recordings are."""
-    bmw = {**FERRARI, "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423")}
+    bmw = {
+        **FERRARI,
+        "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"),
+    }
     own = "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, cg_to_rear_axle: 1.423, cg_height: 0.42}"
-    bmw = {name: tuple(own if word == CAR else word for word in words) for name, words in bmw.items()}
-    yield Ground("sim_quickstart", "simulated", ("drive_1", 0, 150), ("drive_2", 0, 90), ("drive_3", 40.0), bmw)
+    bmw = {
+        name: tuple(own if word == CAR else word for word in words) for name, words in bmw.items()
+    }
+    yield Ground(
+        "sim_quickstart",
+        "simulated",
+        ("drive_1", 0, 150),
+        ("drive_2", 0, 90),
+        ("drive_3", 40.0),
+        bmw,
+    )
     if os.environ.get("VEHEST_DATA"):
         day, hoons = "20140222_01_01_03_250lm", "iros_hoons_1_with_friction_run_"
         yield Ground("ferrari_250lm", "real", (day, 0, 300), (day, 300, 400), (day, 450.0), FERRARI)
-        yield Ground("f1tenth", "real", (f"{hoons}1", 0, 60), (f"{hoons}0", 0, 40), ("hoons_all_test_run_4", 10.0), SMALL_CAR)
+        yield Ground(
+            "f1tenth",
+            "real",
+            (f"{hoons}1", 0, 60),
+            (f"{hoons}0", 0, 40),
+            ("hoons_all_test_run_4", 10.0),
+            SMALL_CAR,
+        )
 
 
 @cache
@@ -94,7 +148,9 @@ def stretch(recording, start, stop):
 
 def at_rate(recording, estimator):
     """A recording as the estimator takes it."""
-    for transform in transforms_of({"rate_hz": estimator.settings.rate_hz, **estimator.preparation}):
+    for transform in transforms_of(
+        {"rate_hz": estimator.settings.rate_hz, **estimator.preparation}
+    ):
         recording = transform(recording)
     return recording
 
@@ -106,7 +162,10 @@ def sideslip(vy, vx):
 def walk(estimator, limits, samples):
     """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
     stepper = vehest.online(estimator)
-    rows = [dict(zip(samples, row, strict=True)) for row in zip(*(values.tolist() for values in samples.values()), strict=True)]
+    rows = [
+        dict(zip(samples, row, strict=True))
+        for row in zip(*(values.tolist() for values in samples.values()), strict=True)
+    ]
     said, exceptions, starts = np.full(len(rows), np.nan), 0, 0
     fastest, bounded = 1.0, True
     for k, row in enumerate(rows):
@@ -118,15 +177,25 @@ def walk(estimator, limits, samples):
         speed = abs(row.get("vx", math.nan))
         if speed < 140.0:
             fastest = max(fastest, speed)
-        bounded &= not abs(said[k]) > limits.largest_tan_sideslip * min(fastest, limits.top_speed) * (1 + 1e-9) or math.isinf(said[k])
-    return np.concatenate([np.full(estimator.horizon_steps, np.nan), said])[: len(rows)], exceptions, starts, bounded
+        bounded &= not abs(said[k]) > limits.largest_tan_sideslip * min(
+            fastest, limits.top_speed
+        ) * (1 + 1e-9) or math.isinf(said[k])
+    return (
+        np.concatenate([np.full(estimator.horizon_steps, np.nan), said])[: len(rows)],
+        exceptions,
+        starts,
+        bounded,
+    )
 
 
 def try_family(ground, name):
     """Fit a family and walk it through every case; a row each."""
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    train, validation = (stretch(recording(ground.data, own), start, stop) for own, start, stop in (ground.train, ground.validation))
+    train, validation = (
+        stretch(recording(ground.data, own), start, stop)
+        for own, start, stop in (ground.train, ground.validation)
+    )
     estimator = vehest.train(name, [train], [validation], ground.families[name])
     rate = estimator.settings.rate_hz
     limits = learn_limits([at_rate(train, estimator)], estimator.channels, rate)
@@ -140,7 +209,9 @@ def try_family(ground, name):
     back = SETTLE + LASTS + max(RECOVERS, estimator.warm_up_steps / rate)
 
     def error(vy, chosen):
-        return float(np.sqrt(np.mean(np.square(sideslip(vy[chosen], speed[chosen]) - reference[chosen]))))
+        return float(
+            np.sqrt(np.mean(np.square(sideslip(vy[chosen], speed[chosen]) - reference[chosen])))
+        )
 
     nominal = walk(estimator, limits, samples)[0]
     settled = np.arange(len(drive)) >= max(warm, round(2.0 * rate))
@@ -151,9 +222,23 @@ def try_family(ground, name):
     for channel, kind, severity in product(measured, KINDS, SEVERITIES):
         if not applies(kind, channel):
             continue
-        vy, exceptions, starts, bounded = walk(estimator, limits, inject(samples, rate, Fault(kind, channel, severity, SETTLE, LASTS)))
+        vy, exceptions, starts, bounded = walk(
+            estimator, limits, inject(samples, rate, Fault(kind, channel, severity, SETTLE, LASTS))
+        )
         finite, vy = bool(np.isfinite(vy[warm:]).all()), np.nan_to_num(vy, nan=1e9)
-        row = (ground.data, ground.kind, name, f"{rate:g}", kind, channel, severity, finite, exceptions, bounded, starts)
+        row = (
+            ground.data,
+            ground.kind,
+            name,
+            f"{rate:g}",
+            kind,
+            channel,
+            severity,
+            finite,
+            exceptions,
+            bounded,
+            starts,
+        )
         figures = (f"{figure:.4g}" for figure in (usual, error(vy, during), error(vy, after)))
         rows.append((*row, *figures, error(vy, after) <= TIMES_USUAL * usual))
     return rows
@@ -161,26 +246,49 @@ def try_family(ground, name):
 
 def main():
     """Write the table; the last line counts what did not hold."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", help="one estimator")
     parser.add_argument("--data", help="one data set")
     asked = parser.parse_args()
-    cases = [(ground, name) for ground in grounds() if asked.data in (None, ground.data) for name in ground.families]
+    cases = [
+        (ground, name)
+        for ground in grounds()
+        if asked.data in (None, ground.data)
+        for name in ground.families
+    ]
     cases = [case for case in cases if asked.only in (None, case[1])]
     cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
     started, tables = time.monotonic(), {}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        for (ground, name), rows in zip(cases, pool.map(try_family, *zip(*cases, strict=True)), strict=True):
+        for (ground, name), rows in zip(
+            cases, pool.map(try_family, *zip(*cases, strict=True)), strict=True
+        ):
             tables[ground.data, name] = rows
-            table = pd.DataFrame([row for done in sorted(tables) for row in tables[done]], columns=HEADER)
-            table.to_csv(asked.out, index=False)  # so that what is done stands there if the rest is not awaited
-            print(f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s", flush=True)
-    held = {"finite": table["finite"], "without an exception": table["exceptions"] == 0, "within the speed": table["within_speed"]}
+            table = pd.DataFrame(
+                [row for done in sorted(tables) for row in tables[done]], columns=HEADER
+            )
+            table.to_csv(
+                asked.out, index=False
+            )  # so that what is done stands there if the rest is not awaited
+            print(
+                f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s",
+                flush=True,
+            )
+    held = {
+        "finite": table["finite"],
+        "without an exception": table["exceptions"] == 0,
+        "within the speed": table["within_speed"],
+    }
     held["back within twice the usual error"] = table["recovered"]
-    print(f"{len(table)} cases: " + ", ".join(f"{(~own.astype(bool)).sum()} not {what}" for what, own in held.items()))
+    print(
+        f"{len(table)} cases: "
+        + ", ".join(f"{(~own.astype(bool)).sum()} not {what}" for what, own in held.items())
+    )
 
 
 if __name__ == "__main__":

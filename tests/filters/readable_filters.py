@@ -27,7 +27,9 @@ def mean_of(rule, values):
 
 def covariance_of(rule, deviations, others):
     """Weighted Σ w d eᵀ of deviations from the mean, (2n + 1, m) and (2n + 1, k) -> (m, k)."""
-    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.other * (deviations[1:].mT @ others[1:])
+    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.other * (
+        deviations[1:].mT @ others[1:]
+    )
 
 
 def symmetric(matrix):
@@ -76,9 +78,16 @@ class NonlinearModel:
 
 def log_likelihood(steps):
     """Of each sample's measurements given those before, (..., T), by innovations and their covariances; 0 where nothing was measured."""
-    errors, covariances, measured = (torch.as_tensor(part) for part in (steps.innovation, steps.innovation_covariance, steps.measured))
+    errors, covariances, measured = (
+        torch.as_tensor(part)
+        for part in (steps.innovation, steps.innovation_covariance, steps.measured)
+    )
     squared = torch.linalg.solve(covariances, errors).mul(errors).sum(-1)
-    return -0.5 * (squared + torch.logdet(covariances) + measured.sum(-1, dtype=errors.dtype) * math.log(2.0 * math.pi))
+    return -0.5 * (
+        squared
+        + torch.logdet(covariances)
+        + measured.sum(-1, dtype=errors.dtype) * math.log(2.0 * math.pi)
+    )
 
 
 def unscented_filter(model, measurements, inputs, initial, rule):
@@ -92,17 +101,29 @@ def unscented_filter(model, measurements, inputs, initial, rule):
     """
     if measurements.dim() == 3:
         several, n = len(measurements), initial.mean.shape[-1]
-        each = zip(measurements, inputs, initial.mean.expand(several, n), initial.covariance.expand(several, n, n), strict=True)
+        each = zip(
+            measurements,
+            inputs,
+            initial.mean.expand(several, n),
+            initial.covariance.expand(several, n, n),
+            strict=True,
+        )
         found = [unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in each]
         rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in found]
-        return NonlinearFiltered(filtered_of(rows), torch.stack([repaired for _, repaired in found]))
+        return NonlinearFiltered(
+            filtered_of(rows), torch.stack([repaired for _, repaired in found])
+        )
     state, rows, repaired = initial, [], torch.zeros(len(measurements), dtype=torch.bool)
     for k, (y, u) in enumerate(zip(measurements, inputs, strict=True)):
         if k > 0:
             _, factor, repaired[k] = factorised(state.covariance)
-            after = model.transition(model.possible(sigma_points(rule, state.mean, factor)), inputs[k - 1 : k])
+            after = model.transition(
+                model.possible(sigma_points(rule, state.mean, factor)), inputs[k - 1 : k]
+            )
             mean = mean_of(rule, after)
-            covariance = covariance_of(rule, after - mean, after - mean) + model.process_noise(state.mean, inputs[k - 1])
+            covariance = covariance_of(rule, after - mean, after - mean) + model.process_noise(
+                state.mean, inputs[k - 1]
+            )
             state = Gaussian(model.possible(mean), symmetric(covariance))
         prior, factor, lifted = factorised(state.covariance)
         posterior, *update, lost = _updated(model, Gaussian(state.mean, prior), factor, y, u, rule)
@@ -124,11 +145,17 @@ def _updated(model, state, factor, y, u, rule):
     expected = model.observation(drawn, u[None])
     mean, measured = mean_of(rule, expected), ~torch.isnan(y)
     spread = torch.where(measured, expected - mean, 0.0)
-    noise = torch.where(measured[:, None] & measured, model.observation_noise(state.mean, u), torch.eye(len(y), dtype=y.dtype))
+    noise = torch.where(
+        measured[:, None] & measured,
+        model.observation_noise(state.mean, u),
+        torch.eye(len(y), dtype=y.dtype),
+    )
     innovation = torch.where(measured, torch.where(measured, y, 0.0) - mean, 0.0)
 
     def conditioned(rule):
-        covariance, factor, lost = factorised(symmetric(covariance_of(rule, spread, spread) + noise))
+        covariance, factor, lost = factorised(
+            symmetric(covariance_of(rule, spread, spread) + noise)
+        )
         gain = torch.cholesky_solve(covariance_of(rule, drawn - state.mean, spread).mT, factor).mT
         left = symmetric(state.covariance - gain @ covariance @ gain.mT)
         return Gaussian(model.possible(state.mean + gain @ innovation), left), covariance, lost
@@ -150,18 +177,26 @@ def extended_filter(model, measurements, inputs, initial):
             before, pushed = state.mean, inputs[k - 1]
             slope = jacfwd(model.transition)(before, pushed)
             covariance = slope @ state.covariance @ slope.mT + model.process_noise(before, pushed)
-            state = Gaussian(model.possible(model.transition(before, pushed)), 0.5 * (covariance + covariance.mT))
+            state = Gaussian(
+                model.possible(model.transition(before, pushed)), 0.5 * (covariance + covariance.mT)
+            )
             state = state if model.restart is None else model.restart(state, u)
         measured = ~torch.isnan(y)
         H = torch.where(measured[:, None], jacfwd(model.observation)(state.mean, u), 0.0)
-        R = torch.where(measured[:, None] & measured, model.observation_noise(state.mean, u), torch.eye(len(y), dtype=y.dtype))
+        R = torch.where(
+            measured[:, None] & measured,
+            model.observation_noise(state.mean, u),
+            torch.eye(len(y), dtype=y.dtype),
+        )
         innovation = torch.where(measured, y - model.observation(state.mean, u), 0.0)
         S, cross = H @ state.covariance @ H.mT + R, state.covariance @ H.mT
         gain = torch.linalg.solve(S, cross.mT).mT
         if model.free is not None:
             gain = torch.where(model.free(state.mean, u)[:, None], gain, 0.0)
         covariance = state.covariance - gain @ cross.mT - cross @ gain.mT + gain @ S @ gain.mT
-        posterior = Gaussian(model.possible(state.mean + gain @ innovation), 0.5 * (covariance + covariance.mT))
+        posterior = Gaussian(
+            model.possible(state.mean + gain @ innovation), 0.5 * (covariance + covariance.mT)
+        )
         rows.append((*state, *posterior, innovation, S, measured))
         state = posterior
     return filtered_of(rows)
@@ -188,7 +223,10 @@ def rational_model(estimator):
         motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
         tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
         spread = torch.as_tensor(estimator.start_tyres()) if diverged else state.covariance[4:, 4:]
-        return Gaussian(torch.cat([motion, tyres]), torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread))
+        return Gaussian(
+            torch.cat([motion, tyres]),
+            torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread),
+        )
 
     return NonlinearModel(
         track.transition,
@@ -210,7 +248,10 @@ def gated(run, measurements, gate):
         for i in range(len(left)):
             if math.isnan(left[i]):
                 continue
-            if steps.innovation[k, i] ** 2 > gate.deviations**2 * steps.innovation_covariance[k, i, i]:
+            if (
+                steps.innovation[k, i] ** 2
+                > gate.deviations**2 * steps.innovation_covariance[k, i, i]
+            ):
                 refused[i] = min(refused[i] + 1, 2 * gate.patience)
                 if refused[i] <= gate.patience:
                     left[i] = torch.nan

@@ -74,8 +74,16 @@ def dense_posterior(model, measurements, initial, seen):
     error = measurements.ravel()[rows] - y_mean[rows]
     mean = f + cross @ np.linalg.solve(S, error)
     covariance = prior - cross @ np.linalg.solve(S, cross.T)
-    density = multivariate_normal(y_mean[rows], S).logpdf(measurements.ravel()[rows]) if len(rows) else 0.0
-    return mean.reshape(steps, N), covariance.reshape(steps, N, steps, N).diagonal(axis1=0, axis2=2).transpose(2, 0, 1), density
+    density = (
+        multivariate_normal(y_mean[rows], S).logpdf(measurements.ravel()[rows])
+        if len(rows)
+        else 0.0
+    )
+    return (
+        mean.reshape(steps, N),
+        covariance.reshape(steps, N, steps, N).diagonal(axis1=0, axis2=2).transpose(2, 0, 1),
+        density,
+    )
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.4])
@@ -108,7 +116,9 @@ def test_predictions_stand_where_nothing_is_measured():
 def test_covariances_stay_symmetric_and_positive():
     """From a first variance of 1e10 down to 1e-6; the short form of the update, (I - KC)P, turns negative on the way."""
     model, measurements, _ = example(300, seed=8)
-    model = model._replace(process_noise=1e-6 * model.process_noise, observation_noise=1e-6 * model.observation_noise)
+    model = model._replace(
+        process_noise=1e-6 * model.process_noise, observation_noise=1e-6 * model.observation_noise
+    )
     start = Gaussian(np.zeros(N), 1e10 * np.eye(N))
     result = kalman_scan(model, measurements, start).filtered.covariance
     assert np.array_equal(result, result.transpose(0, 2, 1))
@@ -125,7 +135,9 @@ def test_covariances_stay_symmetric_and_positive():
 def test_shapes_that_do_not_fit_and_noise_that_is_not_positive_are_refused():
     model, measurements, initial = example(4)
     wrong = model._replace(observation=model.observation[..., :2])
-    with pytest.raises(ValueError, match=r"observation of shape \(4, 2, 2\) does not fit \(4, 2, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"observation of shape \(4, 2, 2\) does not fit \(4, 2, 3\)"
+    ):
         kalman_scan(wrong, measurements, initial)
     for empty in (measurements[:0], measurements[0]):
         with pytest.raises(ValueError, match="with T > 0"):

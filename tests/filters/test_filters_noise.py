@@ -7,7 +7,15 @@ from scipy.stats import multivariate_normal
 
 from point_models import covariances
 from vehest.filters.noise_levels import high_passed_level
-from vehest.filters.noise_models import DEVIATION, FLOOR, ConstantNoise, StateDependentNoise, compiled_noise, entropy, with_entropy
+from vehest.filters.noise_models import (
+    DEVIATION,
+    FLOOR,
+    ConstantNoise,
+    StateDependentNoise,
+    compiled_noise,
+    entropy,
+    with_entropy,
+)
 
 STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
 START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
@@ -40,19 +48,29 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         covariance = noise.double()(STATE.double(), INPUTS.double())
         assert (torch.linalg.eigvalsh(covariance) >= 0.99 * FLOOR).all()
         covariance.square().sum().backward()
-        assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in noise.parameters())
+        assert all(
+            parameter.grad is not None and parameter.grad.abs().sum() > 0
+            for parameter in noise.parameters()
+        )
 
 
 def test_state_dependent_noise_is_the_formula_written_out_and_factors_of_zero_leave_the_floor():
     noise = drawn(StateDependentNoise([0.2, 0.3], 5), 0.5, 3)
     a, b, c = (noise.weight @ STATE[2]).tolist()
     lower = torch.tensor([[a, 0.0], [b, c]])
-    assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
+    assert torch.allclose(
+        noise(STATE, INPUTS)[2],
+        torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT,
+        atol=1e-6,
+    )
     noise = ConstantNoise([1.0, 1.0])
     torch.nn.init.zeros_(noise.factor)
     assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
     assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
-    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
+    assert (
+        sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters())
+        == 15 + 15 * 6
+    )
 
 
 def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
@@ -60,11 +78,16 @@ def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
     for own, value in zip(covariance, entropy(covariance), strict=True):
         assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
-    small, large = 1e-4 * torch.eye(5, dtype=torch.float64), 10.0 * torch.eye(5, dtype=torch.float64)
+    small, large = (
+        1e-4 * torch.eye(5, dtype=torch.float64),
+        10.0 * torch.eye(5, dtype=torch.float64),
+    )
     small[0, 1] = small[1, 0] = 5e-5
     raised = with_entropy(torch.stack([small, large]), -9.0)
     assert float(entropy(raised[0])) == pytest.approx(-9.0)
-    assert torch.allclose(raised[0] / raised[0, 0, 0], small / small[0, 0]), "only its size has changed"
+    assert torch.allclose(raised[0] / raised[0, 0, 0], small / small[0, 0]), (
+        "only its size has changed"
+    )
     assert torch.equal(raised[1], large)
 
 
@@ -77,8 +100,13 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     states = torch.randn(7, 3, generator=generator).to(dtype)
     known = noise(states, states).detach()
     floor = float(entropy(known).median())
-    for expected, own in ((known, compiled_noise(noise)), (with_entropy(known, floor), compiled_noise(noise, floor))):
-        assert covariances(own, states.numpy(), states.numpy()) == pytest.approx(expected.numpy(), rel=tolerance, abs=tolerance)
+    for expected, own in (
+        (known, compiled_noise(noise)),
+        (with_entropy(known, floor), compiled_noise(noise, floor)),
+    ):
+        assert covariances(own, states.numpy(), states.numpy()) == pytest.approx(
+            expected.numpy(), rel=tolerance, abs=tolerance
+        )
     assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"
 
 
@@ -86,13 +114,17 @@ def test_level_of_white_noise_is_its_share_above_the_cutoff_without_slow_signals
     """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency; 2 % leaves room for the filter's slopes."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(100_000)
     for cutoff in (0.1, 0.2):
-        assert high_passed_level([noise], cutoff) == pytest.approx(0.3 * np.sqrt(1 - cutoff), rel=0.02)
+        assert high_passed_level([noise], cutoff) == pytest.approx(
+            0.3 * np.sqrt(1 - cutoff), rel=0.02
+        )
     # 60 dB down below 0.75 times the cut-off.
     time = np.arange(20_000) / 100.0
     noise = 0.01 * np.random.default_rng(1).standard_normal(len(time))
     slow = 5.0 + 3.0 * np.sin(2 * np.pi * 0.5 * time) + np.sin(2 * np.pi * 7.0 * time)
     assert high_passed_level([slow], 0.2) < 1e-3
-    assert high_passed_level([slow + noise], 0.2) == pytest.approx(high_passed_level([noise], 0.2), rel=0.02)
+    assert high_passed_level([slow + noise], 0.2) == pytest.approx(
+        high_passed_level([noise], 0.2), rel=0.02
+    )
     noise = np.random.default_rng(2).standard_normal(2_000)
     offset = noise + 1e3
     offset[700] = np.nan

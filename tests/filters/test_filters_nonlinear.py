@@ -4,14 +4,25 @@ import filterpy.kalman as filterpy
 import numpy as np
 import pytest
 import torch
-from readable_filters import NonlinearModel, extended_filter, log_likelihood, scaled_rule, sigma_points, unscented_filter
+from readable_filters import (
+    NonlinearModel,
+    extended_filter,
+    log_likelihood,
+    scaled_rule,
+    sigma_points,
+    unscented_filter,
+)
 from test_filters_kalman import arrays, example, tensors
 
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.sigma_points import symmetric_rule
 
-RULES = {"symmetric": symmetric_rule(3, 0.5), "scaled": scaled_rule(3, 0.5, 2.0, 1.0), "cubature": symmetric_rule(3, 0.0)}
+RULES = {
+    "symmetric": symmetric_rule(3, 0.5),
+    "scaled": scaled_rule(3, 0.5, 2.0, 1.0),
+    "cubature": symmetric_rule(3, 0.0),
+}
 STEP = 0.1
 
 
@@ -26,8 +37,13 @@ def linear_as_nonlinear(model):
         return part[u[..., :1].long()].select(u.dim() - 1, 0)
 
     return NonlinearModel(
-        lambda x, u: (at(model.transition, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.transition_offset, u),
-        lambda x, u: (at(model.observation, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.observation_offset, u),
+        lambda x, u: (
+            (at(model.transition, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.transition_offset, u)
+        ),
+        lambda x, u: (
+            (at(model.observation, u) @ x.unsqueeze(-1)).squeeze(-1)
+            + at(model.observation_offset, u)
+        ),
         lambda x, u: at(model.process_noise, u),
         lambda x, u: torch.diag_embed(at(model.observation_noise, u)),
     )
@@ -38,7 +54,14 @@ def pendulum_with_radar():
 
     def transition(x, u):
         angle, rate, damping = x.unbind(-1)
-        return torch.stack([angle + STEP * rate, rate + STEP * (u[..., 0] - 9.81 * torch.sin(angle) - damping * rate), damping], -1)
+        return torch.stack(
+            [
+                angle + STEP * rate,
+                rate + STEP * (u[..., 0] - 9.81 * torch.sin(angle) - damping * rate),
+                damping,
+            ],
+            -1,
+        )
 
     def observation(x, u):
         return torch.stack([1.0 - torch.cos(x[..., 0]), torch.sin(x[..., 0]) * x[..., 1]], -1)
@@ -56,18 +79,32 @@ def measured_pendulum(steps=40, sequences=1, seed=1):
     inputs = torch.randn(sequences, steps, 1, generator=generator, dtype=torch.float64)
     ys = []
     for k in range(steps):
-        ys.append(model.observation(x, inputs[:, k]) + 0.15 * torch.randn(sequences, 2, generator=generator, dtype=torch.float64))
+        ys.append(
+            model.observation(x, inputs[:, k])
+            + 0.15 * torch.randn(sequences, 2, generator=generator, dtype=torch.float64)
+        )
         x = model.transition(x, inputs[:, k])
-    first = Gaussian(torch.tensor([0.4, 0.1, 0.2], dtype=torch.float64), torch.diag(torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)))
+    first = Gaussian(
+        torch.tensor([0.4, 0.1, 0.2], dtype=torch.float64),
+        torch.diag(torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)),
+    )
     return torch.stack(ys, 1), inputs, first
 
 
 def test_rules_are_those_of_an_independent_library():
-    mean, covariance = np.array([0.3, -0.2, 0.7]), np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])
-    theirs = {"symmetric": filterpy.JulierSigmaPoints(3, 0.5), "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0)}
+    mean, covariance = (
+        np.array([0.3, -0.2, 0.7]),
+        np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]]),
+    )
+    theirs = {
+        "symmetric": filterpy.JulierSigmaPoints(3, 0.5),
+        "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0),
+    }
     for name, known in theirs.items():
         rule = RULES[name]
-        points = sigma_points(rule, torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance)))
+        points = sigma_points(
+            rule, torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance))
+        )
         assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
         assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
         assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)
@@ -80,7 +117,11 @@ def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
     known = kalman_scan(model, measurements, initial)
     y, inputs = torch.from_numpy(measurements), torch.arange(30, dtype=torch.float64).unsqueeze(-1)
     nonlinear, first = linear_as_nonlinear(tensors(model)), tensors(initial)
-    ours = extended_filter(nonlinear, y, inputs, first) if name == "extended" else unrepaired(nonlinear, y, inputs, first, RULES[name])
+    ours = (
+        extended_filter(nonlinear, y, inputs, first)
+        if name == "extended"
+        else unrepaired(nonlinear, y, inputs, first, RULES[name])
+    )
     for part in ("predicted", "filtered"):
         for own, theirs in zip(arrays(getattr(ours, part)), getattr(known, part), strict=True):
             assert np.allclose(own, theirs, rtol=1e-9, atol=1e-9)
@@ -110,13 +151,20 @@ def test_unscented_filter_is_that_of_an_independent_library(rule, points):
     ours = unscented_filter(model, measurements[0], inputs[0], initial, rule).steps
 
     def as_numpy(function):
-        return lambda x, *rest, u: function(torch.from_numpy(np.asarray(x)), torch.from_numpy(u)).numpy()
+        return lambda x, *rest, u: function(
+            torch.from_numpy(np.asarray(x)), torch.from_numpy(u)
+        ).numpy()
 
     drawn = points()
-    theirs = filterpy.UnscentedKalmanFilter(3, 2, STEP, as_numpy(model.observation), as_numpy(model.transition), drawn)
+    theirs = filterpy.UnscentedKalmanFilter(
+        3, 2, STEP, as_numpy(model.observation), as_numpy(model.transition), drawn
+    )
     theirs.x, theirs.P = initial.mean.numpy().copy(), initial.covariance.numpy().copy()
     none = torch.zeros(3, dtype=torch.float64)
-    theirs.Q, theirs.R = model.process_noise(none, none).numpy(), model.observation_noise(none, none).numpy()
+    theirs.Q, theirs.R = (
+        model.process_noise(none, none).numpy(),
+        model.observation_noise(none, none).numpy(),
+    )
     for k, y in enumerate(measurements[0].numpy()):
         if k > 0:
             theirs.predict(u=inputs[0, k - 1].numpy())

@@ -16,13 +16,24 @@ from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, u
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
-Learnt = namedtuple("Learnt", "process observation mean covariance gravity")  # what gradients are wanted for
+Learnt = namedtuple(
+    "Learnt", "process observation mean covariance gravity"
+)  # what gradients are wanted for
 
 
 def learnt(first):
     model, nothing = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
-    parts = (model.process_noise(nothing, nothing), model.observation_noise(nothing, nothing), *first)
-    return Learnt(*(part.clone().requires_grad_() for part in (*parts, torch.tensor(9.81, dtype=torch.float64))))
+    parts = (
+        model.process_noise(nothing, nothing),
+        model.observation_noise(nothing, nothing),
+        *first,
+    )
+    return Learnt(
+        *(
+            part.clone().requires_grad_()
+            for part in (*parts, torch.tensor(9.81, dtype=torch.float64))
+        )
+    )
 
 
 def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
@@ -32,7 +43,10 @@ def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
     """
     generator = torch.Generator().manual_seed(5)
     sequences, steps = measurements.shape[:2]
-    weights = [torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64) for size in ((3,), (3, 3))]
+    weights = [
+        torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64)
+        for size in ((3,), (3, 3))
+    ]
     least = torch.tensor(lower, dtype=torch.float64)
     pairs = []
     for way in (by_the_filter, by_the_scan):
@@ -56,13 +70,31 @@ def by_the_filter(p, rule, measurements, inputs, least, _):
 
 
 def by_the_scan(p, rule, measurements, inputs, least, share):
-    model = TorchModel(partial(swung, p.gravity), pendulum_with_radar().observation, [p.gravity], least.tolist())
-    return unscented_scan(model, measurements, inputs, Gaussian(p.mean, p.covariance), p.process, p.observation, rule, share=share)
+    model = TorchModel(
+        partial(swung, p.gravity), pendulum_with_radar().observation, [p.gravity], least.tolist()
+    )
+    return unscented_scan(
+        model,
+        measurements,
+        inputs,
+        Gaussian(p.mean, p.covariance),
+        p.process,
+        p.observation,
+        rule,
+        share=share,
+    )
 
 
 def swung(gravity, x, u):
     angle, rate, damping = x.unbind(-1)
-    return torch.stack([angle + STEP * rate, rate + STEP * (u[..., 0] - gravity * torch.sin(angle) - damping * rate), damping], -1)
+    return torch.stack(
+        [
+            angle + STEP * rate,
+            rate + STEP * (u[..., 0] - gravity * torch.sin(angle) - damping * rate),
+            damping,
+        ],
+        -1,
+    )
 
 
 def assert_equal(one, other):
@@ -70,7 +102,9 @@ def assert_equal(one, other):
         for a, b in zip(getattr(one.steps, name), getattr(other.steps, name), strict=True):
             assert torch.allclose(a, b, rtol=0, atol=1e-11, equal_nan=True), name
     for name in ("innovation", "innovation_covariance"):
-        assert torch.allclose(getattr(one.steps, name), getattr(other.steps, name), rtol=0, atol=1e-11, equal_nan=True), name
+        assert torch.allclose(
+            getattr(one.steps, name), getattr(other.steps, name), rtol=0, atol=1e-11, equal_nan=True
+        ), name
     assert torch.equal(one.steps.measured, other.steps.measured)
     assert torch.equal(one.repaired, other.repaired)
 
@@ -87,22 +121,31 @@ def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
 def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     measurements, inputs, first = measured_pendulum(30, 3)
     measurements[0, 3, 0] = measurements[1, 5] = measurements[2, 10:20, 1] = torch.nan
-    (filtered, gradients), (scanned, own) = both_ways(RULES["symmetric"], measurements, inputs, first)
+    (filtered, gradients), (scanned, own) = both_ways(
+        RULES["symmetric"], measurements, inputs, first
+    )
     assert_equal(filtered, scanned)
     for a, b in zip(gradients, own, strict=True):
         assert torch.isfinite(b).all()
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
     lower = [-1e9, 0.05, 0.25]
-    (filtered, gradients), (scanned, own) = both_ways(RULES["scaled"], *measured_pendulum(30, 4), lower=lower)
+    (filtered, gradients), (scanned, own) = both_ways(
+        RULES["scaled"], *measured_pendulum(30, 4), lower=lower
+    )
     assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"
-    assert (scanned.steps.predicted.mean[..., 1] == 0.05).any(), "and that of the rate when it falls"
+    assert (scanned.steps.predicted.mean[..., 1] == 0.05).any(), (
+        "and that of the rate when it falls"
+    )
     assert (scanned.steps.filtered.mean[..., 2] >= 0.25).all()
     assert_equal(filtered, scanned)
     for a, b in zip(gradients, own, strict=True):
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
-VARIANCES = torch.tensor([[20.0, 20, 20], [1, 20, 20], [2.9, 20, 20], [-2, 20, 20], [20, 0.5, 20], [20, 20, 20]], dtype=torch.float64)
+VARIANCES = torch.tensor(
+    [[20.0, 20, 20], [1, 20, 20], [2.9, 20, 20], [-2, 20, 20], [20, 0.5, 20], [20, 20, 20]],
+    dtype=torch.float64,
+)
 """Of squares at three samples, by which the negative weight of the mean point costs nothing, the definiteness of the innovation, that of
 the state after it, the innovation's even without that weight, and that of the innovation at the second sample. The last sequence begins
 with a covariance that is not positive definite."""
@@ -110,10 +153,21 @@ with a covariance that is not positive definite."""
 
 def squares(way, repair=True):
     """Sequences with these variances by the readable filter or the scan, and gradients of means in the first mean and covariance."""
-    eye, lone = torch.eye(3, dtype=torch.float64), torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag()
-    mean = torch.tensor([[0.5, 0.0, 0.1]] * 3 + [[0.0, 0.0, 0.0]] + [[0.5, 0.0, 0.1]] * 2, dtype=torch.float64)
-    first = Gaussian(mean.requires_grad_(), torch.cat([eye.expand(5, 3, 3), lone[None]]).requires_grad_())
-    y, u, rule = torch.full((6, 3, 2), 0.1, dtype=torch.float64), VARIANCES[..., None], symmetric_rule(3, -1.0)
+    eye, lone = (
+        torch.eye(3, dtype=torch.float64),
+        torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag(),
+    )
+    mean = torch.tensor(
+        [[0.5, 0.0, 0.1]] * 3 + [[0.0, 0.0, 0.0]] + [[0.5, 0.0, 0.1]] * 2, dtype=torch.float64
+    )
+    first = Gaussian(
+        mean.requires_grad_(), torch.cat([eye.expand(5, 3, 3), lone[None]]).requires_grad_()
+    )
+    y, u, rule = (
+        torch.full((6, 3, 2), 0.1, dtype=torch.float64),
+        VARIANCES[..., None],
+        symmetric_rule(3, -1.0),
+    )
     model = NonlinearModel(
         lambda x, _: 0.9 * x,
         lambda x, _: torch.stack([x.square().sum(-1), x[..., 0]], -1),
@@ -124,17 +178,36 @@ def squares(way, repair=True):
         filtered = unscented_filter(model, y, u, first, rule)
     else:
         noises = 1e-4 * eye, model.observation_noise(None, u)
-        filtered = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, repair=repair)
-    return filtered, torch.autograd.grad(filtered.steps.filtered.mean[: 6 if repair else 1].square().sum(), first)
+        filtered = unscented_scan(
+            TorchModel(model.transition, model.observation),
+            y,
+            u,
+            first,
+            *noises,
+            rule,
+            repair=repair,
+        )
+    return filtered, torch.autograd.grad(
+        filtered.steps.filtered.mean[: 6 if repair else 1].square().sum(), first
+    )
 
 
 def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
     (filtered, slopes), (scanned, own) = squares("filter"), squares("scan")
     assert_equal(filtered, scanned)
-    ways = [[False] * 3, [True, False, False], [True, False, False], [True, False, False], [False, True, False], [True, False, False]]
+    ways = [
+        [False] * 3,
+        [True, False, False],
+        [True, False, False],
+        [True, False, False],
+        [False, True, False],
+        [True, False, False],
+    ]
     assert scanned.repaired.tolist() == ways
     for a, b in zip(slopes, own, strict=True):
-        assert torch.allclose(a, b, rtol=1e-9, atol=1e-10)  # the fourth is conditioned like the margin of a repair, 1e6
+        assert torch.allclose(
+            a, b, rtol=1e-9, atol=1e-10
+        )  # the fourth is conditioned like the margin of a repair, 1e6
 
 
 def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
@@ -159,7 +232,9 @@ def test_sequences_shared_out_are_what_they_are_together():
     together = both_ways(RULES["cubature"], *problem)[1]
     shared = both_ways(RULES["cubature"], *problem, share=halves)[1]
     assert torch.equal(together[0].steps.filtered.mean, shared[0].steps.filtered.mean)
-    assert torch.equal(together[0].steps.innovation_covariance, shared[0].steps.innovation_covariance)
+    assert torch.equal(
+        together[0].steps.innovation_covariance, shared[0].steps.innovation_covariance
+    )
     for a, b in zip(together[1], shared[1], strict=True):
         assert torch.allclose(a, b, rtol=1e-13, atol=0)
 
@@ -176,8 +251,17 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
     filtered = unscented_filter(readable, measurements, inputs, first, RULES["symmetric"])
     start = Gaussian(first.mean.clone().requires_grad_(), first.covariance)
     own = [noise_by(noise(base.detach().numpy())) for base in (p.process, p.observation)]
-    scanned = unscented_scan(TorchModel(model.transition, model.observation), measurements, inputs, start, *own, RULES["symmetric"])
-    assert torch.allclose(filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-11)
+    scanned = unscented_scan(
+        TorchModel(model.transition, model.observation),
+        measurements,
+        inputs,
+        start,
+        *own,
+        RULES["symmetric"],
+    )
+    assert torch.allclose(
+        filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-11
+    )
     with pytest.raises(RuntimeError, match="has no gradients; give it as a tensor"):
         scanned.steps.filtered.mean.sum().backward()
 
@@ -186,20 +270,37 @@ def test_one_sample_at_a_time_it_is_the_same_filter():
     measurements, inputs, first = measured_pendulum(20, 1)
     measurements[0, 4, 0] = measurements[0, 9] = torch.nan
     model, p = pendulum_with_radar(), learnt(first)
-    points, noises = TorchModel(model.transition, model.observation), [part.detach() for part in (p.process, p.observation)]
-    state = unscented_scan(points, measurements, inputs, first, *noises, RULES["symmetric"]).steps.filtered
-    stepper = UnscentedStepper(points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"])
+    points, noises = (
+        TorchModel(model.transition, model.observation),
+        [part.detach() for part in (p.process, p.observation)],
+    )
+    state = unscented_scan(
+        points, measurements, inputs, first, *noises, RULES["symmetric"]
+    ).steps.filtered
+    stepper = UnscentedStepper(
+        points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"]
+    )
     process, observation = (noise[None].numpy() for noise in noises)
     for k in range(20):
-        mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, noise_by(lambda x, u: observation))
+        mean = stepper.step(
+            measurements[0, k].numpy(),
+            inputs[0, k].numpy(),
+            process,
+            noise_by(lambda x, u: observation),
+        )
         assert mean == pytest.approx(state.mean[0, k].numpy(), abs=1e-12), k
-        assert stepper.state.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
+        assert stepper.state.covariance == pytest.approx(
+            state.covariance[0, k].numpy(), abs=1e-12
+        ), k
 
 
 def test_one_step_alone_is_the_model():
     gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
     model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
-    states, inputs = (torch.randn(6, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (3, 1))
+    states, inputs = (
+        torch.randn(6, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
+        for n in (3, 1)
+    )
     after = moved(model, states, inputs)
     assert torch.equal(after, swung(gravity.detach(), states, inputs))
     (slope,) = torch.autograd.grad(after[:, 1].sum(), gravity)
@@ -220,4 +321,10 @@ def test_shapes_that_do_not_fit_are_refused(wrong, message):
     known = ANY | {"initial": Gaussian(torch.zeros(3), torch.eye(3))} | wrong
     points = TorchModel(model.transition, model.observation)
     with pytest.raises(ValueError, match=message):
-        unscented_scan(points, **known, process_noise=torch.eye(3), observation_noise=torch.eye(2), rule=RULES["cubature"])
+        unscented_scan(
+            points,
+            **known,
+            process_noise=torch.eye(3),
+            observation_noise=torch.eye(2),
+            rule=RULES["cubature"],
+        )

@@ -23,14 +23,26 @@ NOTHING = torch.zeros(3, dtype=torch.float64)
 
 def walk(steps):
     """A position that wanders by 0.1 a sample, measured to 1 by two sensors."""
-    model = LinearModel(np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.ones(2))
-    return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(np.zeros(1), np.eye(1))
+    model = LinearModel(
+        np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.ones(2)
+    )
+    return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(
+        np.zeros(1), np.eye(1)
+    )
 
 
 def pendulum(y, u, first, gate):
     model = pendulum_with_radar()
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
-    return unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate)
+    return unscented_scan(
+        TorchModel(model.transition, model.observation),
+        y,
+        u,
+        first,
+        *noises,
+        RULES["symmetric"],
+        gate=gate,
+    )
 
 
 def by_the_filter(u, first, rule, y):
@@ -51,7 +63,9 @@ def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
     y = truth[:, None] + generator.standard_normal((steps, 2))
     taken = kalman_scan(model, y, first, Gate(2.0, 10**9)).measured
     share = 2.0 * norm.sf(2.0)
-    assert 1.0 - taken.mean() == pytest.approx(share, abs=5.0 * math.sqrt(share / (2 * steps)) + 0.002)
+    assert 1.0 - taken.mean() == pytest.approx(
+        share, abs=5.0 * math.sqrt(share / (2 * steps)) + 0.002
+    )
 
 
 def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it():
@@ -79,7 +93,9 @@ def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back():
     assert gated.measured[50 + PATIENCE :].all()
     free = kalman_scan(model, y, first)
     assert abs(gated.filtered.mean[49 + PATIENCE, 0]) < 5.0, "shut, it stays where it was"
-    assert gated.filtered.mean[-1] == pytest.approx(free.filtered.mean[-1], abs=1.0), "open, it goes where the free one goes"
+    assert gated.filtered.mean[-1] == pytest.approx(free.filtered.mean[-1], abs=1.0), (
+        "open, it goes where the free one goes"
+    )
 
 
 def test_a_gate_that_refuses_nothing_changes_no_bit():
@@ -89,7 +105,9 @@ def test_a_gate_that_refuses_nothing_changes_no_bit():
     assert np.array_equal(plain.filtered.mean, wide.filtered.mean)
     assert np.array_equal(plain.filtered.covariance, wide.filtered.covariance)
     y, u, start = measured_pendulum(60, 3)
-    without, within = (pendulum(y, u, start, gate).steps.filtered for gate in (None, Gate(1e9, PATIENCE)))
+    without, within = (
+        pendulum(y, u, start, gate).steps.filtered for gate in (None, Gate(1e9, PATIENCE))
+    )
     assert torch.equal(without.mean, within.mean)
     assert torch.equal(without.covariance, within.covariance)
 
@@ -107,7 +125,9 @@ def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
     model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
     for name, rule in RULES.items():
-        scanned = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate).steps
+        scanned = unscented_scan(
+            TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate
+        ).steps
         for row in range(3):
             judged = gated(partial(by_the_filter, u[row], first, rule), y[row], gate)
             assert torch.equal(judged.measured, scanned.measured[row]), name
@@ -116,7 +136,9 @@ def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
         assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
         for a, b in zip(readable.filtered, scanned.filtered, strict=True):
             assert torch.allclose(a, b, rtol=0, atol=1e-12 * float(a.abs().max())), name
-        assert torch.allclose(readable.innovation_covariance, scanned.innovation_covariance, rtol=1e-10, atol=1e-10)
+        assert torch.allclose(
+            readable.innovation_covariance, scanned.innovation_covariance, rtol=1e-10, atol=1e-10
+        )
 
 
 def test_gradients_through_a_gate_are_those_of_missing_measurements():
@@ -128,10 +150,17 @@ def test_gradients_through_a_gate_are_those_of_missing_measurements():
     found = []
     for measurements, gate in ((y, Gate(4.0, PATIENCE)), (torch.where(taken, y, torch.nan), None)):
         own = [part.clone().requires_grad_() for part in (measurements, *first)]
-        noises = [noise(NOTHING, NOTHING).clone().requires_grad_() for noise in (model.process_noise, model.observation_noise)]
+        noises = [
+            noise(NOTHING, NOTHING).clone().requires_grad_()
+            for noise in (model.process_noise, model.observation_noise)
+        ]
         points = TorchModel(model.transition, model.observation)
-        scanned = unscented_scan(points, own[0], u, Gaussian(*own[1:]), *noises, RULES["symmetric"], gate=gate)
-        found.append(torch.autograd.grad((scanned.steps.filtered.mean * weights).sum(), (*own, *noises)))
+        scanned = unscented_scan(
+            points, own[0], u, Gaussian(*own[1:]), *noises, RULES["symmetric"], gate=gate
+        )
+        found.append(
+            torch.autograd.grad((scanned.steps.filtered.mean * weights).sum(), (*own, *noises))
+        )
     for a, b in zip(*found, strict=True):
         assert torch.isfinite(a).all()
         assert torch.equal(a, b)

@@ -2,7 +2,13 @@
 
 import os
 
-os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "MPLBACKEND": "agg"}
+os.environ |= {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "COLUMNS": "160",
+    "MPLBACKEND": "agg",
+}
 
 import argparse
 import sys
@@ -20,10 +26,15 @@ def main():
         started = time.monotonic()
         folder = Path(options.folder) if options.folder else Path(made)
         folder.mkdir(parents=True, exist_ok=True)
-        fuzzer = Fuzzer(folder, options.seed, options.family, keep=bool(options.folder), seconds=options.seconds)
+        fuzzer = Fuzzer(
+            folder, options.seed, options.family, keep=bool(options.folder), seconds=options.seconds
+        )
         fuzzer.prepare()
         indices = options.only or range(options.inputs)
-        print(f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after {time.monotonic() - started:.0f} s", flush=True)
+        print(
+            f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after {time.monotonic() - started:.0f} s",
+            flush=True,
+        )
         rows = []
 
         def report(row):
@@ -39,7 +50,9 @@ def main():
         if options.only and options.folder:
             print(f"files: {', '.join(str(folder / f'{index:06d}') for index in indices)}")
         bad = sum(row.verdict != "ok" for row in rows)
-        print(f"\n{summary(rows)}\n\n{bad} of {len(rows)} inputs ended badly; {time.monotonic() - started:.0f} s, seed {options.seed}")
+        print(
+            f"\n{summary(rows)}\n\n{bad} of {len(rows)} inputs ended badly; {time.monotonic() - started:.0f} s, seed {options.seed}"
+        )
     return 1 if bad else 0
 
 
@@ -50,7 +63,9 @@ def _options():
     parser.add_argument("--only", type=int, nargs="+", help="indices of single inputs to try again")
     parser.add_argument("--jobs", type=int, default=2, help="children at a time")
     parser.add_argument("--seconds", type=float, default=20.0, help="that a command may take")
-    parser.add_argument("--family", nargs="+", default=[], help="families to use; indices then count other inputs")
+    parser.add_argument(
+        "--family", nargs="+", default=[], help="families to use; indices then count other inputs"
+    )
     parser.add_argument("--out", help="CSV file to write")
     parser.add_argument("--folder", help="work here and keep every input's files")
     return parser.parse_args()

@@ -51,13 +51,19 @@ class Case:
 
     def copy(self, template, to="."):
         """Copy a template's folder into the place, and say where."""
-        return Path(shutil.copytree(self.templates / template, self.place / to, symlinks=True, dirs_exist_ok=True))
+        return Path(
+            shutil.copytree(
+                self.templates / template, self.place / to, symlinks=True, dirs_exist_ok=True
+            )
+        )
 
     def write(self, name, content):
         """Write a file into the place."""
         path = self.place / os.fsdecode(name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
+        path.write_bytes(
+            content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
+        )
         return path
 
     def spoil(self, file, spoil):
@@ -81,7 +87,9 @@ def generator(*needs, weight=1):
     """Register a generator with the templates that it copies from."""
 
     def register(build):
-        GENERATORS.append(Generator(build.__module__.rpartition(".")[2], build.__name__, build, needs, weight))
+        GENERATORS.append(
+            Generator(build.__module__.rpartition(".")[2], build.__name__, build, needs, weight)
+        )
         return build
 
     return register
@@ -103,7 +111,12 @@ def load_families():
 
 def schedule(chosen):
     """The generators in the order in which they take turns; heavier ones come more than once a round."""
-    return [one for turn in range(max(one.weight for one in chosen)) for one in chosen if one.weight > turn]
+    return [
+        one
+        for turn in range(max(one.weight for one in chosen))
+        for one in chosen
+        if one.weight > turn
+    ]
 
 
 def is_honest(one, position, visit):

@@ -19,11 +19,22 @@ from vehest.cli import main
 
 SECONDS, RATE_HZ = 30.0, 50.0
 SWEEPS = [
-    ["estimator=luenberger", "estimator.rate_hz=20", "training.grid=1", "training.max_evaluations=5"],
+    [
+        "estimator=luenberger",
+        "estimator.rate_hz=20",
+        "training.grid=1",
+        "training.max_evaluations=5",
+    ],
     ["estimator=ksnn", "estimator.n_hidden=0", "training.max_epochs=1"],
 ]
 PIPELINE = place.PIPELINE | {"sweeps": SWEEPS, "evaluation": {"rate_hz": 20}}
-KSNN = ("estimator=ksnn", "estimator.n_hidden=0", "split=mine", "training.max_epochs=1", "tracking=none")
+KSNN = (
+    "estimator=ksnn",
+    "estimator.n_hidden=0",
+    "split=mine",
+    "training.max_epochs=1",
+    "tracking=none",
+)
 LUENBERGER = (*SWEEPS[0], "split=mine", "tracking=none")
 KALMAN = ("estimator=kalman", "estimator.rate_hz=50", "split=steered", "tracking=none")
 
@@ -31,7 +42,12 @@ KALMAN = ("estimator=kalman", "estimator.rate_hz=50", "split=steered", "tracking
 def lap(seed=9, seconds=SECONDS, rate_hz=RATE_HZ):
     """A drive whose columns are called like channels, in SI units."""
     drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02)
-    return pd.DataFrame({"time": drive.time, **{name: drive[name] for name in ("vx", "yaw_rate", "ay", "ax", "vx_ref", "vy_ref")}})
+    return pd.DataFrame(
+        {
+            "time": drive.time,
+            **{name: drive[name] for name in ("vx", "yaw_rate", "ay", "ax", "vx_ref", "vy_ref")},
+        }
+    )
 
 
 def run(*words):
@@ -45,7 +61,9 @@ def run(*words):
             main()
         except SystemExit as leave:
             if leave.code:
-                raise RuntimeError(f"'vehest {' '.join(words)}' leaves with {leave.code}") from leave
+                raise RuntimeError(
+                    f"'vehest {' '.join(words)}' leaves with {leave.code}"
+                ) from leave
 
 
 @template
@@ -62,7 +80,10 @@ def drives(folder):
 def steered(folder):
     """Three tables with a steering angle, for filters that know a car; and the Kalman filter of their split."""
     write_steered(folder, {"one": 1, "two": 2, "three": 3})
-    write_yaml(folder / "conf" / "split" / "steered.yaml", SPLIT | {"name": "steered", "dataset": "steered"})
+    write_yaml(
+        folder / "conf" / "split" / "steered.yaml",
+        SPLIT | {"name": "steered", "dataset": "steered"},
+    )
 
 
 @template
@@ -101,7 +122,10 @@ def import_everything():
     import vehest
     import vehest_papers
 
-    for module in (*pkgutil.walk_packages(vehest.__path__, "vehest."), *pkgutil.walk_packages(vehest_papers.__path__, "vehest_papers.")):
+    for module in (
+        *pkgutil.walk_packages(vehest.__path__, "vehest."),
+        *pkgutil.walk_packages(vehest_papers.__path__, "vehest_papers."),
+    ):
         if module.name != "vehest.__main__":
             importlib.import_module(module.name)
     for name in PIECES:
@@ -109,7 +133,9 @@ def import_everything():
     for name in PACKAGES:
         for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
             if not module.name.endswith("__main__"):
-                with suppress(ImportError, AssertionError):  # of what is not installed, or made for another system
+                with suppress(
+                    ImportError, AssertionError
+                ):  # of what is not installed, or made for another system
                     importlib.import_module(module.name)
     for module in pkgutil.iter_modules(encodings.__path__):
         if module.name not in ("mbcs", "oem", "cp65001"):
@@ -127,7 +153,12 @@ def load_kernels():
     time = np.arange(1200) / 20.0
     yaw_rate = 0.3 * np.sin(0.7 * time) + 0.05 * np.sin(2.9 * time)
     vy, vx = -2.0 * yaw_rate, 20.0 + np.sin(0.2 * time)
-    channels = {"yaw_rate": yaw_rate, "vx": vx, "ay": np.gradient(vy, time) + vx * yaw_rate, "vy_ref": vy}
+    channels = {
+        "yaw_rate": yaw_rate,
+        "vx": vx,
+        "ay": np.gradient(vy, time) + vx * yaw_rate,
+        "vy_ref": vy,
+    }
     drive = vehest.Recording("drive", "car", 20.0, 0.0, channels, "simulated")
     for drives in ([drive], []):
         vehest.estimate(vehest.train("zero", drives, drives), drive.without_references())

@@ -39,7 +39,18 @@ RAW = (
     "%percent", "[" * 100 + "]" * 100, "[" * 5000 + "]" * 5000, "{a: " * 70 + "1" + "}" * 70, "9" * 5000, "0." + "1" * 100_000,
 )  # fmt: skip
 """Pieces of YAML that a reader may stumble over."""
-JSON = ("[" * 100_000, '{"a": ' * 90 + "1" + "}" * 90, "1" * 5000, "NaN", "1e999", '"\\ud800"', "null", "3", "[]", '"a"')
+JSON = (
+    "[" * 100_000,
+    '{"a": ' * 90 + "1" + "}" * 90,
+    "1" * 5000,
+    "NaN",
+    "1e999",
+    '"\\ud800"',
+    "null",
+    "3",
+    "[]",
+    '"a"',
+)
 
 
 def spoil_bytes(content, rng):
@@ -51,7 +62,10 @@ def spoil_bytes(content, rng):
         if not size:
             break
         near = size if where == "anywhere" else min(size, 500)
-        at, length = (size - near if where == "end" else 0) + rng.randrange(near), rng.choice([1, 2, 4, 8, 16, 100, 1000])
+        at, length = (
+            (size - near if where == "end" else 0) + rng.randrange(near),
+            rng.choice([1, 2, 4, 8, 16, 100, 1000]),
+        )
         how = rng.randrange(7)
         if how == 0:
             data[at] ^= 1 << rng.randrange(8)
@@ -66,14 +80,23 @@ def spoil_bytes(content, rng):
         elif how == 5:
             data[at:at] = data[at : at + length] * rng.choice([1, 2, 50])
         else:
-            number, width = rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1]), rng.choice([2, 4, 8])
-            data[at : at + width] = (number % 2 ** (8 * width)).to_bytes(width, rng.choice(["little", "big"]))
+            number, width = (
+                rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1]),
+                rng.choice([2, 4, 8]),
+            )
+            data[at : at + width] = (number % 2 ** (8 * width)).to_bytes(
+                width, rng.choice(["little", "big"])
+            )
     return bytes(data)
 
 
 def hostile(rng, yaml_text=False):
     """A value that belongs nowhere."""
-    return Raw(rng.choice(RAW)) if yaml_text and rng.random() < 0.3 else copy.deepcopy(rng.choice(SCALARS))
+    return (
+        Raw(rng.choice(RAW))
+        if yaml_text and rng.random() < 0.3
+        else copy.deepcopy(rng.choice(SCALARS))
+    )
 
 
 def spoil_tree(tree, rng, yaml_text=False):
@@ -89,7 +112,9 @@ def spoil_tree(tree, rng, yaml_text=False):
         if how == 0:
             del holder[key]
         elif how == 1 and isinstance(holder, dict):
-            holder[rng.choice([*NAMES, 1, None, True, f"{key}x", "defaults", "_target_"])] = holder.pop(key)
+            holder[rng.choice([*NAMES, 1, None, True, f"{key}x", "defaults", "_target_"])] = (
+                holder.pop(key)
+            )
         elif how == 1:
             holder.extend(copy.deepcopy(holder[key]) for _ in range(rng.choice([1, 100, 5000])))
         elif how == 2:
@@ -107,7 +132,11 @@ def spoil_tree(tree, rng, yaml_text=False):
 def _holders(tree):
     """Every mapping and list of a tree."""
     inner = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
-    return [tree, *(holder for value in inner for holder in _holders(value))] if isinstance(tree, dict | list) else []
+    return (
+        [tree, *(holder for value in inner for holder in _holders(value))]
+        if isinstance(tree, dict | list)
+        else []
+    )
 
 
 def spoil_items(tree, rng):
@@ -168,7 +197,10 @@ def _bomb(rng):
     """A few hundred bytes of YAML whose aliases or merged mappings would unfold to 10¹² values, or some such number."""
     if rng.random() < 0.5:
         lines = ["m0: &m0 {a: 1, b: 2}"]
-        lines += [f"m{k}: &m{k} {{<<: [{', '.join([f'*m{k - 1}'] * 8)}], k{k}: *m{k - 1}}}" for k in range(1, rng.choice([6, 12, 25]))]
+        lines += [
+            f"m{k}: &m{k} {{<<: [{', '.join([f'*m{k - 1}'] * 8)}], k{k}: *m{k - 1}}}"
+            for k in range(1, rng.choice([6, 12, 25]))
+        ]
     else:
         width, depth = rng.choice([(10, 12), (2, 40), (100, 6), (9, 9)])
         lines = [f"b0: &b0 [{', '.join(['x'] * width)}]"]

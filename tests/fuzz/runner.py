@@ -28,7 +28,10 @@ from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
-Row = namedtuple("Row", "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict detail")
+Row = namedtuple(
+    "Row",
+    "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict detail",
+)
 """One input and what became of it: a line of the CSV file."""
 
 
@@ -38,7 +41,11 @@ class Fuzzer:
     def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
         self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
         load_families()
-        chosen = [one for one in GENERATORS if (one.family in families if families else one.family != PLANTED)]
+        chosen = [
+            one
+            for one in GENERATORS
+            if (one.family in families if families else one.family != PLANTED)
+        ]
         if not chosen:
             raise SystemExit("no family has such a name")
         self.turns = schedule(chosen)
@@ -51,7 +58,10 @@ class Fuzzer:
 
         honest.import_everything()
         needed = sorted({name for one in self.turns for name in one.needs})
-        for name, make in {"first": honest.warm_up, **{name: TEMPLATES[name] for name in needed}}.items():
+        for name, make in {
+            "first": honest.warm_up,
+            **{name: TEMPLATES[name] for name in needed},
+        }.items():
             folder = self.folder / "templates" / name
             folder.mkdir(parents=True)
             with _quiet(folder):
@@ -69,7 +79,9 @@ class Fuzzer:
         gc.collect()
         gc.freeze()  # what is here stays; children need not copy it to look through it
         sys.stdout.flush()
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), die_with_parent) as workers:
+        with ProcessPoolExecutor(
+            jobs, multiprocessing.get_context("fork"), die_with_parent
+        ) as workers:
             for ended in as_completed([workers.submit(self.try_one, index) for index in indices]):
                 report(ended.result())
 
@@ -81,21 +93,55 @@ class Fuzzer:
             command = one.build(case)
         except Exception:
             detail = printable(" | ".join(traceback.format_exc().splitlines()[-4:]))
-            return Row(index, one.family, one.name, honest, "", 0, 0.0, 0.0, 0.0, "", "generator failed", detail)
+            return Row(
+                index,
+                one.family,
+                one.name,
+                honest,
+                "",
+                0,
+                0.0,
+                0.0,
+                0.0,
+                "",
+                "generator failed",
+                detail,
+            )
         outcome = _watch(case, command)
         verdict, detail = judge(case, command, outcome)
         if not self.keep:
             _remove(case.folder)
         error = last_line("\n".join(refusal_lines(outcome.stderr)))
-        shown, took = _shown(command, case), (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb)
-        said = (printable(text.replace(str(case.folder), "…"))[:200] for text in (error, verdict, detail))
-        return Row(index, one.family, one.name, honest, shown, *(round(number, 3) for number in took), *said)
+        shown, took = (
+            _shown(command, case),
+            (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb),
+        )
+        said = (
+            printable(text.replace(str(case.folder), "…"))[:200]
+            for text in (error, verdict, detail)
+        )
+        return Row(
+            index,
+            one.family,
+            one.name,
+            honest,
+            shown,
+            *(round(number, 3) for number in took),
+            *said,
+        )
 
     def case_of(self, index, visit, honest):
         """An empty folder for an input; what is drawn depends on seed and index alone."""
         folder = self.folder / f"{index:06d}"
         _remove(folder)
-        case = Case(folder, self.folder / "templates", random.Random(f"{self.seed}-{index}"), honest, visit, self.seconds)
+        case = Case(
+            folder,
+            self.folder / "templates",
+            random.Random(f"{self.seed}-{index}"),
+            honest,
+            visit,
+            self.seconds,
+        )
         for made in (case.place, folder / "tmp", folder / "home", folder / "log"):
             made.mkdir(parents=True)
         return case
@@ -121,7 +167,9 @@ def _watch(case, command):
     readers.look()
     seconds = max(0.0, time.monotonic() - started - readers.waited)
     with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(child, signal.SIGKILL)  # whatever it has started; its number is its own until it is waited for
+        os.killpg(
+            child, signal.SIGKILL
+        )  # whatever it has started; its number is its own until it is waited for
     _, status, used = os.wait4(child, 0)
     logs = case.folder / "log"
     noted = [json.loads(line) for line in _text(logs / "events").splitlines()]
@@ -129,7 +177,9 @@ def _watch(case, command):
         noted += [json.loads(line) for line in os.read(events, 2**16).splitlines()]
     os.close(events)
     imports_kb = next((value for key, value in noted if key == "rss"), used.ru_maxrss)
-    most_kb = readers.command_kb if readers.peaks_kb else used.ru_maxrss  # which counts ended children too
+    most_kb = (
+        readers.command_kb if readers.peaks_kb else used.ru_maxrss
+    )  # which counts ended children too
     return Outcome(
         exit_code=os.waitstatus_to_exitcode(status),
         seconds=seconds,
@@ -139,7 +189,9 @@ def _watch(case, command):
         stderr=_text(logs / "stderr"),
         events=tuple((key, str(value)) for key, value in noted if key != "rss"),
         changed=differences(before, snapshot(case.folder)),
-        stack=" < ".join(line.strip() for line in _text(logs / "stack").splitlines() if line.startswith("  File"))[:1500],
+        stack=" < ".join(
+            line.strip() for line in _text(logs / "stack").splitlines() if line.startswith("  File")
+        )[:1500],
     )
 
 
@@ -202,7 +254,11 @@ def _quiet(folder):
     """Work in a folder, with what is printed kept back."""
     printed = io.StringIO()
     try:
-        with contextlib.chdir(folder), contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        with (
+            contextlib.chdir(folder),
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(printed),
+        ):
             yield
     except BaseException:
         sys.stdout.write(printed.getvalue())
@@ -217,7 +273,10 @@ def write_rows(rows, path):
 
 def described(row):
     """A row for people, on two lines."""
-    kind, took = " (honest)" if row.honest else "", f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
+    kind, took = (
+        " (honest)" if row.honest else "",
+        f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)",
+    )
     return (
         f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest {row.command}\n"
         f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} {row.detail}"
@@ -229,7 +288,12 @@ def summary(rows):
     lines = []
     for family in [*sorted({row.family for row in rows}), "all"]:
         own = [row for row in rows if family in (row.family, "all")]
-        ended = ", ".join(f"{number} {verdict}" for verdict, number in Counter(row.verdict for row in own).most_common())
+        ended = ", ".join(
+            f"{number} {verdict}"
+            for verdict, number in Counter(row.verdict for row in own).most_common()
+        )
         honest, done = sum(row.honest for row in own), sum(row.exit_code == 0 for row in own)
-        lines.append(f"{family:<14} {len(own):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}")
+        lines.append(
+            f"{family:<14} {len(own):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}"
+        )
     return "\n".join(lines)

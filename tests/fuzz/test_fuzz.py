@@ -22,7 +22,12 @@ TESTS = Path(__file__).parents[1]
 def rows_of(folder, *options):
     """Rows of a run of the harness, in a process of its own."""
     out = folder / "fuzz.csv"
-    paths = [str(TESTS), str(TESTS / "sources"), str(TESTS.parent / "src"), os.environ.get("PYTHONPATH", "")]
+    paths = [
+        str(TESTS),
+        str(TESTS / "sources"),
+        str(TESTS.parent / "src"),
+        os.environ.get("PYTHONPATH", ""),
+    ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     command = [sys.executable, "-m", "fuzz", "--out", str(out), *options]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -37,13 +42,20 @@ def test_two_hundred_malformed_inputs_end_with_a_result_or_one_line(tmp_path):
     honest = [row for row in rows if row["honest"] == "True"]
     assert len(honest) >= 15
     load_families()
-    assert {(row["family"], row["generator"]) for row in rows} == {(one.family, one.name) for one in GENERATORS if one.family != PLANTED}
-    bad = [f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest {row['command']}: {row['detail']}" for row in rows]
+    assert {(row["family"], row["generator"]) for row in rows} == {
+        (one.family, one.name) for one in GENERATORS if one.family != PLANTED
+    }
+    bad = [
+        f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest {row['command']}: {row['detail']}"
+        for row in rows
+    ]
     assert [line for line, row in zip(bad, rows, strict=True) if row["verdict"] != "ok"] == []
 
 
 def test_each_misdeed_gets_its_verdict(tmp_path):
-    rows = rows_of(tmp_path, "--family", "planted", "--inputs", str(len(MISDEEDS)), "--seconds", "6")
+    rows = rows_of(
+        tmp_path, "--family", "planted", "--inputs", str(len(MISDEEDS)), "--seconds", "6"
+    )
     found = {row["command"].removeprefix("PLANTED:"): row["verdict"] for row in rows}
     assert found == {name: verdict for name, (verdict, _) in MISDEEDS.items()}
     assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}

@@ -57,11 +57,16 @@ def _findings(case, command, outcome):
     yield from (("executed", f"made {path}") for path in made)
     for verdict in ("executed", "outside"):
         yield from (event for event in outcome.events if event[0] == verdict)
-    yield from (("outside", path) for path in outcome.changed if not _is_allowed(path, case, command))
+    yield from (
+        ("outside", path) for path in outcome.changed if not _is_allowed(path, case, command)
+    )
     if outcome.peak_mb > MEMORY_MB:
         yield "memory", f"{outcome.peak_mb:.0f} MB"
     if outcome.seconds > case.seconds:
-        yield "slow", f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; {outcome.stack}"
+        yield (
+            "slow",
+            f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; {outcome.stack}",
+        )
     if outcome.exit_code < 0:
         yield "crash", f"signal {-outcome.exit_code}"
     if "Traceback (most recent call last)" in outcome.stderr + outcome.stdout:
@@ -74,7 +79,11 @@ def _findings(case, command, outcome):
     control = _CONTROL.search(outcome.stdout) or _CONTROL.search(outcome.stderr)
     if control:
         yield "escapes", repr(control.string[max(0, control.start() - 20) : control.end() + 20])
-    yield from (("leftovers", path) for path in outcome.changed if ASIDE_PREFIX in path or path.startswith("tmp/"))
+    yield from (
+        ("leftovers", path)
+        for path in outcome.changed
+        if ASIDE_PREFIX in path or path.startswith("tmp/")
+    )
 
 
 def _about_lines(case, command, outcome):
@@ -83,8 +92,12 @@ def _about_lines(case, command, outcome):
     if case.honest:
         yield "refused", f"exit code {outcome.exit_code}: {last_line(outcome.stderr)}"
     lines = refusal_lines(outcome.stderr)
-    words = [os.fsdecode(word) for word in command.argv[:2]]  # these say on standard output what is wrong, and leave with a code by it
-    if not lines and not ((words[:1] == ["doctor"] or words == ["data", "check"]) and outcome.stdout.strip()):
+    words = [
+        os.fsdecode(word) for word in command.argv[:2]
+    ]  # these say on standard output what is wrong, and leave with a code by it
+    if not lines and not (
+        (words[:1] == ["doctor"] or words == ["data", "check"]) and outcome.stdout.strip()
+    ):
         yield "silent", f"exit code {outcome.exit_code}"
     if len(lines) > 1 or any(not line.startswith("error: ") for line in lines):
         yield "several lines", f"{len(lines)} lines, first {lines[0][:120]!r}"
@@ -105,7 +118,9 @@ def _is_allowed(path, case, command):
     place = case.place.relative_to(case.folder).as_posix()
     roots = [f"{place}/{name}" for name in ("outputs", *command.targets)] + ["tmp"]
     folder, _, name = path.rpartition("/")  # a target is first written beside it
-    is_aside = name.startswith(ASIDE_PREFIX) and any(root.rpartition("/")[0] == folder for root in roots)
+    is_aside = name.startswith(ASIDE_PREFIX) and any(
+        root.rpartition("/")[0] == folder for root in roots
+    )
     return is_aside or any(path == root or path.startswith(f"{root}/") for root in roots)
 
 
@@ -125,7 +140,10 @@ def snapshot(folder):
                 continue
             about = entry.stat(follow_symlinks=False)
             is_folder = stat.S_ISDIR(about.st_mode)
-            found[path] = (about.st_mode, None if is_folder else (about.st_size, about.st_mtime_ns, about.st_ino))
+            found[path] = (
+                about.st_mode,
+                None if is_folder else (about.st_size, about.st_mtime_ns, about.st_ino),
+            )
             if is_folder:
                 pending.append(entry.path)
     return found
@@ -133,4 +151,6 @@ def snapshot(folder):
 
 def differences(before, after):
     """Paths that are new, gone or different, sorted."""
-    return tuple(sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path)))
+    return tuple(
+        sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
+    )

@@ -17,13 +17,32 @@ ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
 
 # What runs, and what asks for code to be run. Each is noted; a program that would start is stopped.
-PROGRAMS = {"os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile", "os.fork", "os.forkpty", "pty.spawn", "subprocess.Popen"}
-CODE = frozenset({"exec", "compile", "import", "ctypes.dlopen", "pickle.find_class", "marshal.loads"})
+PROGRAMS = {
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.startfile",
+    "os.fork",
+    "os.forkpty",
+    "pty.spawn",
+    "subprocess.Popen",
+}
+CODE = frozenset(
+    {"exec", "compile", "import", "ctypes.dlopen", "pickle.find_class", "marshal.loads"}
+)
 # Position of the path that each of these writes to.
-WRITES = {f"os.{name}": (0,) for name in ("mkdir", "remove", "rmdir", "truncate", "chmod", "chown", "utime", "mkfifo")}
+WRITES = {
+    f"os.{name}": (0,)
+    for name in ("mkdir", "remove", "rmdir", "truncate", "chmod", "chown", "utime", "mkfifo")
+}
 WRITES |= {"shutil.rmtree": (0,), "os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}
 DEVICES = ("/dev/null", "/dev/full", "/dev/zero", "/dev/tty", "/dev/shm/")
-NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made, though a user may ask for it
+NO_PLACES = (
+    "/dev/null/",
+    "/dev/full/",
+    "/proc/",
+)  # where nothing can be made, though a user may ask for it
 
 # Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels, syntax trees; annotations of the commands'
 # own functions, which inspect and typing evaluate for Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates
@@ -34,7 +53,12 @@ MAKERS += ("rosbags.typesys.store", "rosbags.serde.", "sqlalchemy.util.langhelpe
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
 READER = "vehest.sources.limited"
 """The module that a command may run in a process of its own, to read one file."""
-IMPORTERS = ("importlib._bootstrap", "importlib._bootstrap_external", "_frozen_importlib", "_frozen_importlib_external")
+IMPORTERS = (
+    "importlib._bootstrap",
+    "importlib._bootstrap_external",
+    "_frozen_importlib",
+    "_frozen_importlib_external",
+)
 
 
 class Watch:
@@ -83,13 +107,22 @@ class Watch:
             return
         if self._reads and (event == "ctypes.dlopen" or _called_from(caller, IMPORTERS)):
             return
-        if event in ("exec", "marshal.loads", "compile") and (module in IMPORTERS or module.startswith(MAKERS)):
+        if event in ("exec", "marshal.loads", "compile") and (
+            module in IMPORTERS or module.startswith(MAKERS)
+        ):
             return
-        if event == "pickle.find_class" and _called_from(caller, ("multiprocessing.", "concurrent.futures.")):
+        if event == "pickle.find_class" and _called_from(
+            caller, ("multiprocessing.", "concurrent.futures.")
+        ):
             return
         what = arguments[1] if event == "compile" else arguments[0]
         code = getattr(what, "co_filename", None) or what
-        if self._reads and event == "exec" and os.path.isabs(str(code)) and not str(code).startswith(self._inside + os.sep):
+        if (
+            self._reads
+            and event == "exec"
+            and os.path.isabs(str(code))
+            and not str(code).startswith(self._inside + os.sep)
+        ):
             return
         if module == "jinja2.environment" and str(code).startswith(PAGES):
             return
@@ -102,13 +135,19 @@ class Watch:
     def _program(self, event, arguments):
         if event == "os.fork" or _called_from(sys._getframe(2), ("multiprocessing.",)):
             return
-        if event == "subprocess.Popen" and [*arguments[1]][:1] + [*arguments[1]][-2:] == [sys.executable, "-m", READER]:
+        if event == "subprocess.Popen" and [*arguments[1]][:1] + [*arguments[1]][-2:] == [
+            sys.executable,
+            "-m",
+            READER,
+        ]:
             return
         self._note("executed", f"{event} {str(arguments)[:120]}")
         raise PermissionError(1, "no program is started here")
 
     def _opened(self, path, mode, flags):
-        writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
+        writes = isinstance(flags, int) and flags & (
+            os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+        )
         if writes or (isinstance(mode, str) and set(mode) & set("wax+")):
             self._written("open", path)
 
@@ -124,7 +163,9 @@ class Watch:
             self._armed = True
         kernels = real.endswith((".nbi", ".nbc")) or "__pycache__" in real
         device = (event == "open" and real.startswith(DEVICES)) or f"{real}/".startswith(NO_PLACES)
-        if not (real == self._inside or real.startswith(self._inside + os.sep) or device or kernels):
+        if not (
+            real == self._inside or real.startswith(self._inside + os.sep) or device or kernels
+        ):
             self._note("outside", f"{event} {real[:160]}")
             raise PermissionError(1, "this is outside of the sandbox", real)
 
@@ -216,13 +257,20 @@ def _prepare(case, command):
     _redirect(2, logs / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
-    sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False, buffering=1)  # noqa: SIM115
+    sys.stderr = open(  # noqa: SIM115
+        2, "w", encoding="utf-8", errors="backslashreplace", closefd=False, buffering=1
+    )
     os.chdir(case.place)
     _environment(case)
     tempfile.tempdir = str(case.folder / "tmp")
-    sys.modules["__main__"] = types.ModuleType("__main__")  # the name of the program follows from it: vehest, not python -m fuzz
+    sys.modules["__main__"] = types.ModuleType(
+        "__main__"
+    )  # the name of the program follows from it: vehest, not python -m fuzz
     sys.argv = ["vehest", *(os.fsdecode(word) for word in command.argv)]
-    sys.path[:] = [str(Path(__file__).parent / "reader"), *(entry for entry in sys.path if entry not in ("", "."))]
+    sys.path[:] = [
+        str(Path(__file__).parent / "reader"),
+        *(entry for entry in sys.path if entry not in ("", ".")),
+    ]
     os.write(report, (json.dumps(["rss", status_kb("VmRSS")]) + "\n").encode())
     size = status_kb("VmSize") * 1024 + ADDRESS_SPACE
     for limit, value in {"AS": size, "CPU": 90, "FSIZE": FILE_SIZE, "CORE": 0}.items():
@@ -231,10 +279,16 @@ def _prepare(case, command):
 
 
 def _environment(case):
-    for name in [name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))]:
+    for name in [
+        name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))
+    ]:
         del os.environ[name]
     os.environ |= {"FUZZ_CASE": str(case.folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    os.environ |= {"VEHEST_DATA": str(case.place / "raw"), "HOME": str(case.folder / "home"), "TMPDIR": str(case.folder / "tmp")}
+    os.environ |= {
+        "VEHEST_DATA": str(case.place / "raw"),
+        "HOME": str(case.folder / "home"),
+        "TMPDIR": str(case.folder / "tmp"),
+    }
 
 
 def _redirect(descriptor, path, flags):

@@ -29,7 +29,11 @@ from vehest.trust.faults import is_fault
 
 FILE = Path(__file__).with_name("digests.json")
 DIGITS = 6
-LEARNT, SIMULATED, FIXED = 1e-3, 1e-6, 1e-9  # tolerances elsewhere than on the machine that recorded, of an array's largest value
+LEARNT, SIMULATED, FIXED = (
+    1e-3,
+    1e-6,
+    1e-9,
+)  # tolerances elsewhere than on the machine that recorded, of an array's largest value
 LIBRARIES = ("numpy", "scipy", "numba", "torch")
 VEHICLE = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 MODEL = "static_map"
@@ -41,9 +45,13 @@ Arrays = dict[str, np.ndarray]
 class Subject:
     """Something with versions whose numbers are recorded."""
 
-    versions: Mapping[str, str]  # what to raise when numbers move, for example ``Ksnn.version``, and its value
+    versions: Mapping[
+        str, str
+    ]  # what to raise when numbers move, for example ``Ksnn.version``, and its value
     tolerance: float  # of values elsewhere than on the machine that recorded
-    numbers: Callable[[], Mapping[str, Arrays]]  # makes them: ``weights`` and ``estimates`` of an estimator, else one part
+    numbers: Callable[
+        [], Mapping[str, Arrays]
+    ]  # makes them: ``weights`` and ``estimates`` of an estimator, else one part
 
     def record(self):
         """What digests.json holds of it."""
@@ -51,30 +59,45 @@ class Subject:
         return {
             "versions": dict(self.versions),
             "digests": {part: digest_of(arrays) for part, arrays in parts.items()},
-            "values": {part: {name: _values(array) for name, array in arrays.items()} for part, arrays in parts.items()},
+            "values": {
+                part: {name: _values(array) for name, array in arrays.items()}
+                for part, arrays in parts.items()
+            },
         }
 
 
 def subjects():
     """All of them, by name."""
-    found = {name: _estimator(name) for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")}
+    found = {
+        name: _estimator(name)
+        for name in estimator_names()
+        if estimator_class(name).__module__.startswith("vehest.")
+    }
     for name, make in SOURCES.items():
         tolerance = SIMULATED if name == "simulated" else FIXED
         told = source_class({"source": name})
-        found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make))
+        found[f"source {name}"] = Subject(
+            {f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make)
+        )
     for stage, numbers in STAGES.items():
         name, tolerance = stage.__name__.removeprefix("vehest.run."), FIXED
         what = f"{name} in vehest.run.versions"
         if stage is not downsample:
             what, tolerance = f"{what}, unless numbers of {MODEL} moved too,", LEARNT
-        found[f"stage {name}"] = Subject({what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers))
+        found[f"stage {name}"] = Subject(
+            {what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
+        )
     return found
 
 
 def this_machine():
     """What digits depend on."""
     libraries = {name: metadata.version(name) for name in LIBRARIES}
-    return {"cpu": str(llvmlite.binding.get_host_cpu_name()), "python": platform.python_version(), **libraries}
+    return {
+        "cpu": str(llvmlite.binding.get_host_cpu_name()),
+        "python": platform.python_version(),
+        **libraries,
+    }
 
 
 def moved(name, recorded, now, tolerance):
@@ -82,13 +105,25 @@ def moved(name, recorded, now, tolerance):
     if recorded["versions"] != now["versions"]:
         return f"a version of {name} was raised: record its numbers with `make golden`"
     if tolerance is None:
-        parts = [part for part, digest in recorded["digests"].items() if now["digests"].get(part) != digest]
+        parts = [
+            part
+            for part, digest in recorded["digests"].items()
+            if now["digests"].get(part) != digest
+        ]
     else:
-        parts = [part for part in recorded["values"] if not _are_close(recorded["values"][part], now["values"].get(part, {}), tolerance)]
+        parts = [
+            part
+            for part in recorded["values"]
+            if not _are_close(recorded["values"][part], now["values"].get(part, {}), tolerance)
+        ]
     if not parts:
         return ""
     own, *training = now["versions"]
-    what = own if not training or "weights" not in parts else f"{own}, or {training[0]} if all that it trains moved,"
+    what = (
+        own
+        if not training or "weights" not in parts
+        else f"{own}, or {training[0]} if all that it trains moved,"
+    )
     return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
 
 
@@ -109,7 +144,12 @@ def _values(array):
     flat = np.asarray(array, np.float64).ravel()
     if not flat.size:
         return []
-    picked = [np.max(np.abs(flat[np.isfinite(flat)]), initial=0.0), flat[0], flat[flat.size // 2], flat[-1]]
+    picked = [
+        np.max(np.abs(flat[np.isfinite(flat)]), initial=0.0),
+        flat[0],
+        flat[flat.size // 2],
+        flat[-1],
+    ]
     return [float(f"{value:.12g}") if np.isfinite(value) else None for value in picked]
 
 
@@ -118,7 +158,9 @@ def _are_close(recorded, now, tolerance):
         return False
     for name, values in recorded.items():
         then, today = np.array(values, float), np.array(now[name], float)
-        if then.shape != today.shape or not np.allclose(then, today, rtol=0, atol=tolerance * then[0] if then.size else 0, equal_nan=True):
+        if then.shape != today.shape or not np.allclose(
+            then, today, rtol=0, atol=tolerance * then[0] if then.size else 0, equal_nan=True
+        ):
             return False
     return True
 
@@ -155,7 +197,11 @@ def _text_log(folder):
     write_csv(folder / "lap.csv", 1, 5.0)
     lines = (folder / "lap.csv").read_text().splitlines()
     (folder / "lap.csv").write_text("\n".join([lines[0], "s,km/h,deg/s,,,", *lines[1:]]) + "\n")
-    return _channels(open_source(DATASET | {"path": str(folder), "source": "text_log", "rows_below_names": 1}).read("lap"))
+    return _channels(
+        open_source(
+            DATASET | {"path": str(folder), "source": "text_log", "rows_below_names": 1}
+        ).read("lap")
+    )
 
 
 def _vbo(folder):
@@ -170,8 +216,15 @@ def _can(folder):
 
     write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
-    told = {"files": "drive.*", "dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": channels}
-    return _channels(open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive"))
+    told = {
+        "files": "drive.*",
+        "dbc": str(folder / "car.dbc"),
+        "rate_hz": 100,
+        "channels": channels,
+    }
+    return _channels(
+        open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive")
+    )
 
 
 def _rosbag(folder):
@@ -201,9 +254,19 @@ def _revs(folder):
 
 
 def simulated(folder, seconds=3.0, **car):
-    drive = {"id": "a", "seed": 1, "manoeuvre": {"name": "laps", "course": "handling", "duration": seconds}}
+    drive = {
+        "id": "a",
+        "seed": 1,
+        "manoeuvre": {"name": "laps", "course": "handling", "duration": seconds},
+    }
     vehicle = yaml.safe_load(VEHICLE.read_text(encoding="utf-8")) | car
-    dataset = {"name": "sim", "source": "simulated", "vehicle": vehicle, "rate_hz": 50, "drives": [drive]}
+    dataset = {
+        "name": "sim",
+        "source": "simulated",
+        "vehicle": vehicle,
+        "rate_hz": 50,
+        "drives": [drive],
+    }
     return _channels(open_source(dataset).read("a"))
 
 
@@ -213,7 +276,9 @@ SOURCES |= {"tabular": _tabular, "text_log": _text_log, "vbo": _vbo}
 
 def _downsampled(folder):
     recording = planar_drive(10.0, 100.0, seed=1, noise=0.02)
-    for transform in downsample.transforms_of({"rate_hz": 20.0, "method": "polyphase", "transforms": []}):
+    for transform in downsample.transforms_of(
+        {"rate_hz": 20.0, "method": "polyphase", "transforms": []}
+    ):
         recording = transform(recording)
     return _channels(recording)
 
@@ -228,7 +293,9 @@ def _metrics(chosen):
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
     metrics = {}
     for row in rows:
-        metrics.setdefault(row["metric"], []).extend(float(row[column] or "nan") for column in ("value", "low", "high"))
+        metrics.setdefault(row["metric"], []).extend(
+            float(row[column] or "nan") for column in ("value", "low", "high")
+        )
     return {metric: np.array(values) for metric, values in metrics.items()}
 
 
@@ -238,7 +305,11 @@ def _study():
     made = tempfile.TemporaryDirectory()
     folder = Path(made.name)
     Place(folder, None)
-    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()),
+    ):
         for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
             run(*words)
     return made
@@ -249,13 +320,17 @@ def _leaves(path, content):
     if isinstance(content, Mapping):
         for name, value in content.items():
             yield from _leaves(f"{path}.{name}".lstrip("."), value)
-    elif isinstance(content, int | float | list) and np.issubdtype(np.array(content).dtype, np.number):
+    elif isinstance(content, int | float | list) and np.issubdtype(
+        np.array(content).dtype, np.number
+    ):
         yield path, np.array(content)
 
 
 STAGES = {
     downsample: _downsampled,
-    calibrate: lambda _: dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))),
+    calibrate: lambda _: dict(
+        _leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))
+    ),
     evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
     evaluate_faults: lambda _: _metrics(is_fault),
 }
@@ -269,7 +344,10 @@ def main():
         made[name] = subject.record()
         print(f"{name}: {'as before' if made[name] == former.get(name) else 'recorded'}")
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(record)}" for name, record in made.items())
-    FILE.write_text(f'{{"machine": {json.dumps(this_machine())},\n"subjects": {{\n{lines}\n}}}}\n', encoding="utf-8")
+    FILE.write_text(
+        f'{{"machine": {json.dumps(this_machine())},\n"subjects": {{\n{lines}\n}}}}\n',
+        encoding="utf-8",
+    )
 
 
 if __name__ == "__main__":

@@ -18,7 +18,9 @@ NAMES = (
     "ferrari_250lm_unlabelled roboracer saloon_standstill tum"
 )
 VBOX = ("vbo", "dataset.path=${root}/vbox", "dataset.clock=interpolate")
-READINGS = {name: (name,) for name in NAMES.split()} | {"vbox": VBOX}  # data set, and what else is set
+READINGS = {name: (name,) for name in NAMES.split()} | {
+    "vbox": VBOX
+}  # data set, and what else is set
 
 
 def read(name, root):
@@ -30,8 +32,15 @@ def read(name, root):
         channels = {}
         for channel, samples in recording.channels.items():
             mean_square = np.mean(np.square(samples[np.isfinite(samples)]))
-            channels[channel] = [digest_of({channel: samples}, DIGITS)[:8], float(f"{np.sqrt(mean_square):.12g}")]
-        found[recording.id] = {"rate_hz": recording.rate_hz, "start_time": recording.start_time, "channels": channels}
+            channels[channel] = [
+                digest_of({channel: samples}, DIGITS)[:8],
+                float(f"{np.sqrt(mean_square):.12g}"),
+            ]
+        found[recording.id] = {
+            "rate_hz": recording.rate_hz,
+            "start_time": recording.start_time,
+            "channels": channels,
+        }
     return found
 
 
@@ -39,5 +48,11 @@ if __name__ == "__main__":
     root = os.environ.get("VEHEST_DATA")
     if not root:
         sys.exit("readings: VEHEST_DATA is not set, nothing recorded")
-    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(read(name, root), separators=(',', ':'))}" for name in READINGS)
-    FILE.write_text(f'{{"machine": {json.dumps(this_machine())},\n"readings": {{\n{lines}\n}}}}\n', encoding="utf-8")
+    lines = ",\n".join(
+        f"{json.dumps(name)}: {json.dumps(read(name, root), separators=(',', ':'))}"
+        for name in READINGS
+    )
+    FILE.write_text(
+        f'{{"machine": {json.dumps(this_machine())},\n"readings": {{\n{lines}\n}}}}\n',
+        encoding="utf-8",
+    )

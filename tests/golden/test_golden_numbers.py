@@ -22,7 +22,9 @@ def test_every_family_source_and_stage_is_recorded():
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_numbers_are_those_recorded(name):
     here = RECORDED["machine"] == this_machine()
-    complaint = moved(name, RECORDED["subjects"][name], now(name), None if here else SUBJECTS[name].tolerance)
+    complaint = moved(
+        name, RECORDED["subjects"][name], now(name), None if here else SUBJECTS[name].tolerance
+    )
     assert not complaint, complaint
 
 
@@ -30,7 +32,10 @@ def test_numbers_are_those_recorded(name):
 def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
     from vehest.estimators import luenberger
 
-    former, found = luenberger.Luenberger._estimate_one, now("luenberger")  # before its estimates are shifted: `now` keeps them
+    former, found = (
+        luenberger.Luenberger._estimate_one,
+        now("luenberger"),
+    )  # before its estimates are shifted: `now` keeps them
 
     def shifted(self, recording, state):
         estimate = former(self, recording, state)
@@ -39,7 +44,9 @@ def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
 
     monkeypatch.setattr(luenberger.Luenberger, "_estimate_one", shifted)
     complaint = moved("luenberger", found, SUBJECTS["luenberger"].record(), tolerance)
-    assert complaint.startswith("estimates of luenberger moved: raise Luenberger.version if that is meant")
+    assert complaint.startswith(
+        "estimates of luenberger moved: raise Luenberger.version if that is meant"
+    )
 
 
 def test_a_raised_version_asks_for_a_new_record_and_within_the_tolerance_numbers_pass_on_another_machine():

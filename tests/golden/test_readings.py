@@ -21,8 +21,12 @@ def test_real_recordings_are_read_as_recorded(data_root, name):
         if RECORDED["machine"] == this_machine():
             same = now[recording] == expected
         else:
-            same = _numbers(now[recording]) == pytest.approx(_numbers(expected), rel=FIXED, abs=FIXED)
-        assert same, f"{recording} moved: raise the version of its source if that is meant, then run `make golden`"
+            same = _numbers(now[recording]) == pytest.approx(
+                _numbers(expected), rel=FIXED, abs=FIXED
+            )
+        assert same, (
+            f"{recording} moved: raise the version of its source if that is meant, then run `make golden`"
+        )
 
 
 def _numbers(found):

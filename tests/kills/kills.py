@@ -55,7 +55,18 @@ EVENTS = {  # what there is once more when it happens
 MAX_DELAY = 0.06  # s
 COUNTS = 3  # a moment is one of the first so many of its kind
 RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
-HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
+HEADER = (
+    "number",
+    "round",
+    "jobs",
+    "signal",
+    "stage",
+    "moment",
+    "exit_code",
+    "resumed_runs",
+    "metrics_equal",
+    "tracking_complete",
+)
 HEADER += ("leftovers", "outcome")
 Kill = namedtuple("Kill", "stage number moment exit_code at_once")
 """When a run was killed, by what, how it ended, and what was wrong at once."""
@@ -73,7 +84,11 @@ def session(leader):
     alive = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            alive += [int(entry.name)] if os.getsid(int(entry.name)) == leader and is_alive(entry.name) else []
+            alive += (
+                [int(entry.name)]
+                if os.getsid(int(entry.name)) == leader and is_alive(entry.name)
+                else []
+            )
     return alive
 
 
@@ -89,8 +104,14 @@ def strays(leader, patience=20.0):
 
 def killed(output, stage, number, jobs, draw):
     """Start a run, kill it at a moment of a stage; none if it ended before."""
-    moment, count, delay = draw.choice(MOMENTS[stage]), draw.randint(1, COUNTS), draw.uniform(0.0, MAX_DELAY)
-    count = 1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
+    moment, count, delay = (
+        draw.choice(MOMENTS[stage]),
+        draw.randint(1, COUNTS),
+        draw.uniform(0.0, MAX_DELAY),
+    )
+    count = (
+        1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
+    )
     count = min(count, 2) if stage == "downsample" else count
     event = EVENTS[moment].format(stage=stage)
     before, met = set(glob(event, root_dir=output)), set[str]()
@@ -100,7 +121,9 @@ def killed(output, stage, number, jobs, draw):
         if process.poll() is not None:
             strays(process.pid)
             if process.returncode != 0:
-                raise SystemExit(f"a run failed by itself with exit code {process.returncode}, see '{output.with_suffix('.log')}'")
+                raise SystemExit(
+                    f"a run failed by itself with exit code {process.returncode}, see '{output.with_suffix('.log')}'"
+                )
             return None
         time.sleep(LOOK_SECONDS)
     time.sleep(delay)
@@ -109,7 +132,9 @@ def killed(output, stage, number, jobs, draw):
     if code == 0:
         return None
     left += locks_held(output) + broken(output)
-    left += [f"exit code {code} instead of {EXIT_CODES[number]}"] if code != EXIT_CODES[number] else []
+    left += (
+        [f"exit code {code} instead of {EXIT_CODES[number]}"] if code != EXIT_CODES[number] else []
+    )
     return Kill(stage, number, f"{moment} {count} + {delay * 1e3:.0f} ms", code, tuple(left))
 
 
@@ -150,7 +175,9 @@ def content(output):
         found[own] = artefact.digest
         if artefact.stage == "report":
             with open(folder / "metrics.csv", newline="", encoding="utf-8") as stream:
-                found[own] = json.dumps([row for row in csv.DictReader(stream) if row["metric"] not in TIMES])
+                found[own] = json.dumps(
+                    [row for row in csv.DictReader(stream) if row["metric"] not in TIMES]
+                )
     return found
 
 
@@ -158,8 +185,12 @@ def tracked(output):
     """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
     found = {}
     with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
-        for run, name, status in store.execute("select run_uuid, name, status from runs where lifecycle_stage = 'active'").fetchall():
-            if status == "KILLED":  # of an interrupted training, by which it is told from the finished one
+        for run, name, status in store.execute(
+            "select run_uuid, name, status from runs where lifecycle_stage = 'active'"
+        ).fetchall():
+            if (
+                status == "KILLED"
+            ):  # of an interrupted training, by which it is told from the finished one
                 continue
             keys, points, parameters = (
                 store.execute(f"select {what} where run_uuid = ? {rest}", [run]).fetchall()
@@ -169,7 +200,10 @@ def tracked(output):
                     ("key, value from params", "order by key"),
                 )
             )
-            files = sorted(str(file.relative_to(output / "mlartifacts" / run)) for file in (output / "mlartifacts" / run).rglob("*.*"))
+            files = sorted(
+                str(file.relative_to(output / "mlartifacts" / run))
+                for file in (output / "mlartifacts" / run).rglob("*.*")
+            )
             own = f"{name} {status} {keys[0][0] if keys else ''}"
             logged = [[point for point in points if "_seconds" not in point[0]], parameters, files]
             found[own + (f" again {run}" if own in found else "")] = json.dumps(logged)
@@ -178,29 +212,49 @@ def tracked(output):
 
 def leftovers(output):
     """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
-    found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
+    found = [
+        str(path.relative_to(output))
+        for path in output.rglob(".*")
+        if path.name.startswith((".writing-", ".parts-"))
+    ]
     return [*found, *glob("checkpoints/*", root_dir=output), *locks_held(output)]
 
 
 def one_round(position, wanted, output, reference, draw):
     """Kill runs in one output root, let the last one end, and look at what there is: kills, and a row of the table for each, unnumbered."""
     jobs = 2 if position % 4 == 3 else 1
-    kills = [kill for kill in (killed(output, *each, jobs, draw) for each in wanted) if kill is not None]
+    kills = [
+        kill for kill in (killed(output, *each, jobs, draw) for each in wanted) if kill is not None
+    ]
     last = started(output, jobs)
     code, left = last.wait(RUN_SECONDS), strays(last.pid)
-    failed = [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
+    failed = (
+        [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
+    )
     metrics, tracking = [], []
     for of, differing in () if failed else ((content, metrics), (tracked, tracking)):
         found, known = of(output), of(reference)
-        differing += [name for name in sorted({*found, *known}) if found.get(name) != known.get(name)]
+        differing += [
+            name for name in sorted({*found, *known}) if found.get(name) != known.get(name)
+        ]
     left += [] if failed else leftovers(output)
     equal, complete = ("no" if failed or found else "yes" for found in (metrics, tracking))
     rows = []
     for place, kill in enumerate(kills):
         remains = "; ".join([*left, *kill.at_once])
         faults = "; ".join([*failed, *metrics, *tracking]) or remains
-        head = [position, jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code, len(kills) - place]
-        rows.append([*head, equal, complete, remains or "none", f"bad: {faults}" if faults else "good"])
+        head = [
+            position,
+            jobs,
+            kill.number.name,
+            kill.stage,
+            kill.moment,
+            kill.exit_code,
+            len(kills) - place,
+        ]
+        rows.append(
+            [*head, equal, complete, remains or "none", f"bad: {faults}" if faults else "good"]
+        )
     return kills, rows
 
 
@@ -209,7 +263,9 @@ def rounds(missing, draw, scratch, out):
     os.chdir(scratch)  # runs find the configuration that came with the package
     begun, reference = time.monotonic(), scratch / "reference"
     if started(reference, 1).wait(RUN_SECONDS) != 0:
-        raise SystemExit(f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}")
+        raise SystemExit(
+            f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}"
+        )
     print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
     position, bad, number, limit = 0, 0, 1, 3 * missing.total()
     with open(out, "w", newline="", encoding="utf-8") as stream:
@@ -218,15 +274,29 @@ def rounds(missing, draw, scratch, out):
         while missing.total() > 0:
             if position > limit:
                 raise SystemExit("moments are missed again and again")
-            wanted = [(stage, max(SIGNALS, key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)))) for stage in STAGES]
-            wanted = [kill for kill in wanted if missing[kill] > 0]  # of each stage one that is missing most
+            wanted = [
+                (
+                    stage,
+                    max(
+                        SIGNALS,
+                        key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)),
+                    ),
+                )
+                for stage in STAGES
+            ]
+            wanted = [
+                kill for kill in wanted if missing[kill] > 0
+            ]  # of each stage one that is missing most
             kills, rows = one_round(position, wanted, scratch / f"round{position}", reference, draw)
             missing -= Counter((kill.stage, kill.number) for kill in kills)
             writer.writerows([number + place, *row] for place, row in enumerate(rows))
             stream.flush()
             worse = sum(row[-1] != "good" for row in rows)
             bad, number = bad + worse, number + len(rows)
-            print(f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s", flush=True)
+            print(
+                f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s",
+                flush=True,
+            )
             if not worse:
                 shutil.rmtree(scratch / f"round{position}")
             position += 1
@@ -235,16 +305,31 @@ def rounds(missing, draw, scratch, out):
 
 def main():
     """Exit code 1 if any row is bad."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=100, help="how many, spread evenly over five stages and three signals")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--kills",
+        type=int,
+        default=100,
+        help="how many, spread evenly over five stages and three signals",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of signals, moments and delays")
-    parser.add_argument("--out", type=Path, default=Path("results/reliability/kills.csv"), help="table, a row a kill")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results/reliability/kills.csv"),
+        help="table, a row a kill",
+    )
     given = parser.parse_args()
     os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     out = given.out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
-    missing = Counter((STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)]) for k in range(given.kills))
+    missing = Counter(
+        (STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)])
+        for k in range(given.kills)
+    )
     with tempfile.TemporaryDirectory(prefix="kills-") as scratch:
         try:
             bad = rounds(missing, random.Random(given.seed), Path(scratch), out)

@@ -25,11 +25,16 @@ SECONDS = 240.0
 
 def scheme(folder, *, bias=False):
     """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
-    drives = {name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))}
+    drives = {
+        name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))
+    }
     for seed, name in ((5, "f1"), (6, "f2")):
         drive = planar_drive(SECONDS, seed=seed, name=name)
         drives[name] = replace(drive, channels={**drive.channels, "ay": drive["ay"] - OFFSET})
-    network, zero = ksnn_with_weights(n_local=2, bias=bias), estimator_class("zero").from_config({"rate_hz": 20.0})
+    network, zero = (
+        ksnn_with_weights(n_local=2, bias=bias),
+        estimator_class("zero").from_config({"rate_hz": 20.0}),
+    )
     spans = {name: (Span("cars", name),) for name in drives}
     split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})
     models, rows = [], []
@@ -37,15 +42,35 @@ def scheme(folder, *, bias=False):
         at = folder / estimator.name
         at.mkdir()
         save_model(estimator, at)
-        models.append(EvaluatedModel(estimator.name, estimator.variant, estimator.full_title, 0, at, at))
+        models.append(
+            EvaluatedModel(estimator.name, estimator.variant, estimator.full_title, 0, at, at)
+        )
         for test in ("c2", "f2"):
             (at / test).mkdir()
-            write_estimate(estimator.estimate([drives[test].without_references()])[0], at / test / "0.parquet")
-        figures = dict.fromkeys(("rmse_vy", "fvu", "r2", "rmse_sideslip", "n_parameters", "epochs"), 1.0)
-        rows += [row for test in ("validation", "c2", "f2") for row in metric_rows(models[-1], test, figures)]
-    part = part_of(split, Protocol(), models, rows, kinds={"cars": "simulated"}, references=stored(folder, "cars", drives))
+            write_estimate(
+                estimator.estimate([drives[test].without_references()])[0], at / test / "0.parquet"
+            )
+        figures = dict.fromkeys(
+            ("rmse_vy", "fvu", "r2", "rmse_sideslip", "n_parameters", "epochs"), 1.0
+        )
+        rows += [
+            row
+            for test in ("validation", "c2", "f2")
+            for row in metric_rows(models[-1], test, figures)
+        ]
+    part = part_of(
+        split,
+        Protocol(),
+        models,
+        rows,
+        kinds={"cars": "simulated"},
+        references=stored(folder, "cars", drives),
+    )
     for model in models:
-        write_segments(model.evaluation_folder / "blocks.csv", {test: segments_of(part.scored(model, test), 20.0) for test in ("c2", "f2")})
+        write_segments(
+            model.evaluation_folder / "blocks.csv",
+            {test: segments_of(part.scored(model, test), 20.0) for test in ("c2", "f2")},
+        )
     return Scheme("scheme_1", "Scheme 1", part, "c2", "f2")
 
 
@@ -57,8 +82,12 @@ def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(t
     network = ksnn_with_weights(n_local=2)
     clean = planar_drive(SECONDS, seed=6)
     error = (network.estimate([clean.without_references()])[0]["vy"] - clean["vy_ref"])[30:]
-    assert errors.value(f"{paper.LINEAR}, corrected", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
-    assert errors.value(f"{paper.LINEAR}, as measured", "rmse_vy") != pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
+    assert errors.value(f"{paper.LINEAR}, corrected", "rmse_vy") == pytest.approx(
+        math.sqrt(np.mean(error**2)), rel=2e-4
+    )
+    assert errors.value(f"{paper.LINEAR}, as measured", "rmse_vy") != pytest.approx(
+        math.sqrt(np.mean(error**2)), rel=2e-4
+    )
 
 
 def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimate(tmp_path):
@@ -79,7 +108,9 @@ def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp
     scored = np.arange(len(drive)) >= 30
     low = scored & (np.abs(drive["yaw_rate"]) < 0.1)
     assert share == pytest.approx(low.sum() / scored.sum())
-    assert errors.value(paper.ZERO, "rmse_vy") == pytest.approx(math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6)
+    assert errors.value(paper.ZERO, "rmse_vy") == pytest.approx(
+        math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6
+    )
     for threshold in (0.0, 100.0):
         assert paper.ZERO not in behaviour.at_low_yaw_rate(own, threshold, [paper.ZERO], "c2")[0]
 
@@ -94,4 +125,6 @@ def test_band_levels_are_the_density_of_the_error(tmp_path):
     write_estimate(noisy, model.evaluation_folder / "c2" / "0.parquet")
     levels = claims_of_models.band_levels(own, {paper.ZERO: model}, "c2")
     densities = [levels[paper.ZERO, hz].value for hz in claims_of_models.BANDS_HZ[3:]]
-    assert np.mean(densities) == pytest.approx(0.1**2 / 10.0, rel=0.1), "white noise of 0.1 m/s over 0 to 10 Hz"
+    assert np.mean(densities) == pytest.approx(0.1**2 / 10.0, rel=0.1), (
+        "white noise of 0.1 m/s over 0 to 10 Hz"
+    )

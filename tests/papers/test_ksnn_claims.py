@@ -19,7 +19,10 @@ from vehest_papers.ksnn.causes import headline
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
 
-PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
+PUBLISHED = {
+    "scheme_1": (paper.TABLE_IV, "c", "c2", "f2"),
+    "scheme_2": (paper.TABLE_V, "f", "f2", "c2"),
+}
 SEGMENTS, SAMPLES = 600, 20
 DEVIATION = {"c2": 0.49, "f2": 0.70}
 """Standard deviation of v on each test [m/s], about those of the paper's cars."""
@@ -35,7 +38,10 @@ NAMES = {
     paper.LINEAR: ("ksnn", "linear_no_bias_p2"),
     paper.NONLINEAR: ("ksnn", "nonlinear_no_bias_p2_q3"),
 }
-N_PARAMETERS = {name: row.n_parameters for name, row in paper.TABLE_IV.items()} | {paper.ZERO: 0, paper.STATIC_MAP: 2}
+N_PARAMETERS = {name: row.n_parameters for name, row in paper.TABLE_IV.items()} | {
+    paper.ZERO: 0,
+    paper.STATIC_MAP: 2,
+}
 
 
 def planted_segments(fvu, test, seed):
@@ -65,26 +71,56 @@ def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2"
         for seed in range(seeds if estimator in ("gru", "lstm", "ksnn") else 1):
             at = folder / f"{train}-{estimator}-{variant}-{seed}"
             at.mkdir(parents=True)
-            own = {test: by_test[test] * math.exp(spread * generator.standard_normal()) for test in tests}
-            write_segments(at / "blocks.csv", {test: planted_segments(own[test], test, seed + 10) for test in tests})
+            own = {
+                test: by_test[test] * math.exp(spread * generator.standard_normal())
+                for test in tests
+            }
+            write_segments(
+                at / "blocks.csv",
+                {test: planted_segments(own[test], test, seed + 10) for test in tests},
+            )
             models.append(EvaluatedModel(estimator, variant, category, seed, at, at))
             validation = own[f"{other}2"]
-            values = {("validation", "fvu"): validation, ("validation", "rmse_vy"): math.sqrt(validation)}
+            values = {
+                ("validation", "fvu"): validation,
+                ("validation", "rmse_vy"): math.sqrt(validation),
+            }
             for test in tests:
-                values |= {(test, "fvu"): own[test], (test, "rmse_vy"): math.sqrt(own[test]) * DEVIATION[test]}
+                values |= {
+                    (test, "fvu"): own[test],
+                    (test, "rmse_vy"): math.sqrt(own[test]) * DEVIATION[test],
+                }
                 values |= {(test, "n_parameters"): N_PARAMETERS[category], (test, "epochs"): 10}
             for test in ("validation", *tests):
-                values |= {(test, "r2"): 1.0 - values[test, "fvu"], (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"]}
-            rows += [row for (test, metric), value in values.items() for row in metric_rows(models[-1], test, {metric: value})]
-    spans = {name: (Span("cars", f"{name}_001", -math.inf, math.inf),) for name in (f"{train}1", f"{other}1", *tests)}
-    split = Split("scheme", spans[f"{train}1"], spans[f"{other}1"], {test: spans[test] for test in tests})
-    return part_of(split, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
+                values |= {
+                    (test, "r2"): 1.0 - values[test, "fvu"],
+                    (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"],
+                }
+            rows += [
+                row
+                for (test, metric), value in values.items()
+                for row in metric_rows(models[-1], test, {metric: value})
+            ]
+    spans = {
+        name: (Span("cars", f"{name}_001", -math.inf, math.inf),)
+        for name in (f"{train}1", f"{other}1", *tests)
+    }
+    split = Split(
+        "scheme", spans[f"{train}1"], spans[f"{other}1"], {test: spans[test] for test in tests}
+    )
+    return part_of(
+        split, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"}
+    )
 
 
 def of_the_paper(table, static_map=0.6):
     """Every category with the FVU that the paper prints, and the baselines."""
     printed = {name: {"c2": row.c2_fvu, "f2": row.f2_fvu} for name, row in table.items()}
-    return {paper.ZERO: {"c2": 1.0, "f2": 1.0}, paper.STATIC_MAP: {"c2": static_map, "f2": static_map}, **printed}
+    return {
+        paper.ZERO: {"c2": 1.0, "f2": 1.0},
+        paper.STATIC_MAP: {"c2": static_map, "f2": static_map},
+        **printed,
+    }
 
 
 def schemes(folder, fvus=None, **options):
@@ -109,7 +145,10 @@ def verdicts(made):
 
 def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
     found = verdicts(schemes(tmp_path))
-    assert found["Luenberger leaves about 25 % (20 to 30 %) of v's variance on either car"] == "reproduced"
+    assert (
+        found["Luenberger leaves about 25 % (20 to 30 %) of v's variance on either car"]
+        == "reproduced"
+    )
     for claim in (
         "and are worse than Luenberger on the other",
         "biases: lower FVU on the own car",
@@ -125,9 +164,14 @@ def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
         "all dots above the diagonal, scheme 1",
     ):
         assert found[claim] == "reproduced", claim
-    assert found["GRU, LSTM explain over 90 % on the own car"] == "not reproduced", "the paper's text rounds its Table IV"
+    assert found["GRU, LSTM explain over 90 % on the own car"] == "not reproduced", (
+        "the paper's text rounds its Table IV"
+    )
     assert found["all dots above the diagonal, scheme 2"] == "reproduced"
-    assert found[next(claim for claim in found if claim.startswith("a third car"))] == "not testable on this data"
+    assert (
+        found[next(claim for claim in found if claim.startswith("a third car"))]
+        == "not testable on this data"
+    )
 
 
 def test_turned_figures_turn_verdicts_and_the_headline(tmp_path):
@@ -140,10 +184,17 @@ def test_turned_figures_turn_verdicts_and_the_headline(tmp_path):
         assert found[claim] == "not reproduced", claim
     assert "comes out in both schemes" in headline(schemes(tmp_path / "as"), {})
     words = headline(schemes(tmp_path / "turned", turned), {})
-    assert words.startswith("**The paper's order of families does not come out** (scheme 1 and scheme 2)")
+    assert words.startswith(
+        "**The paper's order of families does not come out** (scheme 1 and scheme 2)"
+    )
     assert "static map" in words
     level = headline(
-        schemes(tmp_path / "level", lambda table: {name: {"c2": 0.3, "f2": 0.3} for name in of_the_paper(table)}, spread=0.0), {}
+        schemes(
+            tmp_path / "level",
+            lambda table: {name: {"c2": 0.3, "f2": 0.3} for name in of_the_paper(table)},
+            spread=0.0,
+        ),
+        {},
     )
     assert "is not decided here" in level
 
@@ -151,7 +202,9 @@ def test_turned_figures_turn_verdicts_and_the_headline(tmp_path):
 def test_regularisation_is_compared_on_the_same_structures(tmp_path):
     with_it = schemes(tmp_path / "with")[1]
     table = {paper.LSTM: {"c2": 0.84, "f2": 0.042}, paper.NONLINEAR: {"c2": 0.197, "f2": 0.059}}
-    without = Scheme("one_vehicle", "Without", planted_part(tmp_path / "without", table, train="f"), "f2", "c2")
+    without = Scheme(
+        "one_vehicle", "Without", planted_part(tmp_path / "without", table, train="f"), "f2", "c2"
+    )
     found = decided(claims.on_regularisation(with_it, without))
     assert [claim.verdict for claim in found] == ["reproduced"] * 3
     assert "−57 %" in found[0].ours
@@ -177,7 +230,13 @@ def test_intervals_hold_the_true_ratio_as_often_as_they_say():
         scale = generator.lognormal(0.0, 0.3, 40)
         parts = {}
         for name, level in (("first", 0.8), ("second", 1.0)):
-            squares = [level * scale * generator.lognormal(0.0, 0.3, 40) * math.exp(0.1 * generator.standard_normal()) for _ in range(4)]
+            squares = [
+                level
+                * scale
+                * generator.lognormal(0.0, 0.3, 40)
+                * math.exp(0.1 * generator.standard_normal())
+                for _ in range(4)
+            ]
             parts[name] = [_of_pieces(own) for own in squares]
         change = SegmentErrors(parts, f"trial {trial}").change("first", "second", "rmse_vy")
         low, high = change.ends()
@@ -189,7 +248,9 @@ def _of_pieces(squares):
     """Segments each in a piece of its own, so that each is a block."""
     zeros = np.zeros_like(squares)
     n = np.arange(len(squares), dtype=float)
-    return Segments(n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares))
+    return Segments(
+        n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares)
+    )
 
 
 def test_masked_segments_without_a_mask_are_the_evaluations_own():
@@ -210,10 +271,17 @@ def change(ratio, error):
 
 @pytest.mark.parametrize(
     ("ratios", "verdict"),
-    [((0.5, 0.6), "reproduced"), ((0.5, 0.99), "undecided"), ((0.5, 2.0), "not reproduced"), ((), "not testable on this data")],
+    [
+        ((0.5, 0.6), "reproduced"),
+        ((0.5, 0.99), "undecided"),
+        ((0.5, 2.0), "not reproduced"),
+        ((), "not testable on this data"),
+    ],
 )
 def test_a_statement_is_reproduced_only_where_all_its_comparisons_are(ratios, verdict):
-    statement = Statement("claim", "paper", "simulated", [Compared(str(own), change(own, 0.05)) for own in ratios])
+    statement = Statement(
+        "claim", "paper", "simulated", [Compared(str(own), change(own, 0.05)) for own in ratios]
+    )
     (claim,) = decided([statement])
     assert claim.verdict == verdict
     assert ("−50 % [" in claim.ours) == bool(ratios)
@@ -234,16 +302,25 @@ def test_many_comparisons_bounds_and_counts_are_judged_as_relative_changes():
     assert counted("c", "p", "o", "d", [], "w").verdict == "not testable on this data"
 
 
-@pytest.mark.parametrize(("n_hidden", "bias", "products_and_sums"), [(0, False, 36), (0, True, 40), (2, False, 60), (3, True, 88)])
+@pytest.mark.parametrize(
+    ("n_hidden", "bias", "products_and_sums"),
+    [(0, False, 36), (0, True, 40), (2, False, 60), (3, True, 88)],
+)
 def test_operations_of_a_ksnn_are_those_of_its_equations(n_hidden, bias, products_and_sums):
     """Counted by hand in Eqs. 7 to 9: 32 without the four f, and of each f 1, 1 more for a bias, 3 a neuron and 1 more for its bias."""
     assert cost.ksnn_operations(2, n_hidden, bias=bias) == (products_and_sums, 4 * n_hidden)
-    assert cost.ksnn_operations(6, n_hidden, bias=bias) == (products_and_sums, 4 * n_hidden), "two modules at most are active"
+    assert cost.ksnn_operations(6, n_hidden, bias=bias) == (products_and_sums, 4 * n_hidden), (
+        "two modules at most are active"
+    )
 
 
 def test_times_in_c_are_those_that_were_published():
     published = pd.read_csv(Path(__file__).parents[2] / "results" / "export" / "metrics.csv")
     for (estimator, variant), shown in cost.IN_C_US.items():
-        own = published[(published["family"] == estimator) & (published["variant"] == variant) & (published["drive"] == "ferrari_250lm")]
+        own = published[
+            (published["family"] == estimator)
+            & (published["variant"] == variant)
+            & (published["drive"] == "ferrari_250lm")
+        ]
         measured = float(own[own["precision"] == "double"]["c_method_ns"].iloc[0]) / 1e3
         assert shown == pytest.approx(measured, rel=0.01)

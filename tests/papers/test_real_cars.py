@@ -23,8 +23,16 @@ def drive(seconds=120.0, size=1.0, noise=0.0, name="lap"):
     vy = size * (-2.0 * yaw_rate + 0.2 * np.cos(0.4 * time))
     ay = np.gradient(vy) * 100.0 + vx * yaw_rate
     vy_ref = vy + noise * np.random.default_rng(0).standard_normal(len(time))
-    channels = {"vx": vx, "yaw_rate": yaw_rate, "ay": ay, "ax": np.zeros_like(time), "vy_ref": vy_ref}
-    return Recording(name, "car", 100.0, 0.0, channels, provenance={"derived": {"reference_point": "unknown"}})
+    channels = {
+        "vx": vx,
+        "yaw_rate": yaw_rate,
+        "ay": ay,
+        "ax": np.zeros_like(time),
+        "vy_ref": vy_ref,
+    }
+    return Recording(
+        name, "car", 100.0, 0.0, channels, provenance={"derived": {"reference_point": "unknown"}}
+    )
 
 
 def test_statistics_are_those_of_the_closed_form():
@@ -32,7 +40,9 @@ def test_statistics_are_those_of_the_closed_form():
     found = statistics_of([drive()])
     level = math.degrees(0.2 / math.sqrt(2.0) / 20.0)
     assert found.static_map == pytest.approx(level, rel=0.02)
-    assert found.rms == pytest.approx(math.degrees(math.sqrt(0.6**2 / 2.0 + 0.2**2 / 2.0) / 20.0), rel=0.02)
+    assert found.rms == pytest.approx(
+        math.degrees(math.sqrt(0.6**2 / 2.0 + 0.2**2 / 2.0) / 20.0), rel=0.02
+    )
     assert found.speed == pytest.approx((20.0, 20.0))
     assert found.driven == pytest.approx(120.0, abs=0.1)
     assert found.point == "at a point that is not known"
@@ -57,8 +67,14 @@ def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
     datasets = []
     for name, recording in (("long", drive()), ("short", drive(seconds=40.0))):
         write_recording(recording, tmp_path / f"{name}.parquet")
-        datasets.append(StoredDataset(name, name, "real", {}, {"lap": tmp_path / f"{name}.parquet"}, "none", "nobody"))
-    (report,) = documents(StudyArtefacts("real_cars", "Real cars", "", "vehest run real_cars", datasets=datasets)).values()
+        datasets.append(
+            StoredDataset(
+                name, name, "real", {}, {"lap": tmp_path / f"{name}.parquet"}, "none", "nobody"
+            )
+        )
+    (report,) = documents(
+        StudyArtefacts("real_cars", "Real cars", "", "vehest run real_cars", datasets=datasets)
+    ).values()
     text = "\n".join(block for block in report.blocks if isinstance(block, str))
     assert "Of 2 data sets 1 can rank estimators" in text
     assert "`short` (40 s of driving)" in text
@@ -69,11 +85,17 @@ def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
 def noise():
     generator = np.random.default_rng(0)
     names = ("vx", "yaw_rate", "ax", "ay", "steer", "vy_ref", "sideslip_ref")
-    return Recording("r", "car", 100.0, 0.0, {name: generator.standard_normal(2000) for name in names})
+    return Recording(
+        "r", "car", 100.0, 0.0, {name: generator.standard_normal(2000) for name in names}
+    )
 
 
 def fault(name, channel, size):
-    (found,) = [one for one in planted_faults() if (one.name, one.channels[0], one.size) == (name, channel, size)]
+    (found,) = [
+        one
+        for one in planted_faults()
+        if (one.name, one.channels[0], one.size) == (name, channel, size)
+    ]
     return found
 
 
@@ -81,9 +103,15 @@ def test_faults_change_their_channels_alone_and_are_what_they_are_called():
     whole = noise()
     for one in planted_faults():
         changed = one(whole)
-        assert {name for name in whole.channels if not np.array_equal(whole[name], changed[name])} == set(one.channels)
-    np.testing.assert_allclose(fault("late", "ay", "40 ms")(whole)["ay"][4:], whole["ay"][:-4], atol=1e-9)
-    np.testing.assert_allclose(fault("held", "ay", "10 Hz")(whole)["ay"], np.repeat(whole["ay"][::10], 10))
+        assert {
+            name for name in whole.channels if not np.array_equal(whole[name], changed[name])
+        } == set(one.channels)
+    np.testing.assert_allclose(
+        fault("late", "ay", "40 ms")(whole)["ay"][4:], whole["ay"][:-4], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        fault("held", "ay", "10 Hz")(whole)["ay"], np.repeat(whole["ay"][::10], 10)
+    )
     slow = fault("low-passed", "ax", "0.4 s")(whole)["ax"]
     state = whole["ax"][0]
     for sample in range(1, 50):
@@ -92,8 +120,13 @@ def test_faults_change_their_channels_alone_and_are_what_they_are_called():
     assert set(detections(noise().select(["vx", "ay"]))["channel"]) == {"vx", "ay"}
 
 
-@pytest.mark.parametrize(("start", "stop", "missed"), [(150.0, 450.0, {20}), (450.0, 550.0, {20, 40}), (550.0, 700.0, {20})])
-def test_all_but_the_shortest_delays_of_the_reference_are_found_in_the_ferrari_without_a_false_alarm(data_root, start, stop, missed):
+@pytest.mark.parametrize(
+    ("start", "stop", "missed"),
+    [(150.0, 450.0, {20}), (450.0, 550.0, {20, 40}), (550.0, 700.0, {20})],
+)
+def test_all_but_the_shortest_delays_of_the_reference_are_found_in_the_ferrari_without_a_false_alarm(
+    data_root, start, stop, missed
+):
     """Its accelerometers are late by some 15 ms themselves, which a late reference makes good."""
     table = detections(real_drive(data_root).cut(start, stop))
     assert len(table) == len(planted_faults())

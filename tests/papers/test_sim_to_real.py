@@ -26,7 +26,13 @@ from vehest_papers.sim_to_real import documents
 
 PROTOCOL = Protocol(rate_hz=20.0)
 SPLITS = [name for name in choices("split") if name.startswith("sim_to_real_")]
-LEARNT = ("sim_fleet_wide", "sim_fleet_fast", "sim_fleet_rough", "sim_fleet_more", "sim_fleet_level")
+LEARNT = (
+    "sim_fleet_wide",
+    "sim_fleet_fast",
+    "sim_fleet_rough",
+    "sim_fleet_more",
+    "sim_fleet_level",
+)
 HELD_OUT = "sim_fleet_held_out"
 
 
@@ -35,7 +41,11 @@ def dataset(name):
 
 
 def courses(name):
-    return {drive.manoeuvre["course"] for drive in open_source(dataset(name)).drives.values() if "course" in drive.manoeuvre}
+    return {
+        drive.manoeuvre["course"]
+        for drive in open_source(dataset(name)).drives.values()
+        if "course" in drive.manoeuvre
+    }
 
 
 @pytest.mark.parametrize("name", SPLITS)
@@ -44,7 +54,9 @@ def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
     for entry in (*split["train"], *split["validation"]):
         assert kind_of(dataset(entry["dataset"])) == "simulated"
     assert [entry["dataset"] for entry in split["validation"]] == [HELD_OUT]
-    assert split["tests"]["ferrari"] == [{"dataset": "ferrari_250lm", "recording": "20140222_01_01_03_250lm"}]
+    assert split["tests"]["ferrari"] == [
+        {"dataset": "ferrari_250lm", "recording": "20140222_01_01_03_250lm"}
+    ]
     assert split["tests"]["race_cars"] == [{"dataset": "sim_two_cars", "recordings": "*"}]
     learns_on_it = "tum" in {entry["dataset"] for entry in split["train"]}
     assert ("other_simulator" in split["tests"]) != learns_on_it
@@ -61,10 +73,17 @@ def test_validation_cars_are_other_cars_on_other_courses(name):
 @pytest.mark.parametrize("name", [*LEARNT, HELD_OUT])
 def test_fleets_take_nothing_that_was_read_off_the_real_recording(name):
     described = dataset(name)
-    preset = described["sensors"]["preset"] if isinstance(described["sensors"], Mapping) else described["sensors"]
+    preset = (
+        described["sensors"]["preset"]
+        if isinstance(described["sensors"], Mapping)
+        else described["sensors"]
+    )
     assert preset == "default"
     assert "palm_beach_like" not in courses(name)
-    assert {vehicle["name"] for vehicle in described["vehicles"].values()} == {"bmw_545i", "corvette_grand_sport"}
+    assert {vehicle["name"] for vehicle in described["vehicles"].values()} == {
+        "bmw_545i",
+        "corvette_grand_sport",
+    }
 
 
 ERRORS = {  # part -> (on validation, on race cars, on another simulation's car, on the real car) of every seed
@@ -88,7 +107,9 @@ def part(folder, name):
     models, rows = [], []
     for seed, sizes in enumerate([*ERRORS[name], *([None] if name == "level" else [])]):
         home = folder / name / str(seed)
-        model = EvaluatedModel("ksnn", "nonlinear_no_bias_p2_q2", "KS-NN", seed, home / "model", home)
+        model = EvaluatedModel(
+            "ksnn", "nonlinear_no_bias_p2_q2", "KS-NN", seed, home / "model", home
+        )
         if sizes is None:
             model = replace(model, estimator="zero", variant="zero", title="v = 0", seed=0)
         models.append(model)
@@ -99,21 +120,44 @@ def part(folder, name):
         save_model(fitted, model.model_folder)
         for (where, span), size in zip(spans.items(), sizes or [0.0] * 4, strict=True):
             vy = recording["vy_ref"] * (sizes is not None) + size * np.sin(3.0 * recording.time)
-            estimate = Estimate(recording.id, "ksnn", 20.0, recording.start_time, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
+            estimate = Estimate(
+                recording.id,
+                "ksnn",
+                20.0,
+                recording.start_time,
+                {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])},
+            )
             write_estimate(estimate, home / where / "0.parquet")
             found = accuracy([score(estimate, recording, span, PROTOCOL)])
             rows += metric_rows(model, where, found, dataset=span.dataset)
-    tests = {test: (span,) for test, span in spans.items() if test != "validation" and (name, test) != ("one", "other_simulator")}
+    tests = {
+        test: (span,)
+        for test, span in spans.items()
+        if test != "validation" and (name, test) != ("one", "other_simulator")
+    }
     split = Split(name, (Span("sim", f"{name}_lap"),), (spans["validation"],), tests)
-    kinds, references = {"sim": "simulated", "ferrari": "real"}, {(dataset, recording.id): file for dataset in ("sim", "ferrari")}
-    return part_of(split, PROTOCOL, models, rows, kinds=kinds, references=references, facts=["the same for all"])
+    kinds, references = (
+        {"sim": "simulated", "ferrari": "real"},
+        {(dataset, recording.id): file for dataset in ("sim", "ferrari")},
+    )
+    return part_of(
+        split,
+        PROTOCOL,
+        models,
+        rows,
+        kinds=kinds,
+        references=references,
+        facts=["the same for all"],
+    )
 
 
 @pytest.fixture(scope="module")
 def artefacts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("toy")
     parts = {name: part(folder, name) for name in ERRORS}
-    return StudyArtefacts("toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, [])
+    return StudyArtefacts(
+        "toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, []
+    )
 
 
 def overview(document):
@@ -132,29 +176,50 @@ def test_validation_race_cars_and_another_simulation_choose_in_turn_and_ship_a_s
     assert table.loc["rough", "fvu_median"] > table.loc["one", "fvu_median"]
     assert table.loc["one", "chosen"] == "second"
     assert table.loc["level", "chosen"] == "third"
-    assert np.isnan(table.loc["one", "other_simulator_rmse_vy"]), "the lowest error there, but not asked"
-    assert table.loc["level", "model_seed"] == 1, "the best on the other simulation's car, not on the real one"
+    assert np.isnan(table.loc["one", "other_simulator_rmse_vy"]), (
+        "the lowest error there, but not asked"
+    )
+    assert table.loc["level", "model_seed"] == 1, (
+        "the best on the other simulation's car, not on the real one"
+    )
     assert table.loc["level", "model_fvu"] == table.loc["level", "fvu_max"]
     assert table["model_fvu"].notna().sum() == 1
 
 
-def test_report_shows_v_0_beside_the_candidates_and_says_how_many_are_worse_on_the_car_that_makes_the_third_choice(artefacts):
+def test_report_shows_v_0_beside_the_candidates_and_says_how_many_are_worse_on_the_car_that_makes_the_third_choice(
+    artefacts,
+):
     document = documents(artefacts)["report"]
-    (table,) = (block.frame.set_index("step") for block in document.blocks if isinstance(block, Table))
+    (table,) = (
+        block.frame.set_index("step") for block in document.blocks if isinstance(block, Table)
+    )
     zero = table.loc["Level: v = 0"]
     assert (zero["fvu_median"], zero["other_simulator_fvu"], zero["chosen"]) == (1.0, 1.0, "")
-    assert table.loc["Rough: KS-NN", "other_simulator_fvu"] > 1.0 > table.loc["Level: KS-NN", "other_simulator_fvu"]
-    assert any("**1 of these 2 candidates are worse than v = 0 on that car**" in str(block) for block in document.blocks)
+    assert (
+        table.loc["Rough: KS-NN", "other_simulator_fvu"]
+        > 1.0
+        > table.loc["Level: KS-NN", "other_simulator_fvu"]
+    )
+    assert any(
+        "**1 of these 2 candidates are worse than v = 0 on that car**" in str(block)
+        for block in document.blocks
+    )
 
 
-def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path, monkeypatch):
+def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(
+    artefacts, tmp_path, monkeypatch
+):
     undrawn(monkeypatch)
     document = documents(artefacts)["report"]
     write_document(document, tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     values = [overview(document).loc[name, "fvu_median"] for name in ("rough", "one", "level")]
     assert all(f"**FVU {value:.3f}**" in text for value in values)
-    assert text.count("**That misses what was asked for.**") == sum(value > 0.10 for value in values) > 0
+    assert (
+        text.count("**That misses what was asked for.**")
+        == sum(value > 0.10 for value in values)
+        > 0
+    )
     assert "Only the first figure is a clean test." in text
     assert text.count("the same for all") == 1, "what holds for every part is said once"
     assert {"spread.png", "traces.png"} <= {file.name for file in (tmp_path / "figures").iterdir()}
@@ -163,7 +228,11 @@ def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_a
 def test_study_refuses_a_part_that_learns_on_the_real_car_or_stops_on_other_ranges(artefacts):
     one = artefacts.parts["one"]
     real = replace(one, split=replace(one.split, train=(Span("ferrari", "other"),)))
-    with pytest.raises(DataError, match="part 'one' learns or chooses on 'ferrari', which is not simulated"):
+    with pytest.raises(
+        DataError, match="part 'one' learns or chooses on 'ferrari', which is not simulated"
+    ):
         documents(replace(artefacts, parts={**artefacts.parts, "one": real}))
     other = replace(one, split=replace(one.split, validation=(Span("sim", "elsewhere"),)))
-    assert "stop or choose on different ranges" in refusal(lambda: documents(replace(artefacts, parts={**artefacts.parts, "one": other})))
+    assert "stop or choose on different ranges" in refusal(
+        lambda: documents(replace(artefacts, parts={**artefacts.parts, "one": other}))
+    )

@@ -30,16 +30,40 @@ from vehest.report.document import Figure, Table
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
-from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search
+from vehest_papers.cnn_ukf import (
+    claims,
+    document,
+    documents,
+    networks,
+    observability,
+    paper,
+    perturbed,
+    search,
+)
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, limited
 from vehest_papers.cnn_ukf.measures import MSE, ManoeuvreErrors
-from vehest_papers.cnn_ukf.subjects import OFFLINE, OWN, Prepared, Run, candidate_of, chosen, line_of, runs_of, until
+from vehest_papers.cnn_ukf.subjects import (
+    OFFLINE,
+    OWN,
+    Prepared,
+    Run,
+    candidate_of,
+    chosen,
+    line_of,
+    runs_of,
+    until,
+)
 
 ROOT = Path(__file__).parents[2]
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=1.0, skip_seconds=0.5)
 TESTS = ("test_j_turn_1", "test_slalom_1", "test_spiral_1", "test_lap_1")
 NAMES = ("train_1", "validation_1", *TESTS)
-SPLIT = Split("made", (Span("car", "train_1"),), (Span("car", "validation_1"),), {"test": tuple(Span("car", name, 1.5) for name in TESTS)})
+SPLIT = Split(
+    "made",
+    (Span("car", "train_1"),),
+    (Span("car", "validation_1"),),
+    {"test": tuple(Span("car", name, 1.5) for name in TESTS)},
+)
 TRAINED = {"phase": {"patience": 6, "max_epochs": 30}, "batch_size": 32, "steps": 256}
 POINT = "point"
 SAMPLES = SampleSettings(PhaseSettings(learning_rate=1e-3, max_epochs=1))
@@ -50,7 +74,10 @@ def fitted_models(data):
     given = {"tyres": TYRES, "noise": LEVELS}
     made = {
         paper.MODEL: (estimator_class("dugoff_ukf").from_config(given), [0]),
-        paper.SMOOTH: (estimator_class("dugoff_ukf").from_config({**given, "curve": "smooth"}), [0]),
+        paper.SMOOTH: (
+            estimator_class("dugoff_ukf").from_config({**given, "curve": "smooth"}),
+            [0],
+        ),
     }
     network = estimator_class("sideslip_ffnn").from_config({"hidden": [10, 6]})
     network.seed(0)
@@ -67,9 +94,13 @@ def fitted_models(data):
 
 def further_networks(data):
     """A recurrent network with all 17 inputs, and a point of the search."""
-    recurrent = estimator_class("velocity_gru").from_config({"inputs": list(INPUTS["full"]), "outputs": ["vy"], "n_states": 4})
+    recurrent = estimator_class("velocity_gru").from_config(
+        {"inputs": list(INPUTS["full"]), "outputs": ["vy"], "n_states": 4}
+    )
     phase = PhaseSettings(learning_rate=1e-3, max_epochs=1)
-    recurrent.fit(data, SequenceSettings(phase, sequence_steps=100, validation_steps=100, dropped_steps=20))
+    recurrent.fit(
+        data, SequenceSettings(phase, sequence_steps=100, validation_steps=100, dropped_steps=20)
+    )
     narrower = estimator_class("sideslip_ffnn").from_config({"hidden": [5, 6]})
     narrower.seed(0)
     narrower.fit(data, SAMPLES)
@@ -80,7 +111,9 @@ def further_networks(data):
 def everything(tmp_path_factory):
     """The four methods, the smooth filter, baselines and further networks on four test manoeuvres of six seconds."""
     folder = tmp_path_factory.mktemp("study")
-    recordings = {name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)}
+    recordings = {
+        name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)
+    }
     models, rows = [], []
     fitted = fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]]))
     for number, (candidate, (estimator, seeds)) in enumerate(fitted.items()):
@@ -89,25 +122,63 @@ def everything(tmp_path_factory):
             home.mkdir()
             save_model(estimator, home)
             (home / "fit.csv").write_text("metric,value\nbest_validation_loss,1.0\nbest_epoch,1\n")
-            pd.DataFrame({"epoch": [1, 2], "train_loss": 1.0, "validation_loss": 1.0}).to_csv(home / "history.csv", index=False)
-            models.append(EvaluatedModel(estimator.name, estimator.variant, estimator.full_title, seed, home, home, TRAINED))
+            pd.DataFrame({"epoch": [1, 2], "train_loss": 1.0, "validation_loss": 1.0}).to_csv(
+                home / "history.csv", index=False
+            )
+            models.append(
+                EvaluatedModel(
+                    estimator.name,
+                    estimator.variant,
+                    estimator.full_title,
+                    seed,
+                    home,
+                    home,
+                    TRAINED,
+                )
+            )
             for test, spans in {"validation": SPLIT.validation, **SPLIT.tests}.items():
                 seen = [
-                    recordings[span.recording].cut(span.start - PROTOCOL.warm_up_seconds, span.stop).without_references() for span in spans
+                    recordings[span.recording]
+                    .cut(span.start - PROTOCOL.warm_up_seconds, span.stop)
+                    .without_references()
+                    for span in spans
                 ]
                 own = estimator.estimate(seen)
                 for position, estimate in enumerate(own):
                     write_estimate(estimate, home / test / f"{position}.parquet")
-                figures = accuracy(score_all(own.__getitem__, spans, lambda span: recordings[span.recording], PROTOCOL))
-                rows += metric_rows(models[-1], test, figures | {"n_parameters": 9.0, "epochs": 2.0})
-    kinds, titles, references = {"car": "simulated"}, {"car": "A car"}, stored(folder, "car", recordings)
-    return part_of(SPLIT, PROTOCOL, models, rows, kinds=kinds, data_titles=titles, references=references, facts=["Recordings are made"])
+                figures = accuracy(
+                    score_all(
+                        own.__getitem__, spans, lambda span: recordings[span.recording], PROTOCOL
+                    )
+                )
+                rows += metric_rows(
+                    models[-1], test, figures | {"n_parameters": 9.0, "epochs": 2.0}
+                )
+    kinds, titles, references = (
+        {"car": "simulated"},
+        {"car": "A car"},
+        stored(folder, "car", recordings),
+    )
+    return part_of(
+        SPLIT,
+        PROTOCOL,
+        models,
+        rows,
+        kinds=kinds,
+        data_titles=titles,
+        references=references,
+        facts=["Recordings are made"],
+    )
 
 
 @pytest.fixture(scope="module")
 def part(everything):
     """What Table II needs."""
-    of_table = [own for own in everything.models if own.estimator != "velocity_gru" and not own.model_folder.name.startswith(POINT)]
+    of_table = [
+        own
+        for own in everything.models
+        if own.estimator != "velocity_gru" and not own.model_folder.name.startswith(POINT)
+    ]
     return replace(everything, models=of_table)
 
 
@@ -122,18 +193,36 @@ def report(part, everything):
     names = ("full", "before", "free", "ablation", "standard", "limited", "recurrent", "search_5_6")
     models = {
         "before": [own for own in part.models if own.estimator == "cnn_ukf"],
-        "free": [own for own in part.models if own.variant.endswith("_smooth") or own.estimator == "cnn_ukf"],
-        "ablation": [replace(own, variant="full_no_adaptive_process") for own in part.models if own.estimator == "cnn_ukf"],
+        "free": [
+            own
+            for own in part.models
+            if own.variant.endswith("_smooth") or own.estimator == "cnn_ukf"
+        ],
+        "ablation": [
+            replace(own, variant="full_no_adaptive_process")
+            for own in part.models
+            if own.estimator == "cnn_ukf"
+        ],
         "standard": [own for own in part.models if own.estimator == "sideslip_ffnn"],
-        "limited": [own for own in part.models if own.estimator in ("sideslip_ffnn", "ensemble_ukf", "cnn_ukf")],
+        "limited": [
+            own
+            for own in part.models
+            if own.estimator in ("sideslip_ffnn", "ensemble_ukf", "cnn_ukf")
+        ],
         "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
         "search_5_6": [own for own in everything.models if own.model_folder.name.startswith(POINT)],
     }
     parts = {name: replace(part, models=models.get(name, part.models)) for name in names}
-    return documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
+    return documents(
+        StudyArtefacts(
+            "cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []
+        )
+    )["report"]
 
 
-def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict_with_an_interval(report):
+def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict_with_an_interval(
+    report,
+):
     text = "\n".join(block if isinstance(block, str) else block.caption for block in report.blocks)
     shown = {block.name for block in report.blocks if isinstance(block, Figure)}
     assert {f"figure_{number}" for number in range(4, 15)} == shown
@@ -156,10 +245,18 @@ def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict
     } <= of_tables
     assert "SIMULATED data" in text
     assert not re.search(r"\bnan\b", text)
-    frame = next(block.frame for block in report.blocks if isinstance(block, Table) and block.name == "claims")
+    frame = next(
+        block.frame
+        for block in report.blocks
+        if isinstance(block, Table) and block.name == "claims"
+    )
     assert len(frame) > 25
-    tested = frame[(frame["verdict"] != "not testable on this data") & (frame["data"] == "simulated")]
-    one_of_a_kind = tested["claim"].str.contains("nine combinations|weak in|slaloms' peaks")  # the first counts intervals; groups of one
+    tested = frame[
+        (frame["verdict"] != "not testable on this data") & (frame["data"] == "simulated")
+    ]
+    one_of_a_kind = tested["claim"].str.contains(
+        "nine combinations|weak in|slaloms' peaks"
+    )  # the first counts intervals; groups of one
     without = tested[~tested["ours"].str.contains(r"\[", regex=True) & ~one_of_a_kind]
     assert without.empty, without["claim"].tolist()
     assert (frame.loc[frame["verdict"] == "not testable on this data", "ours"] == "–").all()
@@ -173,7 +270,9 @@ def test_candidates_have_the_papers_names_and_lines(part):
     away = replace(part.models[-2], estimator="cnn_ukf", variant="full_no_adaptive_process")
     assert candidate_of(away) == "process noise constant"
     twice = replace(part, models=[part.models[0], part.models[0]])
-    assert "Model-based was trained twice with one seed" in refusal(lambda: runs_of(twice, Prepared(twice)))
+    assert "Model-based was trained twice with one seed" in refusal(
+        lambda: runs_of(twice, Prepared(twice))
+    )
     assert line_of(paper.CNN + OWN) == line_of(paper.CNN)
     with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
         candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
@@ -207,7 +306,10 @@ def test_indicators_and_differences_are_those_of_the_paper(runs):
             assert own.get(candidate, indicator).value == pytest.approx(expected)
     generator = np.random.default_rng(0)
     levels = {"a": 1.0, "b": 1.5, "c": 1.0}
-    made = {name: [made_run(name, noisy(level, generator), seed) for seed in range(3)] for name, level in levels.items()}
+    made = {
+        name: [made_run(name, noisy(level, generator), seed) for seed in range(3)]
+        for name, level in levels.items()
+    }
     own = ManoeuvreErrors(made, "t")
     low, high = own.change("a", "b", MSE).ends()
     assert low < 1.0 / 2.25 < high < 0.7
@@ -223,10 +325,19 @@ def test_validation_chooses_the_seed_and_a_filter_that_does_not_listen_is_called
     assert quiet.kpis.mse > wild.kpis.mse
     assert chosen([quiet, wild]).model.seed == 0
     errors = noisy(1.0, np.random.default_rng(0), 40)
-    same, other = [made_run(paper.SMOOTH, errors)], [made_run(paper.CNN, [0.5 * own for own in errors])]
-    assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9)
-    assert not claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.9)
-    assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01)
+    same, other = (
+        [made_run(paper.SMOOTH, errors)],
+        [made_run(paper.CNN, [0.5 * own for own in errors])],
+    )
+    assert claims.is_own_filter(
+        ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9
+    )
+    assert not claims.is_own_filter(
+        ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.9
+    )
+    assert claims.is_own_filter(
+        ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01
+    )
 
 
 def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_cut():
@@ -236,10 +347,16 @@ def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_
     assert len(until(part, 0.3).time) == 4
 
     def driven(*largest):
-        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
+        test = {
+            f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))]
+            for k, angle in enumerate(largest)
+        }
         return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
 
-    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
+    assert (
+        document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0))
+        == "2 of 4 drives, with up to 180° and 43°, are"
+    )
     assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
     assert document._cut_in_words(driven(3.0)) == "no drive is"
 
@@ -248,9 +365,14 @@ def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, 
     prepared = Prepared(part)
 
     def knowing(run, drives):
-        whole = [prepared.recording("car", drive.id).cut(drive.start_time, drive.end_time + 0.005) for drive in drives]
+        whole = [
+            prepared.recording("car", drive.id).cut(drive.start_time, drive.end_time + 0.005)
+            for drive in drives
+        ]
         true = [np.arctan2(own["vy_ref"], own["vx"]) for own in whole]
-        return [PseudoMeasurement(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true]
+        return [
+            PseudoMeasurement(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true
+        ]
 
     monkeypatch.setattr(networks, "pseudo_measurements_of", knowing)
     outputs = networks.outputs_of(runs[paper.CNN][0], prepared)
@@ -270,9 +392,16 @@ def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(
 def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, runs):
     for name in ("dugoff_ukf", "cnn_ukf"):
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
-        changed, heavy = perturbed.with_stiffness(fitted, 0.1, -0.1), perturbed.with_body(fitted, 1.1, 0.9)
-        before, after, other = ((own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy))
-        np.testing.assert_allclose(after.axle_tyres / before.axle_tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0])
+        changed, heavy = (
+            perturbed.with_stiffness(fitted, 0.1, -0.1),
+            perturbed.with_body(fitted, 1.1, 0.9),
+        )
+        before, after, other = (
+            (own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy)
+        )
+        np.testing.assert_allclose(
+            after.axle_tyres / before.axle_tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0]
+        )
         assert other.track().car.mass == pytest.approx(1.1 * before.track().car.mass)
         assert other.track().car.yaw_inertia == pytest.approx(0.9 * before.track().car.yaw_inertia)
     for change in (perturbed.with_stiffness, perturbed.with_body):
@@ -283,7 +412,9 @@ def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, run
 
 
 def test_the_model_is_observable_straight_ahead_as_well():
-    estimator = estimator_class("dugoff_ukf").from_config({"tyres": TYRES, "noise": LEVELS, "curve": "smooth"})
+    estimator = estimator_class("dugoff_ukf").from_config(
+        {"tyres": TYRES, "noise": LEVELS, "curve": "smooth"}
+    )
     found = observability.local(estimator)
     straight = found[(found["steer"] == 0.0) & (found["measured"] == "ay, yaw rate, both forces")]
     assert set(straight["rank"]) == {2}
@@ -295,13 +426,19 @@ def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(part, runs,
     prepared = Prepared(part)
     learnt = {name: runs[name] for name in (paper.DATA, *paper.HYBRIDS)}
     same = limited(runs, learnt, prepared).scaling
-    assert same.get(AS_TUNED, MSE).value == pytest.approx(same.get(OF_THE_FULL_SET, MSE).value, rel=2e-3)  # estimated on raw drives
+    assert same.get(AS_TUNED, MSE).value == pytest.approx(
+        same.get(OF_THE_FULL_SET, MSE).value, rel=2e-3
+    )  # estimated on raw drives
     other = load_model(runs[paper.DEEP][0].model.model_folder)
     other.scaling = other.scaling + np.array([4.0, 0.0])  # DE-UKF
     save_model(other, tmp_path)
-    of_full = [replace(run, model=replace(run.model, model_folder=tmp_path)) for run in runs[paper.DEEP]]
+    of_full = [
+        replace(run, model=replace(run.model, model_folder=tmp_path)) for run in runs[paper.DEEP]
+    ]
     changed = limited({**runs, paper.DEEP: of_full}, learnt, prepared)
-    assert changed.scaling.get(OF_THE_FULL_SET, MSE).value != pytest.approx(same.get(AS_TUNED, MSE).value, rel=1e-2)
+    assert changed.scaling.get(OF_THE_FULL_SET, MSE).value != pytest.approx(
+        same.get(AS_TUNED, MSE).value, rel=1e-2
+    )
     assert changed.scaling.get(AS_TUNED, MSE).value == same.get(AS_TUNED, MSE).value
     assert paper.MODEL in changed.comparison  # the filter of the full set
     with pytest.raises(DataError, match="no CNN-UKF among the models of part 'limited'"):
@@ -309,31 +446,52 @@ def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(part, runs,
 
 
 def test_the_search_compares_validation_with_the_papers_widths(everything, runs):
-    point = replace(everything, models=[own for own in everything.models if own.model_folder.name.startswith(POINT)])
-    parts = {"search_5_6": runs_of(point, Prepared(point)), "standard": {paper.DATA: runs[paper.DATA]}}
+    point = replace(
+        everything,
+        models=[own for own in everything.models if own.model_folder.name.startswith(POINT)],
+    )
+    parts = {
+        "search_5_6": runs_of(point, Prepared(point)),
+        "standard": {paper.DATA: runs[paper.DATA]},
+    }
     assert list(search.points_of(parts, runs)) == [(5, 6), (10, 6)]
     table = search.search_table(parts, runs, "D")
     assert table.frame["change"].tolist()[1] == "–"
     assert table.frame["weights"].tolist() == [5 * 18 + 6 * 6 + 7, 10 * 18 + 6 * 11 + 7]
     wild = replace(runs[paper.DATA][0], test={})  # the search knows no test
-    assert search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist() == table.frame["validation"].tolist()
+    assert (
+        search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist()
+        == table.frame["validation"].tolist()
+    )
 
 
 def test_manoeuvres_in_two_ranges_and_reports_without_a_main_part_are_refused(part):
     spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
     twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
-    assert "has several ranges, but a manoeuvre is one" in refusal(lambda: runs_of(twice, Prepared(twice)))
+    assert "has several ranges, but a manoeuvre is one" in refusal(
+        lambda: runs_of(twice, Prepared(twice))
+    )
     with pytest.raises(DataError, match="needs part 'full'"):
         documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
 
 
 def test_recordings_are_prepared_as_the_pipeline_does_and_the_published_page_is_short(part):
     content = yaml.safe_load((ROOT / "pipelines" / "cnn_ukf.yaml").read_text())
-    offline = {override for part in content["parts"].values() for sweep in part["sweeps"] for override in sweep}
+    offline = {
+        override
+        for part in content["parts"].values()
+        for sweep in part["sweeps"]
+        for override in sweep
+    }
     (told,) = {override for override in offline if override.startswith("downsample.transforms=")}
-    assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
+    assert (
+        tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2]))
+        == OFFLINE
+    )
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
-    assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(pd.read_parquet(noisy)["ay"], 2))
+    assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(
+        np.diff(pd.read_parquet(noisy)["ay"], 2)
+    )
     text = (ROOT / "results" / "cnn_ukf" / "report.md").read_text(encoding="utf-8")
     assert len(text[: text.index("## Appendix")].split()) <= 2500

@@ -24,12 +24,29 @@ def short_drive(seconds=60.0):
     generator = np.random.default_rng(0)
     u, steer = np.full(len(time), 10.0), 0.05 * np.sin(0.4 * time)
     yaw_rate = u * steer / 3.5
-    clean = {"vx": u, "steer": steer, "yaw_rate": yaw_rate, "ay": u * yaw_rate, "ax": np.zeros(len(time))}
+    clean = {
+        "vx": u,
+        "steer": steer,
+        "yaw_rate": yaw_rate,
+        "ay": u * yaw_rate,
+        "ax": np.zeros(len(time)),
+    }
     levels = {"vx": 0.01, "steer": 0.0005, "yaw_rate": 0.002, "ay": 0.05, "ax": 0.05}
-    channels = {name: samples + levels[name] * generator.standard_normal(len(time)) for name, samples in clean.items()}
+    channels = {
+        name: samples + levels[name] * generator.standard_normal(len(time))
+        for name, samples in clean.items()
+    }
     sides = {"fl": 1.04, "fr": -1.04, "rl": 1.04, "rr": -1.04}
-    channels |= {f"wheel_speed_{wheel}": (u - yaw_rate * side) / WHEELS.wheel_radius for wheel, side in sides.items()}
-    references = {"vx_ref": u, "vy_ref": 0.1 * yaw_rate, "yaw_rate_ref": yaw_rate, "sideslip_ref": 0.01 * yaw_rate}
+    channels |= {
+        f"wheel_speed_{wheel}": (u - yaw_rate * side) / WHEELS.wheel_radius
+        for wheel, side in sides.items()
+    }
+    references = {
+        "vx_ref": u,
+        "vy_ref": 0.1 * yaw_rate,
+        "yaw_rate_ref": yaw_rate,
+        "sideslip_ref": 0.01 * yaw_rate,
+    }
     return Recording("short", "truck", RATE, 0.0, channels | references, "simulated")
 
 
@@ -37,7 +54,9 @@ def short_drive(seconds=60.0):
 def ratte():
     curves = AxleCurves(0.013, 487e3, 0.0077, 622e3)
     return RationalFilter(
-        RationalFilter.settings_type(car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003))
+        RationalFilter.settings_type(
+            car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003)
+        )
     )
 
 
@@ -86,18 +105,31 @@ def test_gains_are_those_of_the_figures_and_locked_axles_named():
 
 
 def estimated(drive, gain, noise=0.0):
-    sideslip = gain * drive["sideslip_ref"] + noise * np.random.default_rng(1).standard_normal(len(drive))
-    return Estimate(drive.id, "scaled", drive.rate_hz, drive.start_time, {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip})
+    sideslip = gain * drive["sideslip_ref"] + noise * np.random.default_rng(1).standard_normal(
+        len(drive)
+    )
+    return Estimate(
+        drive.id,
+        "scaled",
+        drive.rate_hz,
+        drive.start_time,
+        {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip},
+    )
 
 
 def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim():
     drive = short_drive(120.0)
     drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
-    estimates = {"nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}}
+    estimates = {
+        "nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}
+    }
     gains = accuracy.gains_of({"nominal_laps": drive}, estimates, ["LINT", "RATT"])
     assert gains["nominal_laps", "LINT"][0] == pytest.approx(0.8, abs=0.01)
     gains |= {("worn_laps", name): gains["nominal_laps", name] for name in ("LINT", "RATT")}
-    assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == ["reproduced", "undecided"] * 2
+    assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == [
+        "reproduced",
+        "undecided",
+    ] * 2
 
 
 def test_laps_are_thirds_of_the_way_and_the_stop_is_when_the_truck_last_moved():
@@ -107,7 +139,9 @@ def test_laps_are_thirds_of_the_way_and_the_stop_is_when_the_truck_last_moved():
     assert not (laps[0] & laps[1]).any()
     drive = short_drive(60.0)
     speed = np.where(drive.time < 40.0, 10.0, 0.0)
-    stopped = Recording("stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated")
+    stopped = Recording(
+        "stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated"
+    )
     assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
 
 
@@ -115,7 +149,13 @@ def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is
     samples = np.full(5, 1000.0)
     level = np.array([1.0, 1.1, 0.9, 1.05, 0.95]) * 0.04 * 1000.0
     jumps = np.array([1.5, 0.6, 1.4, 0.5, 1.0])
-    sums = {"worn_fast": {"LINT": (level, samples), "RATT": (1.5 * level, samples), "RATTE": (jumps * level, samples)}}
+    sums = {
+        "worn_fast": {
+            "LINT": (level, samples),
+            "RATT": (1.5 * level, samples),
+            "RATTE": (jumps * level, samples),
+        }
+    }
     found = draws.compared(sums)
     own, told_apart = found["worn_fast", ("RATT", "LINT")]
     assert told_apart

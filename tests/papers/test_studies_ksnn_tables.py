@@ -12,14 +12,23 @@ from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.ksnn import paper, scatter, tables
-from vehest_papers.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
+from vehest_papers.ksnn.candidates import (
+    category_of,
+    chosen,
+    chosen_by_category,
+    runs_of,
+    structure_of,
+)
 from vehest_papers.ksnn.schemes import Scheme
 
 SPLIT = Split(
     "scheme",
     (Span("cars", "c1", -math.inf, math.inf),),
     (Span("cars", "f1", -math.inf, math.inf),),
-    {"c2": (Span("cars", "c2", -math.inf, math.inf),), "f2": (Span("cars", "f2", -math.inf, math.inf),)},
+    {
+        "c2": (Span("cars", "c2", -math.inf, math.inf),),
+        "f2": (Span("cars", "f2", -math.inf, math.inf),),
+    },
 )
 
 # (estimator, variant, seed) -> RMSE of v on validation, FVU on c2, FVU on f2
@@ -41,14 +50,27 @@ def part(figures=FIGURES, drop=""):
         values = {("validation", "rmse_vy"): validation, ("validation", "fvu"): validation**2}
         for test, fvu in zip(("c2", "f2"), fvus, strict=True):
             values |= {(test, "fvu"): fvu, (test, "rmse_vy"): 0.5 * math.sqrt(fvu)}
-            values |= {(test, "n_parameters"): 2 + seed * 0, (test, "epochs"): 10 * (seed + 1) * (estimator != "luenberger")}
+            values |= {
+                (test, "n_parameters"): 2 + seed * 0,
+                (test, "epochs"): 10 * (seed + 1) * (estimator != "luenberger"),
+            }
         for test in ("validation", "c2", "f2"):
-            values |= {(test, "r2"): 1 - values[test, "fvu"], (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"]}
-        models.append(EvaluatedModel(estimator, variant, f"{estimator} {variant}", seed, Path("m"), Path("e")))
+            values |= {
+                (test, "r2"): 1 - values[test, "fvu"],
+                (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"],
+            }
+        models.append(
+            EvaluatedModel(estimator, variant, f"{estimator} {variant}", seed, Path("m"), Path("e"))
+        )
         rows += [
-            row for (test, metric), value in values.items() if metric != drop for row in metric_rows(models[-1], test, {metric: value})
+            row
+            for (test, metric), value in values.items()
+            if metric != drop
+            for row in metric_rows(models[-1], test, {metric: value})
         ]
-    return part_of(SPLIT, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
+    return part_of(
+        SPLIT, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"}
+    )
 
 
 def test_runs_have_a_row_a_model_with_all_metrics_and_missing_ones_are_said():
@@ -57,7 +79,9 @@ def test_runs_have_a_row_a_model_with_all_metrics_and_missing_ones_are_said():
     row = runs[(runs["variant"] == "states_3") & (runs["seed"] == 1)].iloc[0]
     assert (row["category"], row["structure"], row["epochs"]) == (paper.GRU, "3 states", 20)
     assert (row["rmse_vy.validation"], row["fvu.c2"], row["r2.f2"]) == (0.25, 0.01, 0.99)
-    assert "luenberger-luenberger-seed0 has no r2.validation; evaluate it again" in refusal(lambda: runs_of(part(drop="r2")))
+    assert "luenberger-luenberger-seed0 has no r2.validation; evaluate it again" in refusal(
+        lambda: runs_of(part(drop="r2"))
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,9 +106,17 @@ def test_candidates_fall_into_the_papers_categories(estimator, variant, category
 def test_validation_chooses_and_neither_tests_nor_diverged_runs_do():
     picked = chosen_by_category(runs_of(part()))
     assert list(picked) == [paper.LUENBERGER, paper.GRU, paper.NONLINEAR_BIAS, paper.LINEAR]
-    assert (picked[paper.GRU]["variant"], picked[paper.GRU]["seed"]) == ("states_3", 0), "seed 1 is far better on both tests"
-    assert (picked[paper.LINEAR]["variant"], picked[paper.LINEAR]["seed"]) == ("linear_no_bias_p2", 1)
-    figures = {("gru", "states_2", 0): (math.nan, 0.1, 0.1), ("gru", "states_2", 1): (0.3, 0.2, 0.2)}
+    assert (picked[paper.GRU]["variant"], picked[paper.GRU]["seed"]) == ("states_3", 0), (
+        "seed 1 is far better on both tests"
+    )
+    assert (picked[paper.LINEAR]["variant"], picked[paper.LINEAR]["seed"]) == (
+        "linear_no_bias_p2",
+        1,
+    )
+    figures = {
+        ("gru", "states_2", 0): (math.nan, 0.1, 0.1),
+        ("gru", "states_2", 1): (0.3, 0.2, 0.2),
+    }
     assert chosen(runs_of(part(figures)))["seed"] == 1
 
 
@@ -98,11 +130,16 @@ def test_sideslip_table_has_a_column_a_kind_of_data():
     assert table["real_whole"].isna().all()
     assert dict(table["paper"].dropna()) == paper.TABLE_VI
     assert set(paper.BASELINES) <= set(table.index)
-    assert tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header == "ours: REAL F-2, scheme 2 [deg]"
+    assert (
+        tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header
+        == "ours: REAL F-2, scheme 2 [deg]"
+    )
 
 
 def test_stopping_and_candidates_count_what_was_trained():
-    table = tables.stopping({"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}).frame.set_index("model")
+    table = tables.stopping(
+        {"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}
+    ).frame.set_index("model")
     assert paper.LUENBERGER not in table.index
     assert table.loc[paper.GRU, ["fits", "least", "median", "most"]].tolist() == [3, 10, 10, 20]
     table = tables.candidates(runs_of(part()), ["c2", "f2"])
@@ -122,7 +159,9 @@ def test_the_scatter_shows_ours_filled_and_the_papers_hollow():
         assert np.isclose(points, expected).all(axis=1).any(), f"{expected} is not drawn"
     lower_right = figure.axes[3]
     points = np.concatenate([own.get_offsets() for own in lower_right.collections])
-    assert np.isclose(points, (0.210, 0.170)).all(axis=1).any(), "the paper's linear network without bias, C-2 against F-2"
+    assert np.isclose(points, (0.210, 0.170)).all(axis=1).any(), (
+        "the paper's linear network without bias, C-2 against F-2"
+    )
 
 
 def test_published_figures_agree_with_each_other():

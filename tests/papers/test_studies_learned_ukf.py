@@ -33,20 +33,54 @@ from vehest_papers.learned_ukf.additions import (
     minima_claim,
     samples_seen,
 )
-from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
+from vehest_papers.learned_ukf.candidates import (
+    candidate_of,
+    chosen,
+    models_by_candidate,
+    runs_of,
+    scored_of,
+)
 from vehest_papers.learned_ukf.errors import Losses
-from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences, one_step_squares, swapped
+from vehest_papers.learned_ukf.filtering import (
+    drives_of,
+    filtered,
+    loaded,
+    lost_sequences,
+    one_step_squares,
+    swapped,
+)
 from vehest_papers.learned_ukf.lengths import lengths
-from vehest_papers.learned_ukf.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
+from vehest_papers.learned_ukf.order import (
+    APART,
+    AS_IN_THE_PAPER,
+    LEVEL,
+    TURNED,
+    UNDECIDED,
+    differences,
+    order_in_words,
+)
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
 
-PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
+PROTOCOL = Protocol(
+    rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True
+)
 SPANS = {name: Span("car", name) for name in ("learnt", "judged", "a", "d")}
-SPLIT = Split("tyres", (SPANS["learnt"],), (SPANS["judged"],), {"tyre_a": (SPANS["a"],), "tyre_d": (SPANS["d"],)})
+SPLIT = Split(
+    "tyres",
+    (SPANS["learnt"],),
+    (SPANS["judged"],),
+    {"tyre_a": (SPANS["a"],), "tyre_d": (SPANS["d"],)},
+)
 PHASE = {"learning_rate": 5e-4, "max_epochs": 1000, "schedule": "constant"}
 AS_THE_PAPER = dict.fromkeys(("one_step", "through", "noise"), PHASE)
-AS_THE_PAPER |= {"batch_size": 256, "placing": "fixed", "start_spread": 0.0, "mirrored": 0.0, "start_noise": "given"}
+AS_THE_PAPER |= {
+    "batch_size": 256,
+    "placing": "fixed",
+    "start_spread": 0.0,
+    "mirrored": 0.0,
+    "start_noise": "given",
+}
 AS_THE_PAPER |= {"drop_steps": 200, "steps": 500}
 CANDIDATES = {
     "NNT": {"dynamics": "tyre_network", "noise": "constant", "through_filter": False},
@@ -60,11 +94,27 @@ CANDIDATES = {
 def recording(name, seconds=3.2, seed=0):
     """A drive of smooth motion that no model explains."""
     time = np.arange(round(100 * seconds)) / 100.0
-    vx, vy, yaw_rate = 2.5 + 0.4 * np.sin(1.3 * time + seed), 0.3 * np.sin(2.0 * time + seed), 1.2 * np.cos(1.1 * time + seed)
+    vx, vy, yaw_rate = (
+        2.5 + 0.4 * np.sin(1.3 * time + seed),
+        0.3 * np.sin(2.0 * time + seed),
+        1.2 * np.cos(1.1 * time + seed),
+    )
     noise = np.random.default_rng(seed).normal(0.0, 0.05, (4, len(time)))
     measured = {"vx": vx, "motor_speed": 20.0 * vx + noise[0], "yaw_rate": yaw_rate + noise[1]}
-    measured |= {"ax": noise[2], "ay": vx * yaw_rate + noise[3], "steer": 0.2 * yaw_rate, "motor_current": 10.0 + 5.0 * np.sin(time)}
-    return Recording(name, "car", 100.0, 0.0, {**measured, "vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate}, "simulated")
+    measured |= {
+        "ax": noise[2],
+        "ay": vx * yaw_rate + noise[3],
+        "steer": 0.2 * yaw_rate,
+        "motor_current": 10.0 + 5.0 * np.sin(time),
+    }
+    return Recording(
+        name,
+        "car",
+        100.0,
+        0.0,
+        {**measured, "vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate},
+        "simulated",
+    )
 
 
 def filter_of(seed=0, **settings):
@@ -84,33 +134,79 @@ def part(tmp_path_factory):
         for seed in (0, 1):
             home = folder / f"{candidate.strip('*')}{candidate.count('*')}-{seed}"
             home.mkdir()
-            estimator = filter_of(seed, **CANDIDATES[candidate]) if candidate in CANDIDATES else None
-            name, variant = (estimator.name, estimator.variant) if estimator else ("velocity_gru", "states_64")
-            models.append(EvaluatedModel(name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}))
-            for test, span in {"validation": SPANS["judged"], "tyre_a": SPANS["a"], "tyre_d": SPANS["d"]}.items():
+            estimator = (
+                filter_of(seed, **CANDIDATES[candidate]) if candidate in CANDIDATES else None
+            )
+            name, variant = (
+                (estimator.name, estimator.variant) if estimator else ("velocity_gru", "states_64")
+            )
+            models.append(
+                EvaluatedModel(
+                    name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}
+                )
+            )
+            for test, span in {
+                "validation": SPANS["judged"],
+                "tyre_a": SPANS["a"],
+                "tyre_d": SPANS["d"],
+            }.items():
                 pieces = sequences([span], lambda span: recordings[span.recording], PROTOCOL)
                 cut = [recordings[span.recording].cut(piece.start, piece.stop) for piece in pieces]
                 states = [reference_state(recordings[span.recording], piece) for piece in pieces]
-                own = estimator.estimate([one.without_references() for one in cut], states) if estimator else [constant(one) for one in cut]
+                own = (
+                    estimator.estimate([one.without_references() for one in cut], states)
+                    if estimator
+                    else [constant(one) for one in cut]
+                )
                 for position, estimate in enumerate(own):
                     write_estimate(estimate, home / test / f"{position}.parquet")
-                scored = score_all(own.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL)
+                scored = score_all(
+                    own.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL
+                )
                 figures = accuracy(scored) | {"n_parameters": 100, "epochs": 4, "n_sequences": 3}
                 rows += metric_rows(models[-1], test, figures)
             if estimator:
                 save_model(estimator, home)
-                pd.DataFrame({"metric": ["skipped_steps", "best_epoch"], "value": [1.0, 2.0]}).to_csv(home / "fit.csv", index=False)
-                history = pd.DataFrame({"phase": [0.0, 1.0, 1.0], "epoch": [1, 1, 2], "train_loss": 1.0, "validation_loss": 1.0})
+                pd.DataFrame(
+                    {"metric": ["skipped_steps", "best_epoch"], "value": [1.0, 2.0]}
+                ).to_csv(home / "fit.csv", index=False)
+                history = pd.DataFrame(
+                    {
+                        "phase": [0.0, 1.0, 1.0],
+                        "epoch": [1, 1, 2],
+                        "train_loss": 1.0,
+                        "validation_loss": 1.0,
+                    }
+                )
                 history.to_csv(home / "history.csv", index=False)
     facts = ["Recordings are made", "learned_ukf: through_filter"]
-    kinds, titles, references = {"car": "simulated"}, {"car": "A car"}, stored(folder, "car", recordings)
-    return part_of(SPLIT, PROTOCOL, models, rows, kinds=kinds, data_titles=titles, references=references, facts=facts)
+    kinds, titles, references = (
+        {"car": "simulated"},
+        {"car": "A car"},
+        stored(folder, "car", recordings),
+    )
+    return part_of(
+        SPLIT,
+        PROTOCOL,
+        models,
+        rows,
+        kinds=kinds,
+        data_titles=titles,
+        references=references,
+        facts=facts,
+    )
 
 
 def constant(own):
     """An estimate without covariance that stays at the start."""
     channels = {name: np.full(len(own), own[f"{name}_ref"][0]) for name in ("vx", "vy", "yaw_rate")}
-    return Estimate(own.id, "velocity_gru", 100.0, own.start_time, {**channels, "sideslip": channels["vy"] / channels["vx"]})
+    return Estimate(
+        own.id,
+        "velocity_gru",
+        100.0,
+        own.start_time,
+        {**channels, "sideslip": channels["vy"] / channels["vx"]},
+    )
 
 
 def model(part, candidate, seed=0):
@@ -126,7 +222,14 @@ def model(part, candidate, seed=0):
 )
 def test_candidates_have_the_papers_names(settings, candidate):
     estimator = LearnedUkf(LearnedUkf.settings_type(width=4, **settings))
-    assert candidate_of(EvaluatedModel("learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path())) == candidate
+    assert (
+        candidate_of(
+            EvaluatedModel(
+                "learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path()
+            )
+        )
+        == candidate
+    )
 
 
 def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets_are_refused(part):
@@ -134,18 +237,41 @@ def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets
     assert "NNT was trained twice with one seed" in refusal(lambda: models_by_candidate(twice))
     (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
     assert name == "NNTF_UH from scratch"
-    assert candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path())) == "PC with E"
-    metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
-    assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(lambda: runs_of(replace(part, metrics=metrics)))
-    assert "needs one of the parts: real, simulated" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, [])))
-    other = replace(part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]}))
-    assert "must be called tyre_a and tyre_d" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, [])))
+    assert (
+        candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path()))
+        == "PC with E"
+    )
+    metrics = part.metrics[
+        ~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))
+    ]
+    assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(
+        lambda: runs_of(replace(part, metrics=metrics))
+    )
+    assert "needs one of the parts: real, simulated" in refusal(
+        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
+    )
+    other = replace(
+        part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})
+    )
+    assert "must be called tyre_a and tyre_d" in refusal(
+        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
+    )
 
 
-def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path, monkeypatch):
+def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(
+    part, tmp_path, monkeypatch
+):
     undrawn(monkeypatch)
-    titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "likelihood": "With likelihood"}
-    parts = {"simulated": part, **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)}, "likelihood": part}
+    titles = {
+        "real": "Real tyre sets",
+        "simulated": "Simulated tyre sets",
+        "likelihood": "With likelihood",
+    }
+    parts = {
+        "simulated": part,
+        **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)},
+        "likelihood": part,
+    }
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
     artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, ["real"])
@@ -153,7 +279,11 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
     figures = {block.name for block in document.blocks if isinstance(block, Figure)}
-    assert figures == {*(f"figure_{number}_simulated" for number in (3, 4, 5, 6)), "figure_7", "friction_simulated"}
+    assert figures == {
+        *(f"figure_{number}_simulated" for number in (3, 4, 5, 6)),
+        "figure_7",
+        "friction_simulated",
+    }
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {
         "claims",
@@ -162,18 +292,49 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
         "additions_budget_simulated",
         "overview",
         "sequence_length",
-        *(f"{name}_simulated" for name in ("table_1", "table_2", "by_state", "consistency", "budget", "friction", "start", "coverage")),
+        *(
+            f"{name}_simulated"
+            for name in (
+                "table_1",
+                "table_2",
+                "by_state",
+                "consistency",
+                "budget",
+                "friction",
+                "start",
+                "coverage",
+            )
+        ),
     }
-    table = next(block for block in document.blocks if isinstance(block, Table) and block.name == "claims")
-    assert set(table.frame["verdict"]) <= {"reproduced", "not reproduced", "undecided", "not testable on this data"}
-    assert (table.frame["verdict"] == "not testable on this data").sum() == len(claims.not_testable(timed=True))
-    added = next(block for block in document.blocks if isinstance(block, Table) and block.name == "claims_added").frame.set_index("claim")
+    table = next(
+        block for block in document.blocks if isinstance(block, Table) and block.name == "claims"
+    )
+    assert set(table.frame["verdict"]) <= {
+        "reproduced",
+        "not reproduced",
+        "undecided",
+        "not testable on this data",
+    }
+    assert (table.frame["verdict"] == "not testable on this data").sum() == len(
+        claims.not_testable(timed=True)
+    )
+    added = next(
+        block
+        for block in document.blocks
+        if isinstance(block, Table) and block.name == "claims_added"
+    ).frame.set_index("claim")
     assert added.loc["full noise below diagonal noise", "verdict"] == "undecided", "the same models"
     assert added.loc["from scratch is prone to local minima", "verdict"] == "not reproduced"
-    assert "an epoch 150, 200 at constant batch" in added.loc["longer training sequences take longer an epoch", "ours"]
+    assert (
+        "an epoch 150, 200 at constant batch"
+        in added.loc["longer training sequences take longer an epoch", "ours"]
+    )
     assert len(text.split("## Appendix")[0].split()) < 2500
     assert "Not run here, for their budget: the E terms of Equation 3." in text
-    assert set(document.data) >= {f"{name}_simulated" for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")}
+    assert set(document.data) >= {
+        f"{name}_simulated"
+        for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")
+    }
     assert "Simulated tyre sets: SIMULATED data" in text
     assert "Not in this report, since the recordings are missing: Real tyre sets" in text
     assert "authors' public code" not in text
@@ -183,7 +344,10 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
 
 def only(part, candidate, training=None):
     """The part with one candidate, trained in another way."""
-    own = [replace(one, training={**one.training, **(training or {})}) for one in models_by_candidate(part)[candidate]]
+    own = [
+        replace(one, training={**one.training, **(training or {})})
+        for one in models_by_candidate(part)[candidate]
+    ]
     return replace(part, models=own)
 
 
@@ -211,7 +375,9 @@ def test_swapping_a_model_for_itself_changes_nothing_and_for_another_both_halves
     own = means(filtered(first, drives))
     assert torch.equal(means(swapped(first, first, drives)), own)
     assert not torch.allclose(means(swapped(first, second, drives)), own)
-    assert not torch.allclose(means(swapped(second, first, drives)), means(filtered(second, drives)))
+    assert not torch.allclose(
+        means(swapped(second, first, drives)), means(filtered(second, drives))
+    )
 
 
 def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
@@ -236,7 +402,9 @@ def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
     drives = Drive(torch.stack(states)[None], inputs[None], torch.zeros(1, 6, 4))
     assert one_step_squares(estimator, drives).max() == 0.0
     drives.states[0, -1, 1] += 0.5
-    np.testing.assert_allclose(one_step_squares(estimator, drives), [[0.0, 0.05, 0.0, 0.0]], rtol=1e-5)
+    np.testing.assert_allclose(
+        one_step_squares(estimator, drives), [[0.0, 0.05, 0.0, 0.0]], rtol=1e-5
+    )
 
 
 def test_validation_chooses_the_seed_and_tests_do_not(part):
@@ -251,8 +419,16 @@ def errors_of(**levels):
     """Twelve sequences of 50 samples, three seeds; losses around a level, in sequences of different difficulty."""
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
-    squared = {name: np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)]) for name, level in levels.items()}
-    return Losses(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
+    squared = {
+        name: np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)])
+        for name, level in levels.items()
+    }
+    return Losses(
+        squared,
+        {name: np.sqrt(own) for name, own in squared.items()},
+        np.repeat(np.arange(12), 50),
+        100.0,
+    )
 
 
 def test_tables_show_means_with_intervals_beside_the_paper():
@@ -315,14 +491,25 @@ def test_friction_is_judged_by_its_time_and_its_end(median, final, verdicts):
 def test_instability_and_several_states_need_all_of_them():
     found = claims.instability_claims({"NNT": [(0, 9), (0, 9)], "NNT_U": [(1, 9), (0, 9)]}, "real")
     assert [own.verdict for own in found] == ["not reproduced", "reproduced"]
-    assert claims.instability_claims({"NNT": [(1, 9), (0, 9), (0, 9)]}, "real")[0].verdict == "undecided"
+    assert (
+        claims.instability_claims({"NNT": [(1, 9), (0, 9), (0, 9)]}, "real")[0].verdict
+        == "undecided"
+    )
     lower, level, higher = interval(-2.0, -1.0), interval(-1.0, 1.0), interval(1.0, 2.0)
 
     def verdict(*states):
-        return claims.states_claim("c", "w", {str(k): (own, 1.0, True) for k, own in enumerate(states)}, "real").verdict
+        return claims.states_claim(
+            "c", "w", {str(k): (own, 1.0, True) for k, own in enumerate(states)}, "real"
+        ).verdict
 
-    assert [verdict(lower, lower), verdict(lower, level), verdict(lower, higher)] == ["reproduced", "undecided", "not reproduced"]
-    assert claims.states_claim("c", "w", {"vx": (higher, 1.0, False)}, "real").verdict == "reproduced"
+    assert [verdict(lower, lower), verdict(lower, level), verdict(lower, higher)] == [
+        "reproduced",
+        "undecided",
+        "not reproduced",
+    ]
+    assert (
+        claims.states_claim("c", "w", {"vx": (higher, 1.0, False)}, "real").verdict == "reproduced"
+    )
 
 
 def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
@@ -330,8 +517,13 @@ def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_p
     for test in ("tyre_a",):
         for position in range(3):
             estimate = own.estimate(test, position)
-            channels = {"vy": np.zeros(len(estimate.channels["vy"])), "sideslip": np.zeros(len(estimate.channels["vy"]))}
-            write_estimate(replace(estimate, channels=channels), tmp_path / test / f"{position}.parquet")
+            channels = {
+                "vy": np.zeros(len(estimate.channels["vy"])),
+                "sideslip": np.zeros(len(estimate.channels["vy"])),
+            }
+            write_estimate(
+                replace(estimate, channels=channels), tmp_path / test / f"{position}.parquet"
+            )
     zero = EvaluatedModel("zero", "zero", "Zero", 0, tmp_path, tmp_path, {})
     scored = scored_of(part, zero, "tyre_a")
     reference = recording("a", seed=2)
@@ -350,24 +542,47 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not_or_level(
 
     published = {"A": 0.1, "B": 0.2, "C": 0.3, "D": 0.4}
     pairs = differences(
-        {"A": losses(1.0), "B": losses(2.0), "C": losses(1.5), "D": losses(1.5), "X": losses(9.0)}, sequence, published, 100.0
+        {"A": losses(1.0), "B": losses(2.0), "C": losses(1.5), "D": losses(1.5), "X": losses(9.0)},
+        sequence,
+        published,
+        100.0,
     )
     verdicts = {(row["first"], row["second"]): row["verdict"] for row in pairs.to_dict("records")}
     assert verdicts["A", "B"] == verdicts["A", "C"] == AS_IN_THE_PAPER
     assert verdicts["B", "C"] == TURNED
     assert verdicts["C", "D"] == UNDECIDED
-    assert [tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()] == [("A", "B"), ("B", "C"), ("C", "D")]
+    assert [tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()] == [
+        ("A", "B"),
+        ("B", "C"),
+        ("C", "D"),
+    ]
     words = order_in_words(pairs, {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.5}, "on tyre A")
     assert "3 in its order, 2 the other way round, and includes zero for 1" in words
     assert "The other way round: C before B; D before B." in words
     assert "do not tell apart: C and D." in words
     generator = np.random.default_rng(0)
-    table = {name: level * generator.uniform(0.9, 1.1, (3, 600)) for name, level in (("A", 1.0), ("B", 2.0), ("C", 2.0), ("D", 3.0))}
-    pairs = differences(table, np.repeat(np.arange(12), 50), {"A": 0.1, "B": 0.1, "C": 0.1, "D": 0.2}, 100.0)
+    table = {
+        name: level * generator.uniform(0.9, 1.1, (3, 600))
+        for name, level in (("A", 1.0), ("B", 2.0), ("C", 2.0), ("D", 3.0))
+    }
+    pairs = differences(
+        table, np.repeat(np.arange(12), 50), {"A": 0.1, "B": 0.1, "C": 0.1, "D": 0.2}, 100.0
+    )
     verdicts = {(row["first"], row["second"]): row["verdict"] for row in pairs.to_dict("records")}
-    assert (verdicts["A", "B"], verdicts["B", "C"], verdicts["C", "D"]) == (APART, LEVEL, AS_IN_THE_PAPER)
-    assert {tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()} == {("A", "D"), ("B", "D"), ("C", "D")}
-    assert "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C." in order_in_words(pairs, {}, "x")
+    assert (verdicts["A", "B"], verdicts["B", "C"], verdicts["C", "D"]) == (
+        APART,
+        LEVEL,
+        AS_IN_THE_PAPER,
+    )
+    assert {tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()} == {
+        ("A", "D"),
+        ("B", "D"),
+        ("C", "D"),
+    }
+    assert (
+        "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C."
+        in order_in_words(pairs, {}, "x")
+    )
 
 
 def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
@@ -376,22 +591,39 @@ def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
     assert (row.steps, row.epochs) == (500, 1000)
     (row,) = lengths({"length_50": of_length(part, 50)})
     assert (row.sequences, row.batches) == (6, 3), "a drive of 3.2 s"
-    assert "was not trained through the filter" in refusal(lambda: lengths({"length_500": replace(part, models=[model(part, "GRU")])}))
-    training = {"one_step": {**PHASE, "max_epochs": 10}, "through": {**PHASE, "max_epochs": 3}, "steps": 50}
+    assert "was not trained through the filter" in refusal(
+        lambda: lengths({"length_500": replace(part, models=[model(part, "GRU")])})
+    )
+    training = {
+        "one_step": {**PHASE, "max_epochs": 10},
+        "through": {**PHASE, "max_epochs": 3},
+        "steps": 50,
+    }
     own = Subject.of(only(part, "NNTF_UH", training), "NNTF_UH")
     assert samples_seen(own) == 10 * 319 + 3 * 300
-    alone = Subject.of(only(part, "NNTF", {**training, "noise": {**PHASE, "max_epochs": 5}}), "NNTF")
+    alone = Subject.of(
+        only(part, "NNTF", {**training, "noise": {**PHASE, "max_epochs": 5}}), "NNTF"
+    )
     assert samples_seen(alone) == 10 * 319 + 5 * 300
 
 
 def subject_of(squared, title="own", validation=()):
     """A candidate with planted losses, three seeds."""
-    models = [EvaluatedModel("learned_ukf", "nntf_uh", title, seed, Path(), Path()) for seed in (0, 1, 2)]
+    models = [
+        EvaluatedModel("learned_ukf", "nntf_uh", title, seed, Path(), Path()) for seed in (0, 1, 2)
+    ]
     values = zip(models, validation, strict=False)
-    rows = [row for own, value in values for row in metric_rows(own, VALIDATION, {"mse_weighted": value})]
+    rows = [
+        row
+        for own, value in values
+        for row in metric_rows(own, VALIDATION, {"mse_weighted": value})
+    ]
     part = part_of(SPLIT, PROTOCOL, models, rows)
     sequence = np.repeat(np.arange(12), 50)
-    errors = {test: Losses({title: own}, {title: np.sqrt(own)}, sequence, 100.0) for test, own in squared.items()}
+    errors = {
+        test: Losses({title: own}, {title: np.sqrt(own)}, sequence, 100.0)
+        for test, own in squared.items()
+    }
     return Subject(title, part, models, errors, title)
 
 
@@ -400,7 +632,12 @@ def planted(**levels):
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
     seeds = np.array([1.0, 5.0, 9.0])[:, None]
-    return subject_of({test: seeds + level * hard * generator.uniform(0.98, 1.02, 600) for test, level in levels.items()})
+    return subject_of(
+        {
+            test: seeds + level * hard * generator.uniform(0.98, 1.02, 600)
+            for test, level in levels.items()
+        }
+    )
 
 
 @pytest.mark.parametrize(
@@ -425,7 +662,12 @@ def test_added_claims_on_two_tyres_need_both_and_shared_seeds_are_paired(level, 
 
 
 @pytest.mark.parametrize(
-    ("losses", "verdict"), [((0.5, 0.5, 0.5), "not reproduced"), ((2.0, 2.0, 0.5), "reproduced"), ((2.0, 0.5, 0.5), "undecided")]
+    ("losses", "verdict"),
+    [
+        ((0.5, 0.5, 0.5), "not reproduced"),
+        ((2.0, 2.0, 0.5), "reproduced"),
+        ((2.0, 0.5, 0.5), "undecided"),
+    ],
 )
 def test_local_minima_are_counted_on_validation(losses, verdict):
     scratch = subject_of({}, "s", losses)
@@ -440,12 +682,31 @@ def test_local_minima_are_counted_on_validation(losses, verdict):
 def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand_calculation():
     first, second = paper.TABLE_I, paper.TABLE_II
     for name, gain in (("mse", 17), ("mae", 6), ("ae99", 33)):
-        assert round(100 * (1 - getattr(first["NNTF_UH"], name) / getattr(first["GRU"], name))) == gain
+        assert (
+            round(100 * (1 - getattr(first["NNTF_UH"], name) / getattr(first["GRU"], name))) == gain
+        )
     order = sorted(second, key=lambda name: -second[name].mse)
-    assert order == ["PC", "LSTM", "GRU", "NN_U", "NN", "PCR", "NNTF", "NNTF_U", "NNTF_UH", "NNTF_UH*"]
+    assert order == [
+        "PC",
+        "LSTM",
+        "GRU",
+        "NN_U",
+        "NN",
+        "PCR",
+        "NNTF",
+        "NNTF_U",
+        "NNTF_UH",
+        "NNTF_UH*",
+    ]
     outside = np.array([[True, True, False, True, False, False], [False] * 6, [False] * 5 + [True]])
     np.testing.assert_allclose(friction.settled(outside, 10.0), [0.4, 0.0, 0.6])
-    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
-    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
+    states = {
+        "vx_ref": [1.0, 1.0, 0.1],
+        "vy_ref": [1.0, 0.0, 1.0],
+        "yaw_rate_ref": [0.0, 10.0, 0.0],
+    }
+    own = Recording(
+        "r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real"
+    )
     np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
     assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0

@@ -18,14 +18,29 @@ from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents, gates
 from vehest_papers.proving_ground.drawing import Distribution, beyond
-from vehest_papers.proving_ground.handling import HandlingPoints, characteristic, single_track_gradient
+from vehest_papers.proving_ground.handling import (
+    HandlingPoints,
+    characteristic,
+    single_track_gradient,
+)
 from vehest_papers.proving_ground.noise import spectra
 from vehest_papers.proving_ground.papers import PROFILES, page_of
 from vehest_papers.proving_ground.tally import FINE, Grid, Tally
 from vehest_papers.proving_ground.vehicles import CHANNELS, busiest_stretch, set_of, survey
 
-FERRARI = yaml.safe_load((Path(__file__).parents[2] / "conf" / "vehicle" / "ferrari_250_lm.yaml").read_text(encoding="utf-8"))
-CALM = {"spun": False, "left_road": False, "stood": False, "completed": True, "gave_up_at": None, "largest_sideslip": 0.05}
+FERRARI = yaml.safe_load(
+    (Path(__file__).parents[2] / "conf" / "vehicle" / "ferrari_250_lm.yaml").read_text(
+        encoding="utf-8"
+    )
+)
+CALM = {
+    "spun": False,
+    "left_road": False,
+    "stood": False,
+    "completed": True,
+    "gave_up_at": None,
+    "largest_sideslip": 0.05,
+}
 REAL = AbsentDataset("ferrari_250lm", "The real car", "somebody's licence", "somebody's paper")
 
 
@@ -54,7 +69,9 @@ def _stored(folder, name, kind, recordings):
     for recording in recordings:
         files[recording.id] = folder / f"{name}-{recording.id}.parquet"
         write_recording(recording, files[recording.id])
-    return StoredDataset(name, f"Title of {name}", kind, {"seed": 7} if kind == "simulated" else {}, files)
+    return StoredDataset(
+        name, f"Title of {name}", kind, {"seed": 7} if kind == "simulated" else {}, files
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +85,17 @@ def study(tmp_path_factory):
         _simulated(_drive("f2_001", 3, 60.0, 100.0), left_road=True),
     ]
     real = replace(_drive("day", 4, 80.0, 100.0), kind="real", vehicle="the real one")
-    datasets = [_stored(folder, "sim_two_cars", "simulated", simulated), _stored(folder, "ferrari_250lm", "real", [real])]
-    return StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run pipelines/x.yaml", datasets=datasets)
+    datasets = [
+        _stored(folder, "sim_two_cars", "simulated", simulated),
+        _stored(folder, "ferrari_250lm", "real", [real]),
+    ]
+    return StudyArtefacts(
+        "proving_ground",
+        "Proving ground",
+        "About it.",
+        "vehest run pipelines/x.yaml",
+        datasets=datasets,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +111,28 @@ def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     together = {name: np.concatenate([drive[name] for drive in drives]) for name in CHANNELS}
     values = {name: value for name, (value, _) in tally.values().items()}
     half_bin = FINE["ay"].width / 2 + 1e-9
-    tight = {"rtol": 0, "atol": 2 * half_bin}  # half a bin, and as much again for another rule of interpolating between two samples
+    tight = {
+        "rtol": 0,
+        "atol": 2 * half_bin,
+    }  # half a bin, and as much again for another rule of interpolating between two samples
     assert values["drives"] == 5
     assert values["duration"] == pytest.approx(sum(drive.duration for drive in drives))
-    assert values["distance"] == pytest.approx(np.hypot(together["vx"], together["vy_ref"]).sum() / 20.0)
-    assert (values["yaw_rate_min"], values["yaw_rate_max"]) == (together["yaw_rate"].min(), together["yaw_rate"].max())
-    np.testing.assert_allclose(values["ay_abs_q99"], np.quantile(np.abs(together["ay"]), 0.99), **tight)
+    assert values["distance"] == pytest.approx(
+        np.hypot(together["vx"], together["vy_ref"]).sum() / 20.0
+    )
+    assert (values["yaw_rate_min"], values["yaw_rate_max"]) == (
+        together["yaw_rate"].min(),
+        together["yaw_rate"].max(),
+    )
+    np.testing.assert_allclose(
+        values["ay_abs_q99"], np.quantile(np.abs(together["ay"]), 0.99), **tight
+    )
     np.testing.assert_allclose(values["vy_q01"], np.quantile(together["vy_ref"], 0.01), **tight)
-    np.testing.assert_allclose(values["sideslip_abs_q50"], np.degrees(np.quantile(np.abs(together["sideslip_ref"]), 0.5)), **tight)
+    np.testing.assert_allclose(
+        values["sideslip_abs_q50"],
+        np.degrees(np.quantile(np.abs(together["sideslip_ref"]), 0.5)),
+        **tight,
+    )
 
 
 def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_papers_bins():
@@ -113,11 +153,18 @@ def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_pap
     assert 0.0 in edges
     assert np.array_equal(counts, expected)
     assert counts.sum() == len(drive)
-    assert np.array_equal(Grid(2.0, 1.0).count(np.array([-9.0, -1.0, 0.0, 0.5, 9.0])), [1, 1, 2, 1]), "beyond the limit: outermost bins"
+    assert np.array_equal(
+        Grid(2.0, 1.0).count(np.array([-9.0, -1.0, 0.0, 0.5, 9.0])), [1, 1, 2, 1]
+    ), "beyond the limit: outermost bins"
     with pytest.raises(ValueError, match="do not fit"):
         tally.histogram("ay", 0.03)
     drive = _drive(seconds=10.0)
-    stopped = {**drive.channels, "vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive)), "sideslip_ref": np.full(len(drive), 3.0)}
+    stopped = {
+        **drive.channels,
+        "vx": np.zeros(len(drive)),
+        "vy_ref": np.zeros(len(drive)),
+        "sideslip_ref": np.full(len(drive), 3.0),
+    }
     tally = Tally()
     tally.add(drive)
     tally.add(replace(drive, channels=stopped))
@@ -131,12 +178,20 @@ def test_medians_find_the_steering_that_was_added_and_the_spectrum_of_white_nois
     ay, angle = points.medians()
     turning = np.abs(ay) > 1.0
     assert turning.sum() >= 4
-    np.testing.assert_allclose(angle[turning], 1.03 * np.sign(ay[turning]), atol=0.06)  # half a bin of 0.1°, and its edge
+    np.testing.assert_allclose(
+        angle[turning], 1.03 * np.sign(ay[turning]), atol=0.06
+    )  # half a bin of 0.1°, and its edge
     noise = np.random.default_rng(0).standard_normal(60_000)
-    drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
+    drive = replace(
+        _drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise)
+    )
     own = spectra({"simulated": drive})["ay [m/s²/√Hz]"][0]
-    np.testing.assert_allclose(np.median(own.density), 0.3 * np.sqrt(2 / 100.0), rtol=0.03)  # 100 bands of 59 windows each
-    np.testing.assert_allclose(own.density, 0.3 * np.sqrt(2 / 100.0), rtol=0.4)  # one band of 59 windows
+    np.testing.assert_allclose(
+        np.median(own.density), 0.3 * np.sqrt(2 / 100.0), rtol=0.03
+    )  # 100 bands of 59 windows each
+    np.testing.assert_allclose(
+        own.density, 0.3 * np.sqrt(2 / 100.0), rtol=0.4
+    )  # one band of 59 windows
     assert own.frequency[-1] > 40.0
 
 
@@ -145,11 +200,15 @@ def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
     own = characteristic(vehicle, 1.0, "dry")
     # m (b/Cf - a/Cr)/L with the axle stiffnesses that the published study of the same car gives
     expected = np.degrees(982.0 / 2.4 * (1.07 / 0.7e5 - 1.33 / 1.2e5))
-    assert single_track_gradient(vehicle) == pytest.approx(expected, rel=0.01)  # p_ky1 is rounded to three digits
+    assert single_track_gradient(vehicle) == pytest.approx(
+        expected, rel=0.01
+    )  # p_ky1 is rounded to three digits
     for low, high in ((0.5, 2.5), (-2.5, -0.5)):
         inside = (own.ay > low) & (own.ay < high)
         slope = np.polyfit(own.ay[inside], own.angle[inside], 1)[0]
-        assert slope == pytest.approx(own.gradient, rel=0.15)  # roll and load transfer are in the plant, not in the single track
+        assert slope == pytest.approx(
+            own.gradient, rel=0.15
+        )  # roll and load transfer are in the plant, not in the single track
     assert own.ay.max() == pytest.approx(11.3, abs=0.5)
     assert own.angle[-1] > 3 * own.gradient * own.ay[-1], "understeer rises towards the limit"
     wet = characteristic(vehicle, 0.7, "wet")
@@ -167,12 +226,20 @@ def test_pages_sets_and_stretches_are_those_of_the_names_and_the_busiest_drive()
     assert set_of("train_j_turn_off_012") == "train_j_turn_off"
     assert set_of("nominal_fast") == "nominal_fast"
     edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
-    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
+    distributions = [
+        Distribution("simulated", edges, np.array([1, 50, 45, 4])),
+        Distribution("real", edges, np.array([0, 60, 40, 0])),
+    ]
     assert beyond(distributions, 20.0) == pytest.approx(2.5)
 
 
 def test_table_i_is_what_the_paper_prints():
-    rows = [own.values for profile in PROFILES.values() for own in profile.sets if "ay_abs_q99" in own.values]
+    rows = [
+        own.values
+        for profile in PROFILES.values()
+        for own in profile.sets
+        if "ay_abs_q99" in own.values
+    ]
     assert [row["ay_abs_q99"] for row in rows] == [11.33, 11.60, 10.55, 10.78]
     assert sum(row["duration"] for row in rows) / 60.0 == pytest.approx(19.0 + 12.6 + 25.7 + 18.1)
     assert sum(row["distance"] for row in rows) / 1000.0 == pytest.approx(35.4 + 24.1 + 45.8 + 33.6)
@@ -185,16 +252,26 @@ def test_accidents_are_kept_flagged_and_counted(study, made):
     assert page.merged("simulated").drives == 3
     assert page.merged("simulated").flags == {"spun": 1, "left_road": 1, "stood": 1}
     assert [drive.recording for drive in page.flagged] == ["f1_002", "f2_001"]
-    assert {name: stretch.recording for name, stretch in page.stretches.items()} == {"laps": "f1_001"}, (
-        "traces show a drive that went as planned"
-    )
+    assert {name: stretch.recording for name, stretch in page.stretches.items()} == {
+        "laps": "f1_001"
+    }, "traces show a drive that went as planned"
     index = "\n".join(block for block in made["report"].blocks if isinstance(block, str))
     assert "Of 3 simulated drives 2 went wrong by accident: 1 spun, 1 left the road" in index
     statistics = made["report"].data["statistics"]
-    assert list(statistics.columns) == ["dataset", "kind", "vehicle", "set", "quantity", "value", "unit"]
+    assert list(statistics.columns) == [
+        "dataset",
+        "kind",
+        "vehicle",
+        "set",
+        "quantity",
+        "value",
+        "unit",
+    ]
     spun = statistics[(statistics["quantity"] == "spun") & (statistics["set"] == "f1")]
     assert spun["value"].tolist() == [1]
-    assert not ((statistics["kind"] == "real") & (statistics["quantity"] == "spun")).any(), "nobody knows that of a real drive"
+    assert not ((statistics["kind"] == "real") & (statistics["quantity"] == "spun")).any(), (
+        "nobody knows that of a real drive"
+    )
 
 
 def test_pages_say_what_is_simulated_and_what_is_real(made):
@@ -204,7 +281,9 @@ def test_pages_say_what_is_simulated_and_what_is_real(made):
     index = "\n".join(str(block) for block in made["report"].blocks)
     assert "seed 7" in index
     assert "vehest run pipelines/x.yaml" in index
-    tables = {block.name: block for block in made["ferrari_250_lm"].blocks if hasattr(block, "frame")}
+    tables = {
+        block.name: block for block in made["ferrari_250_lm"].blocks if hasattr(block, "frame")
+    }
     assert set(tables["ferrari_250_lm_beside_paper"].frame["set"]) == {"F-1", "F-2"}
     assert {"real", "simulated"} <= set(tables["ferrari_250_lm_beside_real"].frame.columns)
     for block in made["ferrari_250_lm"].blocks:
@@ -218,7 +297,9 @@ def test_without_the_real_recording_the_page_says_how_to_get_it(study):
     assert "absent from this report" in text
     assert "somebody's licence" in text
     assert "vehest data check ferrari_250lm" in text
-    assert not any(getattr(block, "name", "").endswith("_spectra") for block in made["ferrari_250_lm"].blocks)
+    assert not any(
+        getattr(block, "name", "").endswith("_spectra") for block in made["ferrari_250_lm"].blocks
+    )
 
 
 @pytest.fixture
@@ -228,7 +309,12 @@ def survey_place(place, monkeypatch):
     place.change("conf/dataset/mine.yaml", path=str(place.folder / "raw"))
     other = {"name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
     place.change("conf/dataset/other.yaml", **DATASET | other)
-    pipeline = {"report": "proving_ground", "datasets": ["mine"], "optional_datasets": ["other"], "publish": True}
+    pipeline = {
+        "report": "proving_ground",
+        "datasets": ["mine"],
+        "optional_datasets": ["other"],
+        "publish": True,
+    }
     place.change("pipelines/ground.yaml", study="ground", **pipeline)
     return place
 
@@ -239,13 +325,17 @@ def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
     assert code == 0, err
     assert "the study goes on without it" in err
     assert "my_car" in out
-    assert {"report.md", "my_car.md", "provenance.json", "figures", "tables"} == {file.name for file in results.iterdir()}
+    assert {"report.md", "my_car.md", "provenance.json", "figures", "tables"} == {
+        file.name for file in results.iterdir()
+    }
     assert json.loads((results / "provenance.json").read_text())["absent"] == ["other"]
     for page in results.glob("*.md"):
         for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
             assert (results / target).is_file(), f"{page.name} links to {target}"
         assert str(place.folder) not in page.read_text(encoding="utf-8")
-    html = next((place.folder / "outputs" / "report").glob("ground-*/report.html")).read_text(encoding="utf-8")
+    html = next((place.folder / "outputs" / "report").glob("ground-*/report.html")).read_text(
+        encoding="utf-8"
+    )
     assert 'href="my_car.html"' in html
     assert 'href="my_car.md"' not in html
 
@@ -257,9 +347,16 @@ def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
 
     here = ("root=raw", "--jobs", "1")  # the real recording is there now
     _, out, err = place("run", "ground", *here, "--json")
-    assert [line.split()[1] for line in err.splitlines() if line.startswith("done")] == ["ingest", "report", "publish"]
+    assert [line.split()[1] for line in err.splitlines() if line.startswith("done")] == [
+        "ingest",
+        "report",
+        "publish",
+    ]
     assert [row["kind"] for row in json.loads(out)["overview"]] == ["simulated", "real"]
-    assert json.loads((results / "provenance.json").read_text())["kinds"] == {"mine": "simulated", "other": "real"}
+    assert json.loads((results / "provenance.json").read_text())["kinds"] == {
+        "mine": "simulated",
+        "other": "real",
+    }
     _, out, err = place("run", "ground", "--json")
     assert "not published: 'results/ground' shows data set 'other'" in err.replace("\n", "")
     assert json.loads(out)["published"] is None
@@ -289,19 +386,35 @@ def test_a_static_map_explains_all_of_a_car_that_is_one():
     mapped = replace(own, channels={**own.channels, "vy_ref": exact})
     assert gates.left_by(gates.static_map_of([mapped]), [mapped]) < 1e-20
     noisy = replace(
-        own, channels={**own.channels, "vy_ref": exact + 0.3 * np.std(exact) * np.random.default_rng(0).standard_normal(len(exact))}
+        own,
+        channels={
+            **own.channels,
+            "vy_ref": exact
+            + 0.3 * np.std(exact) * np.random.default_rng(0).standard_normal(len(exact)),
+        },
     )
-    assert gates.left_by(gates.static_map_of([noisy]), [noisy]) == pytest.approx(0.09 / 1.09, rel=0.1)
+    assert gates.left_by(gates.static_map_of([noisy]), [noisy]) == pytest.approx(
+        0.09 / 1.09, rel=0.1
+    )
 
 
 def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path):
     drives = {gates.AFTER: {"c1": [_set("c1", 1)], "f1": [_set("f1", 2)]}}
     found = gates.gates(drives, [])
-    assert {gate.of for gate in found} == {"C-1", "C-2", "F-1", "F-2", "Corvette", "Ferrari"} | {"Jaguar"}
+    assert {gate.of for gate in found} == {"C-1", "C-2", "F-1", "F-2", "Corvette", "Ferrari"} | {
+        "Jaguar"
+    }
     lengths = [gate for gate in found if gate.of == "C-1" and gate.quantity == "duration [min]"]
     assert [gate.met(gates.AFTER) for gate in lengths] == [False]  # a minute instead of nineteen
     assert not any(gate.met(gates.AFTER) for gate in found if gate.of == "C-2")  # no such drives
-    stored = [_stored(tmp_path, gates.AFTER, "simulated", [own for part in drives[gates.AFTER].values() for own in part])]
+    stored = [
+        _stored(
+            tmp_path,
+            gates.AFTER,
+            "simulated",
+            [own for part in drives[gates.AFTER].values() for own in part],
+        )
+    ]
     said = [block for block in gates.blocks(stored) if isinstance(block, str)]
     assert any("C-1: duration [min] (1)" in text for text in said)
     assert any("needs the real recording" in text for text in said)
@@ -311,10 +424,26 @@ def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels():
     own = _set("f1", 3, 120.0)
     rate = np.gradient(own["vy_ref"]) * own.rate_hz
     twice = replace(
-        own, channels={**own.channels, "ay": own["vx"] * own["yaw_rate"] + rate - 2.0 * (rate - own["ay"] + own["vx"] * own["yaw_rate"])}
+        own,
+        channels={
+            **own.channels,
+            "ay": own["vx"] * own["yaw_rate"]
+            + rate
+            - 2.0 * (rate - own["ay"] + own["vx"] * own["yaw_rate"]),
+        },
     )
-    found = [gate for gate in gates.gates({gates.AFTER: {"f1": [own]}}, [own]) if "process noise" in gate.quantity]
+    found = [
+        gate
+        for gate in gates.gates({gates.AFTER: {"f1": [own]}}, [own])
+        if "process noise" in gate.quantity
+    ]
     assert len(found) == len(gates.BANDS_HZ)
     assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in found)
-    doubled = [gate for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own]) if "process noise" in gate.quantity]
-    np.testing.assert_allclose([gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1)
+    doubled = [
+        gate
+        for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own])
+        if "process noise" in gate.quantity
+    ]
+    np.testing.assert_allclose(
+        [gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1
+    )

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vehest_papers.trust.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, false_alarms_per_hour, integrity_of
+from vehest_papers.trust.integrity import (
+    HAZARDOUS,
+    MISLEADING,
+    NOMINAL,
+    UNAVAILABLE,
+    false_alarms_per_hour,
+    integrity_of,
+)
 from vehest_papers.trust.shuffled import Scores, share_if_shuffled, together
 
 
@@ -29,7 +36,9 @@ def test_each_sample_lies_in_its_region(error, level, flagged, region):
 
 
 def test_alarms_in_a_row_are_one_and_samples_without_a_band_none():
-    found = integrity_of(np.array([0.1, np.nan, 0.1]), np.array([1.0, 1.0, np.nan]), np.zeros(3, bool))
+    found = integrity_of(
+        np.array([0.1, np.nan, 0.1]), np.array([1.0, 1.0, np.nan]), np.zeros(3, bool)
+    )
     assert len(found.error) == 1
     found = false_alarms_per_hour([alarmed(10, 20, 500, 501), alarmed(0, 5)], 10.0)
     assert (found.alarms, found.hours) == (3, 2.0)
@@ -54,8 +63,18 @@ def scores(manoeuvres, alike, seed, samples=40):
 
 
 def test_few_manoeuvres_that_say_all_hold_less_often_than_many_that_say_nothing():
-    many = np.mean([share_if_shuffled(scores(150, 0.0, seed), scores(30, 0.0, 100 + seed), 60, seed) for seed in range(5)])
-    few = np.mean([share_if_shuffled(scores(9, 0.6, seed), scores(8, 0.6, 100 + seed), 60, seed) for seed in range(5)])
+    many = np.mean(
+        [
+            share_if_shuffled(scores(150, 0.0, seed), scores(30, 0.0, 100 + seed), 60, seed)
+            for seed in range(5)
+        ]
+    )
+    few = np.mean(
+        [
+            share_if_shuffled(scores(9, 0.6, seed), scores(8, 0.6, 100 + seed), 60, seed)
+            for seed in range(5)
+        ]
+    )
     assert many > 0.9
     assert few < many - 0.05
 
@@ -64,7 +83,9 @@ def test_draws_are_the_same_again_and_several_tests_together_have_a_narrower_int
     calibration, test = scores(8, 0.4, 1), scores(8, 0.4, 2)
     louder = Scores(3.0 * test.values, test.manoeuvres)
     assert share_if_shuffled(calibration, test, 50) == share_if_shuffled(calibration, test, 50)
-    assert share_if_shuffled(calibration, louder, 200) == pytest.approx(share_if_shuffled(louder, calibration, 200), abs=0.12)
+    assert share_if_shuffled(calibration, louder, 200) == pytest.approx(
+        share_if_shuffled(louder, calibration, 200), abs=0.12
+    )
     assert np.isnan(share_if_shuffled(scores(8, 0.4, 1), scores(2, 0.4, 2)))
     tests = [scores(10, 0.3, seed) for seed in range(5)]
     share = together(tests)[0]

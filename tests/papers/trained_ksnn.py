@@ -16,7 +16,10 @@ def ksnn_with_weights(n_local=3, n_hidden=0, bias=False, seed=0, window=30, yaw_
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             centre, spread = centre_and_spread.get(name, (0.0, 0.05))
-            parameter.copy_(centre + spread * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+            parameter.copy_(
+                centre
+                + spread * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            )
     estimator = Ksnn(settings)
     estimator.network = network
     return estimator

@@ -23,7 +23,15 @@ from vehest.run.config import compose_config, expand, key_of
 
 ROOT = Path(__file__).resolve().parents[2]
 ABSENT = {"ksnn_revs"}  # needs the official files of the Revs database
-BUDGETS = {"max_epochs": 2, "max_evaluations": 6, "grid": 1, "trials": 4, "scaling_trials": 3, "generations": 5, "restarts": 1}
+BUDGETS = {
+    "max_epochs": 2,
+    "max_evaluations": 6,
+    "grid": 1,
+    "trials": 4,
+    "scaling_trials": 3,
+    "generations": 5,
+    "restarts": 1,
+}
 MOST_DRIVES, MOST_SECONDS = 3, 100  # of each kind in a simulated data set; of a drive
 DIGITS, SHOWN = 6, 5
 _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
@@ -31,8 +39,17 @@ _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
 
 def reduced(pipeline):
     """A pipeline with all parts and candidates, but one seed and at most the `BUDGETS` for each training."""
-    parts = {name: {**part, "sweeps": _reduced_sweeps(part["sweeps"])} for name, part in pipeline.get("parts", {}).items()}
-    changed = {"parts": parts} if parts else {"sweeps": _reduced_sweeps(pipeline["sweeps"])} if "sweeps" in pipeline else {}
+    parts = {
+        name: {**part, "sweeps": _reduced_sweeps(part["sweeps"])}
+        for name, part in pipeline.get("parts", {}).items()
+    }
+    changed = (
+        {"parts": parts}
+        if parts
+        else {"sweeps": _reduced_sweeps(pipeline["sweeps"])}
+        if "sweeps" in pipeline
+        else {}
+    )
     return {**pipeline, **changed, "publish": False}
 
 
@@ -42,7 +59,11 @@ def _reduced_sweeps(sweeps):
     for sweep in sweeps:
         seeds = [override for override in sweep if key_of(override) == "seed"]
         for candidate in expand([override for override in sweep if override not in seeds]):
-            chosen = tuple(override for override in candidate if key_of(override).startswith(("estimator", "training")))
+            chosen = tuple(
+                override
+                for override in candidate
+                if key_of(override).startswith(("estimator", "training"))
+            )
             candidates.append([*candidate, *_budgets_of(chosen), *expand(seeds)[0]])
     return candidates
 
@@ -51,8 +72,15 @@ def _reduced_sweeps(sweeps):
 def _budgets_of(overrides):
     """Overrides for what is above its budget in a training's configuration, or in a phase of it."""
     training = compose_config("train", overrides)["training"]
-    phases = {"training": training} | {f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)}
-    return [f"{phase}.{name}={most}" for phase, values in phases.items() for name, most in BUDGETS.items() if values.get(name, most) > most]
+    phases = {"training": training} | {
+        f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)
+    }
+    return [
+        f"{phase}.{name}={most}"
+        for phase, values in phases.items()
+        for name, most in BUDGETS.items()
+        if values.get(name, most) > most
+    ]
 
 
 def write_data_sets(folder):
@@ -66,19 +94,35 @@ def write_data_sets(folder):
             if isinstance(drive["manoeuvre"].get("duration"), int):
                 drive["manoeuvre"]["duration"] = min(drive["manoeuvre"]["duration"], MOST_SECONDS)
         if "drives" in dataset:
-            (folder / file.name).write_text(yaml.safe_dump(dataset, allow_unicode=True), encoding="utf-8")
+            (folder / file.name).write_text(
+                yaml.safe_dump(dataset, allow_unicode=True), encoding="utf-8"
+            )
 
 
 def run(study, out, output, jobs):
     """Run the pilot of a study and keep its tables; returns whether all of it succeeded."""
     begun, computed = time.monotonic(), sum(os.times()[2:4])  # the latter of processes that ended
     pipeline = yaml.safe_load((ROOT / "pipelines" / f"{study}.yaml").read_text(encoding="utf-8"))
-    (output / f"{study}.yaml").write_text(yaml.safe_dump(reduced(pipeline), allow_unicode=True, sort_keys=False), encoding="utf-8")
-    words = ["vehest", "run", f"{study}.yaml", f"output={output}", "tracking=none", f"--jobs={jobs}", "--json"]
-    ran = subprocess.run([sys.executable, "-m", *words], cwd=output, stdout=subprocess.PIPE, text=True, check=False)
+    (output / f"{study}.yaml").write_text(
+        yaml.safe_dump(reduced(pipeline), allow_unicode=True, sort_keys=False), encoding="utf-8"
+    )
+    words = [
+        "vehest",
+        "run",
+        f"{study}.yaml",
+        f"output={output}",
+        "tracking=none",
+        f"--jobs={jobs}",
+        "--json",
+    ]
+    ran = subprocess.run(
+        [sys.executable, "-m", *words], cwd=output, stdout=subprocess.PIPE, text=True, check=False
+    )
     if ran.stdout:
         collect(Path(json.loads(ran.stdout)["report"]).parent, out / study)
-    seconds = f"{time.monotonic() - begun:.0f} s, {sum(os.times()[2:4]) - computed:.0f} s of processors"
+    seconds = (
+        f"{time.monotonic() - begun:.0f} s, {sum(os.times()[2:4]) - computed:.0f} s of processors"
+    )
     print(f"{study}: exit code {ran.returncode}, {seconds}", flush=True)
     return ran.returncode == 0
 
@@ -101,7 +145,13 @@ def _rounded(cell):
 
 def differences(first, second):
     """Files that two folders do not share, tables of another shape, and cells with other values."""
-    for name in sorted({file.relative_to(side).as_posix() for side in (first, second) for file in side.rglob("*.csv")}):
+    for name in sorted(
+        {
+            file.relative_to(side).as_posix()
+            for side in (first, second)
+            for file in side.rglob("*.csv")
+        }
+    ):
         absent = [side for side in (first, second) if not (side / name).is_file()]
         if absent:
             yield f"{name}: not in {absent[0]}"
@@ -117,30 +167,50 @@ def differences(first, second):
 def compare(first, second):
     """Print of every study whether its tables are equal, else the first differences and their number; returns how many studies differ."""
     differing = 0
-    for study in sorted({folder.name for side in (first, second) for folder in side.iterdir() if folder.is_dir()}):
+    for study in sorted(
+        {folder.name for side in (first, second) for folder in side.iterdir() if folder.is_dir()}
+    ):
         alone = [side for side in (first, second) if not (side / study).is_dir()]
-        found = [f"not in {alone[0]}"] if alone else list(differences(first / study, second / study))
-        print(f"{study}: {f'{len(found)} differences' if found else 'equal'}", *found[:SHOWN], sep="\n  ")
+        found = (
+            [f"not in {alone[0]}"] if alone else list(differences(first / study, second / study))
+        )
+        print(
+            f"{study}: {f'{len(found)} differences' if found else 'equal'}",
+            *found[:SHOWN],
+            sep="\n  ",
+        )
         differing += bool(found)
     return differing
 
 
 def main():
     """Run or compare; the exit code is 1 where a pilot failed, or folders differ."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("studies", nargs="*", help="names of pipelines; all by default")
-    parser.add_argument("--out", type=Path, default=Path("build/pilots"), help="folder for the tables")
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/pilots"), help="folder for the tables"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side")
-    parser.add_argument("--compare", nargs=2, type=Path, metavar="OUT", help="compare two folders of tables instead")
+    parser.add_argument(
+        "--compare", nargs=2, type=Path, metavar="OUT", help="compare two folders of tables instead"
+    )
     given = parser.parse_args()
     if given.compare:
         absent = [str(folder) for folder in given.compare if not folder.is_dir()]
-        sys.exit(f"there is no folder {' or '.join(absent)}" if absent else compare(*given.compare) > 0)
+        sys.exit(
+            f"there is no folder {' or '.join(absent)}" if absent else compare(*given.compare) > 0
+        )
     known = {file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - ABSENT
     if set(given.studies) - known:
-        sys.exit(f"no pilot of {', '.join(sorted(set(given.studies) - known))}; there are: {', '.join(sorted(known))}")
+        sys.exit(
+            f"no pilot of {', '.join(sorted(set(given.studies) - known))}; there are: {', '.join(sorted(known))}"
+        )
     studies = given.studies or sorted(known)
-    with tempfile.TemporaryDirectory(prefix="pilots-") as output:  # a new one: keys say nothing of code whose versions stayed
+    with tempfile.TemporaryDirectory(
+        prefix="pilots-"
+    ) as output:  # a new one: keys say nothing of code whose versions stayed
         write_data_sets(Path(output) / "conf" / "dataset")
         succeeded = [run(study, given.out.resolve(), Path(output), given.jobs) for study in studies]
     sys.exit(not all(succeeded))

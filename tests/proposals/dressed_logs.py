@@ -20,7 +20,16 @@ UNIX = 1_393_000_000.0
 @cache
 def ferrari(data, step=1):
     """150 to 450 s of the drive in SI units and ISO 8855 axes, every ``step``-th sample, (T,) each."""
-    names = {"t": "t", "vx": "vx", "vy": "vy", "r": "yawRate", "ax": "axCG", "ay": "ayCG", "delta": "delta", "beta": "beta_true"}
+    names = {
+        "t": "t",
+        "vx": "vx",
+        "vy": "vy",
+        "r": "yawRate",
+        "ax": "axCG",
+        "ay": "ayCG",
+        "delta": "delta",
+        "beta": "beta_true",
+    }
     read = {name: np.loadtxt(data / DRIVE / f"{file}.txt") for name, file in names.items()}
     rows = np.flatnonzero((read["t"] >= 150.0) & (read["t"] < 450.0))[::step]
     drive = {name: samples[rows] for name, samples in read.items()}
@@ -32,10 +41,22 @@ def f1tenth(data, run, rate_hz=100.0):
     """One run in SI units and ISO 8855 axes, by straight lines where another rate is wanted, (T,) each."""
     table = pd.read_csv(data / RUNS)
     table = table[table["run_id"] == run]
-    names = {"vx": "v_x", "vy": "v_y", "r_ref": "r", "v": "omega_wheels", "ax": "ax_imu", "ay": "ay_imu", "r": "r_imu", "delta": "delta"}
+    names = {
+        "vx": "v_x",
+        "vy": "v_y",
+        "r_ref": "r",
+        "v": "omega_wheels",
+        "ax": "ax_imu",
+        "ay": "ay_imu",
+        "r": "r_imu",
+        "delta": "delta",
+    }
     own = np.arange(len(table)) / 100.0
     t = np.arange(int(own[-1] * rate_hz) + 1) / rate_hz
-    return {"t": t} | {name: np.interp(t, own, table[column].to_numpy()) for name, column in {**names, "Iq": "Iq"}.items()}
+    return {"t": t} | {
+        name: np.interp(t, own, table[column].to_numpy())
+        for name, column in {**names, "Iq": "Iq"}.items()
+    }
 
 
 def later(t, samples, delay):
@@ -48,13 +69,28 @@ def nuisances(t, seed):
     random, n = np.random.default_rng(seed), len(t)
     temperature = 80.0 + 10.0 * (1.0 - np.exp(-t / 60.0)) + 0.05 * random.standard_normal(n)
     gear = np.repeat(random.integers(2, 5, n // 200 + 1), 200)[:n].astype(float)
-    return {"temperature": temperature, "gear": gear, "voltage": 13.8 + 0.02 * random.standard_normal(n), "level": np.full(n, 42.0)}
+    return {
+        "temperature": temperature,
+        "gear": gear,
+        "voltage": 13.8 + 0.02 * random.standard_normal(n),
+        "level": np.full(n, 42.0),
+    }
 
 
 def table(d, columns, **more):
     """Columns, ``NAME=QUANTITY`` between commas: what ``d`` and ``more`` hold, or the same in units of loggers; - turns it round."""
-    known = d | {"ms": 1000.0 * d["t"], "km/h": 3.6 * d["vx"], "deg/s": np.degrees(d["r"]), "ay_g": d["ay"] / G, "ax_g": d["ax"] / G}
-    known |= {"road_deg": np.degrees(d["delta"]), "wheel_deg": np.degrees(RATIO * d["delta"]), **more}
+    known = d | {
+        "ms": 1000.0 * d["t"],
+        "km/h": 3.6 * d["vx"],
+        "deg/s": np.degrees(d["r"]),
+        "ay_g": d["ay"] / G,
+        "ax_g": d["ax"] / G,
+    }
+    known |= {
+        "road_deg": np.degrees(d["delta"]),
+        "wheel_deg": np.degrees(RATIO * d["delta"]),
+        **more,
+    }
     known |= {"beta_deg": np.degrees(d["beta"])} if "beta" in d else {}
     named = [column.rsplit("=", 1) for column in columns.split(", ")]
     return {name: -known[own[1:]] if own[0] == "-" else known[own] for name, own in named}
@@ -62,24 +98,22 @@ def table(d, columns, **more):
 
 def write(file, columns, digits=4, **options):
     """A table of text."""
-    pd.DataFrame({name: np.round(samples, digits) for name, samples in columns.items()}).to_csv(file, index=False, **options)
+    pd.DataFrame({name: np.round(samples, digits) for name, samples in columns.items()}).to_csv(
+        file, index=False, **options
+    )
 
 
 def units(data, folder):
     """km/h, deg/s and g, hardly any of it in the header."""
     d = ferrari(data)
-    columns = (
-        "Time [s]=t, Speed [km/h]=km/h, OilTemp=temperature, Gyro=deg/s, LatAcc=ay_g, LongAcc=ax_g, SWA [deg]=wheel_deg, Gear=gear, VLat=vy"
-    )
+    columns = "Time [s]=t, Speed [km/h]=km/h, OilTemp=temperature, Gyro=deg/s, LatAcc=ay_g, LongAcc=ax_g, SWA [deg]=wheel_deg, Gear=gear, VLat=vy"
     write(folder / "units.csv", table(d, columns, **nuisances(d["t"], 1)))
 
 
 def german(data, folder):
     """Decimal commas, semicolons, Latin-1, German names, milliseconds, lateral acceleration to the right."""
     d = ferrari(data)
-    columns = (
-        "Zeit [ms]=ms, v_Fzg [km/h]=km/h, Drehzahl [1/min]=engine, Gierrate [°/s]=deg/s, Querbeschl. [m/s²]=-ay, Längsbeschl. [m/s²]=ax, "
-    )
+    columns = "Zeit [ms]=ms, v_Fzg [km/h]=km/h, Drehzahl [1/min]=engine, Gierrate [°/s]=deg/s, Querbeschl. [m/s²]=-ay, Längsbeschl. [m/s²]=ax, "
     columns += "Lenkradwinkel [°]=wheel_deg, Schwimmwinkel [°]=beta_deg"
     drawn = table(d, columns, engine=900.0 + 90.0 * d["vx"])
     write(folder / "german.csv", drawn, sep=";", decimal=",", encoding="latin-1")
@@ -88,7 +122,9 @@ def german(data, folder):
 def numbered(data, folder):
     """Columns without names or units, tabulators between them, 50 Hz."""
     d = ferrari(data, 2)
-    columns = "Ch1=t, Ch2=ax, Ch3=km/h, Ch4=level, Ch5=deg/s, Ch6=ay, Ch7=delta, Ch8=vy, Ch9=temperature"
+    columns = (
+        "Ch1=t, Ch2=ax, Ch3=km/h, Ch4=level, Ch5=deg/s, Ch6=ay, Ch7=delta, Ch8=vy, Ch9=temperature"
+    )
     write(folder / "numbered.txt", table(d, columns, **nuisances(d["t"], 3)), 5, sep="\t")
 
 
@@ -118,8 +154,13 @@ def wheels(data, folder):
 def sideslip(data, folder):
     """A sideslip angle alone for a reference, no longitudinal acceleration, unix time, 50 Hz, a gyro that is 100 ms late."""
     d = ferrari(data, 2)
-    columns = "Timestamp=unix, Speed=km/h, GyroZ=late, AccY=-ay, SteerWheel=wheel_deg, SlipAngle=beta_deg"
-    write(folder / "sideslip.csv", table(d, columns, unix=UNIX + d["t"], late=np.degrees(later(d["t"], d["r"], 0.1))))
+    columns = (
+        "Timestamp=unix, Speed=km/h, GyroZ=late, AccY=-ay, SteerWheel=wheel_deg, SlipAngle=beta_deg"
+    )
+    write(
+        folder / "sideslip.csv",
+        table(d, columns, unix=UNIX + d["t"], late=np.degrees(later(d["t"], d["r"], 0.1))),
+    )
 
 
 def mdf(data, folder):
@@ -132,10 +173,19 @@ def mdf(data, folder):
     def signal(d, name, samples, unit=""):
         return asammdf.Signal(np.round(samples, 5), d["t"], name=name, unit=unit)
 
-    first = [signal(fast, "YawRt", -np.degrees(fast["r"]), "deg/s"), signal(fast, "LatAcc", fast["ay"] / G, "g")]
+    first = [
+        signal(fast, "YawRt", -np.degrees(fast["r"]), "deg/s"),
+        signal(fast, "LatAcc", fast["ay"] / G, "g"),
+    ]
     first += [signal(fast, "LongAcc", fast["ax"] / G), signal(fast, "ADMA_VelLat", fast["vy"])]
-    second = [signal(slow, "VehSpd", 3.6 * slow["vx"], "km/h"), signal(slow, "StWhlAng", np.degrees(RATIO * slow["delta"]))]
-    second += [signal(slow, "EngTemp", more["temperature"], "°C"), signal(slow, "GearAct", more["gear"])]
+    second = [
+        signal(slow, "VehSpd", 3.6 * slow["vx"], "km/h"),
+        signal(slow, "StWhlAng", np.degrees(RATIO * slow["delta"])),
+    ]
+    second += [
+        signal(slow, "EngTemp", more["temperature"], "°C"),
+        signal(slow, "GearAct", more["gear"]),
+    ]
     second.append(signal(slow, "UBatt", more["voltage"], "V"))
     with asammdf.MDF(version="4.10") as measurement:
         for group in (first, second):
@@ -155,13 +205,17 @@ def bag(data, folder):
 
     def header(k):
         stamp = start + round(d["t"][k] * 1e9)
-        return made["std_msgs/msg/Header"](made["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "base")
+        return made["std_msgs/msg/Header"](
+            made["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "base"
+        )
 
     def vector(x, y, z):
         return made["geometry_msgs/msg/Vector3"](x=float(x), y=float(y), z=float(z))
 
     def twist(x, y, r):
-        return made["geometry_msgs/msg/Twist"](linear=vector(x, y, 0.0), angular=vector(0.0, 0.0, r))
+        return made["geometry_msgs/msg/Twist"](
+            linear=vector(x, y, 0.0), angular=vector(0.0, 0.0, r)
+        )
 
     still = made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     origin = made["geometry_msgs/msg/Pose"](made["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), still)
@@ -169,7 +223,15 @@ def bag(data, folder):
     pose = made["geometry_msgs/msg/PoseWithCovariance"](origin, flat)
 
     def imu(k):
-        return header(k), still, none, vector(0.0, 0.0, d["r"][k]), none, vector(-d["ax"][k], -d["ay"][k], G), none
+        return (
+            header(k),
+            still,
+            none,
+            vector(0.0, 0.0, d["r"][k]),
+            none,
+            vector(-d["ax"][k], -d["ay"][k], G),
+            none,
+        )
 
     def odometry(k):
         seen = twist(d["vx"][k], d["vy"][k], d["r_ref"][k])
@@ -177,15 +239,25 @@ def bag(data, folder):
 
     messages = {
         "/imu/data": ("sensor_msgs/msg/Imu", imu),
-        "/wheel/twist": ("geometry_msgs/msg/TwistStamped", lambda k: (header(k), twist(d["v"][k], 0.0, 0.0))),
+        "/wheel/twist": (
+            "geometry_msgs/msg/TwistStamped",
+            lambda k: (header(k), twist(d["v"][k], 0.0, 0.0)),
+        ),
         "/servo": ("std_msgs/msg/Float64", lambda k: (float(0.5 - d["delta"][k] / 1.5171428571),)),
         "/mocap/odom": ("nav_msgs/msg/Odometry", odometry),
     }
     with Writer(folder / "drive_bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, (kind, _) in messages.items()}
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=types)
+            for topic, (kind, _) in messages.items()
+        }
         for k, t in enumerate(d["t"]):
             for topic, (kind, fields) in messages.items():
-                writer.write(connections[topic], start + round(t * 1e9), bytes(types.serialize_cdr(made[kind](*fields(k)), kind)))
+                writer.write(
+                    connections[topic],
+                    start + round(t * 1e9),
+                    bytes(types.serialize_cdr(made[kind](*fields(k)), kind)),
+                )
 
 
 def vbo(data, folder):
@@ -193,15 +265,33 @@ def vbo(data, folder):
     d = ferrari(data)
     heading = np.degrees(-np.cumsum(d["r"]) / 100.0) % 360.0
     stamps = np.rint((36_000.0 + d["t"]) * 1000.0).astype(int)
-    clock = [f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in stamps]
-    columns = (
-        "velocity=km/h, heading=heading, height=height, Longacc=ax_g, Latacc=-ay_g, YawRate=-deg/s, SWA=-wheel_deg, Slip_COG=-beta_deg"
-    )
+    clock = [
+        f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}"
+        for k in stamps
+    ]
+    columns = "velocity=km/h, heading=heading, height=height, Longacc=ax_g, Latacc=-ay_g, YawRate=-deg/s, SWA=-wheel_deg, Slip_COG=-beta_deg"
     numbers = table(d, columns, heading=heading, height=np.full(len(heading), 12.0))
     names = " ".join(["sats time lat long", *numbers])
-    rows = [f"009 {clock[k]} +01600.0 +04800.0 " + " ".join(f"{own[k]:+.5f}" for own in numbers.values()) for k in range(len(clock))]
-    head = ["File created on 22/02/2014 @ 10:00", "", "[channel units]", "deg/s", "deg", "deg", "", "[comments]", "", "[column names]"]
-    (folder / "lap.vbo").write_bytes("\r\n".join([*head, names, "", "[data]", *rows, ""]).encode("latin-1"))
+    rows = [
+        f"009 {clock[k]} +01600.0 +04800.0 "
+        + " ".join(f"{own[k]:+.5f}" for own in numbers.values())
+        for k in range(len(clock))
+    ]
+    head = [
+        "File created on 22/02/2014 @ 10:00",
+        "",
+        "[channel units]",
+        "deg/s",
+        "deg",
+        "deg",
+        "",
+        "[comments]",
+        "",
+        "[column names]",
+    ]
+    (folder / "lap.vbo").write_bytes(
+        "\r\n".join([*head, names, "", "[data]", *rows, ""]).encode("latin-1")
+    )
 
 
 def two_runs(data, folder):
@@ -215,11 +305,28 @@ def two_runs(data, folder):
 def no_reference(data, folder):
     """Neither reference nor time, German shorthand, 50 Hz."""
     d = ferrari(data, 2)
-    columns = table(d, "Nr=row, Tacho=km/h, Quer=ay, Laengs=-ax, Gier=r, Lenk=wheel_deg", row=np.arange(1.0, len(d["t"]) + 1.0))
+    columns = table(
+        d,
+        "Nr=row, Tacho=km/h, Quer=ay, Laengs=-ax, Gier=r, Lenk=wheel_deg",
+        row=np.arange(1.0, len(d["t"]) + 1.0),
+    )
     write(folder / "no_reference.csv", columns, 5)
 
 
-MADE = (units, german, numbered, unix, flipped, wheels, sideslip, mdf, bag, vbo, two_runs, no_reference)
+MADE = (
+    units,
+    german,
+    numbered,
+    unix,
+    flipped,
+    wheels,
+    sideslip,
+    mdf,
+    bag,
+    vbo,
+    two_runs,
+    no_reference,
+)
 LOGS = {make.__name__: make for make in MADE}
 
 

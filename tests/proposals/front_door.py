@@ -17,7 +17,13 @@ EXPECTED = Path(__file__).parent / "front_door.yaml"
 
 def vehest(folder, *words):
     """Exit code, standard output and error of a command in a folder."""
-    ran = subprocess.run([sys.executable, "-m", "vehest", *words], cwd=folder, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, "-m", "vehest", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     return ran.returncode, ran.stdout, ran.stderr
 
 
@@ -26,9 +32,15 @@ def differences(told, code, plain, words):
     if code:
         return [] if told["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
     found = {one["channel"]: one["column"] for one in plain["channels"]}
-    wrong = [f"{channel} is {found.get(channel)}, not {own}" for channel, own in told["channels"].items() if found.get(channel) != own]
+    wrong = [
+        f"{channel} is {found.get(channel)}, not {own}"
+        for channel, own in told["channels"].items()
+        if found.get(channel) != own
+    ]
     wrong += [
-        f"nothing is asked about {own}" for own in told.get("asked", ()) if own not in {question["key"] for question in plain["open"]}
+        f"nothing is asked about {own}"
+        for own in told.get("asked", ())
+        if own not in {question["key"] for question in plain["open"]}
     ]
     evidence = [text for one in plain["channels"] for text in one["evidence"]]
     said = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *evidence])
@@ -47,7 +59,9 @@ def tried(name, data, folder, minutes):
         return wrong + ([f"ended with: {end}"] if told["end"] == "verdict" else []), end
     if not minutes:
         return wrong, "not run"
-    code, out, err = vehest(folder, "run", name, "--minutes", f"{minutes:g}", "tracking=none", "--quiet")
+    code, out, err = vehest(
+        folder, "run", name, "--minutes", f"{minutes:g}", "tracking=none", "--quiet"
+    )
     lines = [line for line in out.splitlines() if line.strip()]
     end = " ".join(lines[-6:]) if code == 0 else (err.strip().splitlines() or ["nothing"])[-1]
     return wrong + ([f"exit {code}"] if (code != 0) == (told["end"] == "verdict") else []), end

@@ -25,24 +25,43 @@ def part(d, start, seconds):
 def six_seconds(data, folder):
     """Fifteen manoeuvres of six seconds, a file each."""
     for number in range(15):
-        write(folder / f"turn_{number:02d}.csv", usual(part(ferrari(data), 10.0 + 18.0 * number, 6.0)))
+        write(
+            folder / f"turn_{number:02d}.csv", usual(part(ferrari(data), 10.0 + 18.0 * number, 6.0))
+        )
 
 
 def standstill_first(data, folder):
     """A minute at standstill before the drive."""
     d, waits = ferrari(data), 6000
     random = np.random.default_rng(2)
-    noise = {"vx": 0.0003, "vy": 0.0003, "r": 0.001, "ax": 0.02, "ay": 0.02, "delta": 0.0, "beta": 0.0}
+    noise = {
+        "vx": 0.0003,
+        "vy": 0.0003,
+        "r": 0.001,
+        "ax": 0.02,
+        "ay": 0.02,
+        "delta": 0.0,
+        "beta": 0.0,
+    }
     before = {name: size * random.standard_normal(waits) for name, size in noise.items()}
-    joined = {name: np.concatenate([before[name], d[name]]) for name in before} | {"t": np.arange(waits + len(d["t"])) / 100.0}
+    joined = {name: np.concatenate([before[name], d[name]]) for name in before} | {
+        "t": np.arange(waits + len(d["t"])) / 100.0
+    }
     write(folder / "cold_start.csv", usual(joined))
 
 
 def two_speeds(data, folder):
     """The speed of antennas and that of the car's bus; the antenna's comes first and is the smoother one."""
     d, random = ferrari(data), np.random.default_rng(3)
-    own = np.round(MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
-    columns = {"Time [s]": d["t"], "Velocity [km/h]": MPS * d["vx"], **usual(d), "VehSpdLgt_CAN [km/h]": own}
+    own = np.round(
+        MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05
+    ) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
+    columns = {
+        "Time [s]": d["t"],
+        "Velocity [km/h]": MPS * d["vx"],
+        **usual(d),
+        "VehSpdLgt_CAN [km/h]": own,
+    }
     del columns["VehSpd [km/h]"]
     write(folder / "antenna.csv", columns)
 
@@ -50,14 +69,20 @@ def two_speeds(data, folder):
 def misnamed_lateral(data, folder):
     """A lateral velocity called like an acceleration, before the acceleration itself, neither with a unit."""
     d = ferrari(data)
-    columns = table(d, "t=t, speed=vx, gyro_z=r, lat_a=vy, imu_1=ay, imu_0=ax, wheel_angle=wheel", wheel=RATIO * d["delta"])
+    columns = table(
+        d,
+        "t=t, speed=vx, gyro_z=r, lat_a=vy, imu_1=ay, imu_0=ax, wheel_angle=wheel",
+        wheel=RATIO * d["delta"],
+    )
     write(folder / "misnamed.csv", columns, 5)
 
 
 def two_yaw_rates(data, folder):
     """The yaw rate of the car's ESP, 40 ms late and rough, and that of the reference."""
     d, random = ferrari(data), np.random.default_rng(5)
-    rough = np.round(np.degrees(later(d["t"], d["r"], 0.04)) / 0.1) * 0.1 + 0.05 * random.standard_normal(len(d["t"]))
+    rough = np.round(
+        np.degrees(later(d["t"], d["r"], 0.04)) / 0.1
+    ) * 0.1 + 0.05 * random.standard_normal(len(d["t"]))
     columns = usual(d) | {"ESP_YawRate [deg/s]": rough, "ADMA_YawRate [deg/s]": np.degrees(d["r"])}
     del columns["YawRate [deg/s]"]
     write(folder / "two_yaw_rates.csv", columns)
@@ -67,7 +92,9 @@ def fast_speedometer(data, folder):
     """A speedometer 6 % high, wheels that are right, in rad/s by their header."""
     d = ferrari(data)
     columns = usual(d) | {"VehSpd [km/h]": 1.06 * MPS * d["vx"]}
-    columns |= {f"WheelSpeed{corner} [rad/s]": d["vx"] / RADIUS for corner in ("FL", "FR", "RL", "RR")}
+    columns |= {
+        f"WheelSpeed{corner} [rad/s]": d["vx"] / RADIUS for corner in ("FL", "FR", "RL", "RR")
+    }
     write(folder / "speedometer.csv", columns)
 
 
@@ -82,7 +109,9 @@ def wheels_in_kmh(data, folder):
 def vbox(data, folder):
     """Three drives of a Volvo S90 as its VBOX wrote them: offsets of the Slip_* points changed places."""
     for number in ("038", "040", "041"):
-        (folder / f"S90__{number}.VBO").write_bytes((data / "vbox" / f"S90__{number}.VBO").read_bytes())
+        (folder / f"S90__{number}.VBO").write_bytes(
+            (data / "vbox" / f"S90__{number}.VBO").read_bytes()
+        )
 
 
 def twenty_seconds(data, folder):
@@ -99,5 +128,14 @@ def no_reference(data, folder):
     write(folder / "no_reference.csv", columns)
 
 
-MADE = (six_seconds, standstill_first, two_speeds, misnamed_lateral, two_yaw_rates, fast_speedometer, wheels_in_kmh, vbox)
+MADE = (
+    six_seconds,
+    standstill_first,
+    two_speeds,
+    misnamed_lateral,
+    two_yaw_rates,
+    fast_speedometer,
+    wheels_in_kmh,
+    vbox,
+)
 LOGS = {make.__name__: make for make in (*MADE, twenty_seconds, no_reference)}

@@ -12,8 +12,14 @@ def drive(seconds=120.0, rate_hz=50.0, seed=0):
     generator = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     phases = generator.uniform(0.0, 2.0 * np.pi, 6)
-    vx = 20.0 + 5.0 * np.sin(2 * np.pi * 0.02 * t + phases[0]) + 2.0 * np.sin(2 * np.pi * 0.07 * t + phases[1])
-    ay_wanted = 2.5 * np.sin(2 * np.pi * 0.11 * t + phases[2]) + 1.5 * np.sin(2 * np.pi * 0.23 * t + phases[3])
+    vx = (
+        20.0
+        + 5.0 * np.sin(2 * np.pi * 0.02 * t + phases[0])
+        + 2.0 * np.sin(2 * np.pi * 0.07 * t + phases[1])
+    )
+    ay_wanted = 2.5 * np.sin(2 * np.pi * 0.11 * t + phases[2]) + 1.5 * np.sin(
+        2 * np.pi * 0.23 * t + phases[3]
+    )
     r = ay_wanted / vx
     vy = r * (1.4 - 0.0045 * vx * vx) + 0.08 * np.sin(2 * np.pi * 0.31 * t + phases[4])
     steer = WHEELBASE * r / vx + 0.002 * ay_wanted

@@ -43,7 +43,10 @@ def read_back(made):
 
 
 def asked(tmp_path, table):
-    return [question.key for question in questions_of(inspect("my_car", [write(tmp_path / "lap.csv", table)]))]
+    return [
+        question.key
+        for question in questions_of(inspect("my_car", [write(tmp_path / "lap.csv", table)]))
+    ]
 
 
 CORNERS = ("fl", "fr", "rl", "rr")
@@ -53,20 +56,43 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
     table = usual(drive())
     table["Gyro"] *= -1.0
     found = proposed(tmp_path, table)
-    units = {"vx": ("Speed", "km/h", 1), "yaw_rate": ("Gyro", "deg/s", -1), "ay": ("LatAcc", "g", 1), "ax": ("LongAcc", "g", 1)}
+    units = {
+        "vx": ("Speed", "km/h", 1),
+        "yaw_rate": ("Gyro", "deg/s", -1),
+        "ay": ("LatAcc", "g", 1),
+        "ax": ("LongAcc", "g", 1),
+    }
     units |= {"handwheel": ("Steer", "deg", 1), "sideslip_ref": ("Beta", "deg", 1)}
     assert {name: (one.column, one.unit, one.sign) for name, one in found.items()} == units
-    assert found["yaw_rate"].in_words.startswith("yaw_rate: column Gyro, deg/s, sign -1: ay and vx·yaw_rate agree -")
+    assert found["yaw_rate"].in_words.startswith(
+        "yaw_rate: column Gyro, deg/s, sign -1: ay and vx·yaw_rate agree -"
+    )
 
 
 @pytest.mark.parametrize("unit", ["m/s", "km/h", "mph"])
 @pytest.mark.parametrize(("of_rate", "of_ay"), [("rad/s", "g"), ("deg/s", "m/s²")])
-def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(tmp_path, unit, of_rate, of_ay):
+def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(
+    tmp_path, unit, of_rate, of_ay
+):
     d, size = (
         drive(),
-        {"m/s": 1.0, "km/h": 3.6, "mph": 1.0 / 0.44704, "rad/s": 1.0, "deg/s": 180.0 / np.pi, "m/s²": 1.0, "g": 1.0 / 9.80665},
+        {
+            "m/s": 1.0,
+            "km/h": 3.6,
+            "mph": 1.0 / 0.44704,
+            "rad/s": 1.0,
+            "deg/s": 180.0 / np.pi,
+            "m/s²": 1.0,
+            "g": 1.0 / 9.80665,
+        },
     )
-    columns = {"a": d["t"], "b": size[unit] * d["vx"], "c": size[of_rate] * d["r"], "d": size[of_ay] * d["ay"], "e": d["ax"]}
+    columns = {
+        "a": d["t"],
+        "b": size[unit] * d["vx"],
+        "c": size[of_rate] * d["r"],
+        "d": size[of_ay] * d["ay"],
+        "e": d["ax"],
+    }
     found = proposed(tmp_path, pd.DataFrame(columns))
     expected = {"vx": ("b", unit), "yaw_rate": ("c", of_rate), "ay": ("d", of_ay)}
     assert {name: (found[name].column, found[name].unit) for name in expected} == expected
@@ -81,22 +107,33 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     mirrored = usual(d)
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(tmp_path, mirrored) == ["left_right"]
-    found = proposals_of(tmp_path, mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in CORNERS}))
+    found = proposals_of(
+        tmp_path,
+        mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in CORNERS}),
+    )
     assert "right wheels are faster" in found.left_right
     assert {found.by_channel[name].sign for name in LATERAL} == {-1}
     heading = np.cumsum(d["r"]) / 50.0  # counter-clockwise from east
-    east, north = np.cumsum(d["vx"] * np.cos(heading)) / 50.0, np.cumsum(d["vx"] * np.sin(heading)) / 50.0
+    east, north = (
+        np.cumsum(d["vx"] * np.cos(heading)) / 50.0,
+        np.cumsum(d["vx"] * np.sin(heading)) / 50.0,
+    )
     mirrored["Latitude"] = 48.0 + north / 111_000.0
     mirrored["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
     mirrored.to_csv(tmp_path / "course.csv", index=False)
     found = inspect("my_car", [tmp_path / "course.csv"]).proposals
-    assert ("course over latitude and longitude" in found.left_right, found.by_channel["yaw_rate"].sign) == (True, -1)
+    assert (
+        "course over latitude and longitude" in found.left_right,
+        found.by_channel["yaw_rate"].sign,
+    ) == (True, -1)
 
 
 def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
     d = drive()
     wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Speed").assign(**wheels))])
+    examined = inspect(
+        "my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Speed").assign(**wheels))]
+    )
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
     assert {"vx", "vy_ref"} <= draft(examined).contents[0].channels
@@ -109,21 +146,35 @@ def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp
     assert sum("wheel_speed" in note and "samples are missing" in note for note in made.notes) == 4
 
 
-@pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
-def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(tmp_path, wheel, other):
+@pytest.mark.parametrize(
+    ("wheel", "other"),
+    [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")],
+)
+def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(
+    tmp_path, wheel, other
+):
     d = drive()
-    columns = {"t": d["t"], wheel: d["wheel_fl"], "n_VR": d["wheel_fr"], other: np.cumsum(d["r"]) / 50.0}
+    columns = {
+        "t": d["t"],
+        wheel: d["wheel_fl"],
+        "n_VR": d["wheel_fr"],
+        other: np.cumsum(d["r"]) / 50.0,
+    }
     found = proposed(tmp_path, pd.DataFrame(columns))
     assert {one.column for one in found.values()} <= set(columns)
     assert "wheel_speed_fr" in found
 
 
-def test_road_wheel_and_steering_wheel_are_told_apart_and_the_ratio_is_estimated_where_the_wheelbase_is_told(tmp_path):
+def test_road_wheel_and_steering_wheel_are_told_apart_and_the_ratio_is_estimated_where_the_wheelbase_is_told(
+    tmp_path,
+):
     d = drive(300.0)
     table = usual(d)
     assert proposed(tmp_path, table.assign(Steer=d["steer"]))["steer"].unit == "rad"
     assert proposed(tmp_path, table)["handwheel"].unit == "deg"
-    found = proposed(tmp_path, table.drop(columns="Steer").assign(**{"SWA [rad]": 4.0 * d["handwheel"]}))["handwheel"]
+    found = proposed(
+        tmp_path, table.drop(columns="Steer").assign(**{"SWA [rad]": 4.0 * d["handwheel"]})
+    )["handwheel"]
     assert (found.column, found.unit) == ("SWA [rad]", "rad"), "though no slow corner shows it"
     assert not any("by slow corners" in text for text in found.evidence)
     file = write(tmp_path / "lap.csv", table)
@@ -132,11 +183,17 @@ def test_road_wheel_and_steering_wheel_are_told_apart_and_the_ratio_is_estimated
     assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
 
 
-def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_the_car_s_own_whatever_their_noise(tmp_path):
+def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_the_car_s_own_whatever_their_noise(
+    tmp_path,
+):
     d = drive()
     assert {"Speed", "Speed2"} <= set(asked(tmp_path, usual(d).assign(Speed2=3.6 * d["vx"] + 0.01)))
     noise = 0.1 * np.random.default_rng(1).standard_normal(len(d["t"]))
-    of_bus = usual(d).rename(columns={"Speed": "Velocity"}).assign(VehSpd_CAN=3.6 * d["vx"], Velocity=3.6 * (d["vx"] + noise))
+    of_bus = (
+        usual(d)
+        .rename(columns={"Speed": "Velocity"})
+        .assign(VehSpd_CAN=3.6 * d["vx"], Velocity=3.6 * (d["vx"] + noise))
+    )
     for table, own, reference in (
         (usual(d).assign(GPS_Speed=3.6 * d["vx"] + 0.01), "Speed", "GPS_Speed"),
         (of_bus, "VehSpd_CAN", "Velocity"),
@@ -145,23 +202,38 @@ def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_th
         assert (found["vx"].column, found["vx_ref"].column) == (own, reference)
         assert asked(tmp_path, table) == ["left_right"]
     assert asked(tmp_path, of_bus.rename(columns={"Velocity": "Rad_1"})) == ["Rad_1", "left_right"]
-    table = usual(d).rename(columns={"Gyro": "Gyro [rad/s]", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"})
-    assert "Gyro [rad/s]" in asked(tmp_path, table), "a unit of the header that contradicts the motion"
+    table = usual(d).rename(
+        columns={"Gyro": "Gyro [rad/s]", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"}
+    )
+    assert "Gyro [rad/s]" in asked(tmp_path, table), (
+        "a unit of the header that contradicts the motion"
+    )
 
 
 def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path):
     d = drive(300.0)
-    made = drafted(tmp_path, usual(d).assign(Gyro=np.interp(d["t"] - 0.12, d["t"], np.degrees(d["r"]))))
+    made = drafted(
+        tmp_path, usual(d).assign(Gyro=np.interp(d["t"] - 0.12, d["t"], np.degrees(d["r"])))
+    )
     assert made.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
-    assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), "an estimator in the car gets it late, too"
+    assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), (
+        "an estimator in the car gets it late, too"
+    )
 
 
 @pytest.mark.parametrize("columns", [20, pytest.param(300, marks=pytest.mark.slow)])
 def test_columns_of_noise_do_not_hide_the_car(tmp_path, columns):
     d, random = drive(60.0), np.random.default_rng(1)
-    noise = pd.DataFrame({f"S{k}": random.standard_normal(len(d["t"])).cumsum() for k in range(columns)})
+    noise = pd.DataFrame(
+        {f"S{k}": random.standard_normal(len(d["t"])).cumsum() for k in range(columns)}
+    )
     found = proposed(tmp_path, pd.concat([usual(d), noise], axis=1))
-    assert [found[name].column for name in ("vx", "yaw_rate", "ay", "ax")] == ["Speed", "Gyro", "LatAcc", "LongAcc"]
+    assert [found[name].column for name in ("vx", "yaw_rate", "ay", "ax")] == [
+        "Speed",
+        "Gyro",
+        "LatAcc",
+        "LongAcc",
+    ]
 
 
 @pytest.mark.parametrize("mark", ["", "---", "n.a."])
@@ -177,12 +249,22 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
     assert np.isfinite([recording["sideslip_ref"], recording["ay"]]).all()
 
 
-def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(tmp_path):
+def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(
+    tmp_path,
+):
     table = usual(drive()).drop(columns="Beta")
-    examined = inspect("my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))])
-    assert any("agrees 1.000, as of another place" in text for text in examined.proposals.by_channel["ay"].evidence)
+    examined = inspect(
+        "my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))]
+    )
+    assert any(
+        "agrees 1.000, as of another place" in text
+        for text in examined.proposals.by_channel["ay"].evidence
+    )
     outcome, _ = write_files(examined, dry_run=True)
-    assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
+    assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == (
+        [],
+        ["conf"],
+    )
     assert outcome["next"][-1].startswith('vehest estimate "')
     table = -usual(drive())
     table["Time [s]"] *= -1.0
@@ -215,8 +297,15 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
         ("lap.mat", b"MATLAB 5.0 MAT-file", "writetable"),
         ("lap.asc", b"base hex timestamps absolute", "of a CAN bus"),
-        ("lap.csv", b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column is recognised"),
-        *((f"lap.{ending}", b"junk\x00" * 1000, "") for ending in ("mf4", "vbo", "db3", "mcap", "parquet", "zip", "bag")),
+        (
+            "lap.csv",
+            b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)),
+            "no column is recognised",
+        ),
+        *(
+            (f"lap.{ending}", b"junk\x00" * 1000, "")
+            for ending in ("mf4", "vbo", "db3", "mcap", "parquet", "zip", "bag")
+        ),
     ],
     ids=lambda own: str(own)[:20],
 )
@@ -240,11 +329,21 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
         '"s","km/h","deg/s","m/s^2"',
     ]
     file = tmp_path / "lap.csv"
-    file.write_text("\n".join([*head, *(f'"{t:.2f}","{v:.4f}","{r:.5f}","{a:.5f}"' for t, v, r, a in numbers), ""]))
+    file.write_text(
+        "\n".join(
+            [*head, *(f'"{t:.2f}","{v:.4f}","{r:.5f}","{a:.5f}"' for t, v, r, a in numbers), ""]
+        )
+    )
     log = survey(file)
     assert (log.source, log.options["skip_rows"]) == ("text_log", 3)
-    assert {column.name: column.unit for column in log.columns} == {"Ground Speed": "km/h", "Gyro Yaw": "deg/s", "G Lat": "m/s^2"}
-    np.testing.assert_allclose(read_back(draft(inspect("my_car", [file])))["vx"], d["vx"], atol=1e-4)
+    assert {column.name: column.unit for column in log.columns} == {
+        "Ground Speed": "km/h",
+        "Gyro Yaw": "deg/s",
+        "G Lat": "m/s^2",
+    }
+    np.testing.assert_allclose(
+        read_back(draft(inspect("my_car", [file])))["vx"], d["vx"], atol=1e-4
+    )
 
 
 ROLES = {
@@ -256,8 +355,16 @@ ROLES = {
 
 
 def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
-    assert {name: list(hints(name)) for name in ROLES} == {name: [role] for name, role in ROLES.items()}
-    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
+    assert {name: list(hints(name)) for name in ROLES} == {
+        name: [role] for name, role in ROLES.items()
+    }
+    told = Proposals(
+        (
+            Proposal("v", "vx", "m/s"),
+            Proposal("r", "yaw_rate", "rad/s"),
+            Proposal("a", "ax", "m/s²", -1),
+        )
+    )
     assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
 
 
@@ -266,23 +373,39 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log):
     for module in {"mdf": ["asammdf"], "bag": ["rosbags"]}.get(log, []):
         pytest.importorskip(module, reason="the log is written by it")
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
-    assert [row for row in rows_of(log, answers, outcome_of(write_log(log, data_root, tmp_path))) if row["correct"] != "yes"] == []
+    assert [
+        row
+        for row in rows_of(log, answers, outcome_of(write_log(log, data_root, tmp_path)))
+        if row["correct"] != "yes"
+    ] == []
 
 
-def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_that_motion_contradicts_are_asked(tmp_path):
+def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_that_motion_contradicts_are_asked(
+    tmp_path,
+):
     d = drive()
     table = usual(d)
     agreeing = table.drop(columns="LatAcc").assign(Steer=d["ay"] / 9.80665 + 0.02 * np.sin(d["t"]))
     assert "ay" not in proposed(tmp_path, agreeing)
     assert "yaw_rate" not in proposed(tmp_path, table.drop(columns="Gyro"))
-    found = proposed(tmp_path, table.drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"}))["ay"]
+    found = proposed(tmp_path, table.drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"}))[
+        "ay"
+    ]
     assert (found.column, "contradicts its name" in found.asked) == ("LongAcc", True)
-    found = proposed(tmp_path, table.rename(columns={"LatAcc": "Ch7"}).assign(Ch7=0.8 * table["LatAcc"]))["ay"]
+    found = proposed(
+        tmp_path, table.rename(columns={"LatAcc": "Ch7"}).assign(Ch7=0.8 * table["LatAcc"])
+    )["ay"]
     assert (found.column, "it may be a velocity" in found.asked) == ("Ch7", True)
     assert proposed(tmp_path, table.rename(columns={"LatAcc": "Ch7"}))["ay"].asked == ""
     found = proposed(tmp_path, table.drop(columns="LatAcc"))
-    assert [(found[name].column, found[name].unit) for name in ("vx", "ax")] == [("Speed", "km/h"), ("LongAcc", "g")]
-    rate, wheelbase = 4.0 * d["r"], 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
+    assert [(found[name].column, found[name].unit) for name in ("vx", "ax")] == [
+        ("Speed", "km/h"),
+        ("LongAcc", "g"),
+    ]
+    rate, wheelbase = (
+        4.0 * d["r"],
+        3.6,
+    )  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
     nameless = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
     assert {"a", "b", "c"} <= set(asked(tmp_path, nameless))
 
@@ -302,20 +425,38 @@ def test_times_of_a_clock_are_read(tmp_path, first, how):
     d = drive(60.0)
     stamps = pd.Timestamp(f"2024-05-03 {first}") + pd.to_timedelta(d["t"], unit="s")
     words = [stamp.strftime(how)[:-3] + ("Z" if "T" in how else "") for stamp in stamps]
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=words))])
+    examined = inspect(
+        "my_car",
+        [
+            write(
+                tmp_path / "lap.csv",
+                usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=words),
+            )
+        ],
+    )
     assert examined.rate_hz is None
     recording = read_back(draft(examined))
     assert recording.rate_hz == pytest.approx(50.0)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
 
-def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_makes_recordings(tmp_path):
+def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_makes_recordings(
+    tmp_path,
+):
     table = usual(drive()).rename(columns={"Time [s]": "stamp"})
     table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
     clock = survey(write(tmp_path / "lap.csv", table)).clock
     assert (clock.column, clock.unit) == ("stamp", "ns")
-    log = survey(write(tmp_path / "laps.csv", pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)])))
-    assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == ("run", [(0, 2000), (2000, 4000)])
+    log = survey(
+        write(
+            tmp_path / "laps.csv",
+            pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)]),
+        )
+    )
+    assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == (
+        "run",
+        [(0, 2000), (2000, 4000)],
+    )
     d = drive(60.0)
     dates = pd.Timestamp("2024-05-03T10:59:30") + pd.to_timedelta(d["t"], unit="s").round("ms")
     usual(d).assign(**{"Time [s]": dates}).to_parquet(tmp_path / "lap.parquet")
@@ -330,15 +471,39 @@ def written(file, table):
     """A table as a VBOX or as a measuring system writes it, or as it is."""
     if file.suffix == ".csv":
         return write(file, table)
-    t, units = table["Time [s]"].to_numpy(), dict(zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
+    t, units = (
+        table["Time [s]"].to_numpy(),
+        dict(
+            zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True)
+        ),
+    )
     if file.suffix == ".vbo":
-        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table[[*units]].round(5).reset_index(drop=True))
+        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(
+            table[[*units]].round(5).reset_index(drop=True)
+        )
         text = rows.to_csv(None, sep=" ", header=False, index=False, na_rep="nan")
-        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
+        head = [
+            "[channel units]",
+            *units.values(),
+            "",
+            "[column names]",
+            " ".join(rows),
+            "",
+            "[data]",
+            "",
+        ]
         file.write_text("\n".join(head) + text)
     else:
         asammdf = pytest.importorskip("asammdf")
-        write_mdf(file, {"All": [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]})
+        write_mdf(
+            file,
+            {
+                "All": [
+                    asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit)
+                    for name, unit in units.items()
+                ]
+            },
+        )
     return file
 
 
@@ -348,48 +513,108 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     if suffix == ".csv":
         table = table.rename(columns={"Speed": "Tempo"})
         table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])]))
-    assert suffix != ".csv" or np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
+    made = draft(
+        inspect(
+            "my_car",
+            [
+                written(
+                    tmp_path / f"lap{suffix}",
+                    table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)],
+                )
+            ],
+        )
+    )
+    assert (
+        suffix != ".csv"
+        or np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
+    )
     assert {"vx", "yaw_rate", "ay"} <= made.channels
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (
+        1.0,
+        [50, 67],
+    )
     assert any("makes 2 recordings" in note for note in made.notes)
 
 
 @pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
-def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(tmp_path, suffix):
+def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(
+    tmp_path, suffix
+):
     """Half a second in a VBOX's log and in a measurement, two in a table without times."""
     table = usual(drive())
     table.loc[1000 : 1100 if suffix == ".csv" else 1025, "Steer"] = np.nan
     table = table.drop(columns="Time [s]") if suffix == ".csv" else table
     made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
-    assert any(note.startswith("'Steer' (handwheel) is left out: samples are missing") for note in made.notes)
-    assert Resample(20.0)(read_back(made)).channels.keys() == {"vx", "yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref"}
+    assert any(
+        note.startswith("'Steer' (handwheel) is left out: samples are missing")
+        for note in made.notes
+    )
+    assert Resample(20.0)(read_back(made)).channels.keys() == {
+        "vx",
+        "yaw_rate",
+        "ay",
+        "ax",
+        "sideslip_ref",
+        "vy_ref",
+    }
 
 
 def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_the_rest(tmp_path):
     table = usual(drive())
-    table.loc[(table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)), "Beta"] = np.nan
+    table.loc[
+        (table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)),
+        "Beta",
+    ] = np.nan
     made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
-    assert ("vy_ref" in made.channels, [round(own) for own in made.durations.values()]) == (True, [50, 45])
+    assert ("vy_ref" in made.channels, [round(own) for own in made.durations.values()]) == (
+        True,
+        [50, 45],
+    )
 
 
 def standing():
     random, names = np.random.default_rng(0), ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
-    return pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
+    return pd.DataFrame(
+        {"Time [s]": np.arange(3000) / 50.0}
+        | {name: 0.02 * random.standard_normal(3000) for name in names}
+    )
 
 
 ROLL = {"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6}
-POSE = {f"pose_{name}": np.random.default_rng(seed).standard_normal(6000).cumsum() for seed, name in enumerate(("x", "y", "yaw"))}
+POSE = {
+    f"pose_{name}": np.random.default_rng(seed).standard_normal(6000).cumsum()
+    for seed, name in enumerate(("x", "y", "yaw"))
+}
 
 
 @pytest.mark.parametrize(
     ("table", "said", "absent"),
     [
-        (lambda: usual(drive()).sample(frac=1.0, random_state=0), r"'Time \[s\]' as the time: it goes backwards.*sort the rows", ""),
-        (lambda: usual(drive()).rename(columns={"Beta": ""}), "^not read: column 7 has no name$", "sideslip_ref"),
-        (lambda: pd.concat([usual(drive()), usual(drive())[["Steer"]]], axis=1), "column 8, one of 2 columns called 'Steer'", "handwheel"),
-        (lambda: usual(drive()).assign(**ROLL), r"'roll \(rad\)' is named as roll.*left out", "roll"),
-        (lambda: usual(drive()).drop(columns="Beta").assign(**POSE), "no reference is made of 'pose_x', 'pose_y', 'pose_yaw'", "vy_ref"),
+        (
+            lambda: usual(drive()).sample(frac=1.0, random_state=0),
+            r"'Time \[s\]' as the time: it goes backwards.*sort the rows",
+            "",
+        ),
+        (
+            lambda: usual(drive()).rename(columns={"Beta": ""}),
+            "^not read: column 7 has no name$",
+            "sideslip_ref",
+        ),
+        (
+            lambda: pd.concat([usual(drive()), usual(drive())[["Steer"]]], axis=1),
+            "column 8, one of 2 columns called 'Steer'",
+            "handwheel",
+        ),
+        (
+            lambda: usual(drive()).assign(**ROLL),
+            r"'roll \(rad\)' is named as roll.*left out",
+            "roll",
+        ),
+        (
+            lambda: usual(drive()).drop(columns="Beta").assign(**POSE),
+            "no reference is made of 'pose_x', 'pose_y', 'pose_yaw'",
+            "vy_ref",
+        ),
         (standing, "stands all the time", ""),
     ],
     ids=["no clock", "no name", "twice", "impossible angle", "unrelated pose", "standing"],
@@ -402,79 +627,146 @@ def test_what_is_left_out_is_noted(tmp_path, table, said, absent):
 
 def in_two_files(tmp_path, change, **options):
     second = usual(drive(100.0, seed=2))
-    files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", change(second), **options)]
+    files = [
+        write(tmp_path / "lap_1.csv", usual(drive(seed=1))),
+        write(tmp_path / "lap_2.csv", change(second), **options),
+    ]
     return inspect("my_car", files)
 
 
-def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossible_in_it_left_out(tmp_path):
-    remarks = draft(in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))).remarks
+def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossible_in_it_left_out(
+    tmp_path,
+):
+    remarks = draft(
+        in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))
+    ).remarks
     assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
-    marked = in_two_files(tmp_path, lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))), na_rep="-")
+    marked = in_two_files(
+        tmp_path,
+        lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))),
+        na_rep="-",
+    )
     assert len(draft(marked).contents) == 2
     found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
     assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
-    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
+    assert any(
+        re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note)
+        for note in found.notes
+    )
     roll = 0.05 * np.sin(np.arange(6000) / 50.0)
     first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
-    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
-    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
+    second = write(
+        tmp_path / "lap_2.csv",
+        usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}),
+    )
+    assert [
+        "roll" in inspect("my_car", files).proposals.by_channel
+        for files in ([first], [first, second])
+    ] == [True, False]
 
 
 def in_ms(table):
-    return table.assign(**{"Time [s]": 1000.0 * table["Time [s]"]}).rename(columns={"Time [s]": "Time [ms]"})
+    return table.assign(**{"Time [s]": 1000.0 * table["Time [s]"]}).rename(
+        columns={"Time [s]": "Time [ms]"}
+    )
 
 
 def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_path):
-    for change, options, said in ((lambda table: table, {"sep": ";"}, "has delimiter ';'"), (in_ms, {}, r"has times 'Time \[ms\] in ms'")):
+    for change, options, said in (
+        (lambda table: table, {"sep": ";"}, "has delimiter ';'"),
+        (in_ms, {}, r"has times 'Time \[ms\] in ms'"),
+    ):
         with pytest.raises(DataError, match=said):
             in_two_files(tmp_path, change, **options)
     names, _, numbers = usual(drive()).round(5).to_csv(index=False).partition("\n")
     for name, unit in (("lap_1", "km/h"), ("lap_2", "m/s")):
         (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
-    with pytest.raises(DataError, match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike"):
+    with pytest.raises(
+        DataError,
+        match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike",
+    ):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
     write(tmp_path / "lap_1.csv", usual(drive(90.0)))
-    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
-    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
+    write(
+        tmp_path / "lap_2.csv",
+        usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"),
+    )
+    with pytest.raises(
+        DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"
+    ):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
     """Though it agrees better with the speed than the inertial unit does, and one row is corrupt."""
     d = drive(rate_hz=20.0)
-    table = pd.DataFrame({"t": d["t"], "speed": d["vx"], "gyro_z": d["r"], "imu_ay": d["ay"], "mocap_speed": d["vx"] + 0.001})
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "speed": d["vx"],
+            "gyro_z": d["r"],
+            "imu_ay": d["ay"],
+            "mocap_speed": d["vx"] + 0.001,
+        }
+    )
     table["acc_vehicle_x"] = np.diff(table["mocap_speed"], prepend=0.0) / 0.05
     table["imu_ax"] = d["ax"] + 0.4 * np.random.default_rng(5).standard_normal(len(table))
     table.loc[700, "mocap_speed"] = 4000.0
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.by_channel["ax"].column == "imu_ax"
-    assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
+    assert (
+        "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement"
+        in examined.proposals.notes
+    )
 
 
-def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_an_unknown_unit_told_of(tmp_path):
+def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_an_unknown_unit_told_of(
+    tmp_path,
+):
     d = drive()
-    table = pd.DataFrame({"t": d["t"], "speed": d["vx"] / 0.3048, "gyro_z": np.degrees(d["r"]), "acc_y": d["ay"], "Tq": 130.0 * d["ax"]})
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "speed": d["vx"] / 0.3048,
+            "gyro_z": np.degrees(d["r"]),
+            "acc_y": d["ay"],
+            "Tq": 130.0 * d["ax"],
+        }
+    )
     found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
     assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
     assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
-    found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
+    found = proposed(
+        tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01)
+    )
     assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
     assert not found["yaw_rate"].asked
 
 
-def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(tmp_path):
+def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(
+    tmp_path,
+):
     """Hardly any sideslip; the wheels tell which way is left."""
     d = drive()
-    table = usual(d).rename(columns={"Beta": "Beta [deg]"}) * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    table = usual(d).rename(columns={"Beta": "Beta [deg]"}) * np.array(
+        [1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0]
+    )
     table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
     table = table.assign(WheelSpeedFL=d["wheel_fl"], WheelSpeedFR=d["wheel_fr"])
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     found = examined.proposals.by_channel
-    assert [found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [-1, 1, 1, 1]
+    assert [found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [
+        -1,
+        1,
+        1,
+        1,
+    ]
     assert found["sideslip_ref"].asked.startswith("sign")
 
 
-def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(tmp_path):
+def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(
+    tmp_path,
+):
     """Satellites that come late and are lost once; every other cell of a slow signal is bridged, in Parquet, too."""
     table = usual(drive()).astype(float)
     lost = (table["Time [s]"] < 10.0) | ((table["Time [s]"] > 50.0) & (table["Time [s]"] < 53.0))
@@ -483,24 +775,40 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
     table.to_parquet(tmp_path / "lap.parquet")
     for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
         assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
-        assert ([round(own) for own in made.durations.values()], made.dataset["max_gap"]) == ([40, 67], 1.0)
+        assert ([round(own) for own in made.durations.values()], made.dataset["max_gap"]) == (
+            [40, 67],
+            1.0,
+        )
         assert any("1-500" in note for note in made.notes)
 
 
-def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(tmp_path):
+def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(
+    tmp_path,
+):
     d = drive()
     yaw = np.cumsum(d["r"]) / 50.0
-    table = usual(d).drop(columns="Beta").assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
+    table = (
+        usual(d)
+        .drop(columns="Beta")
+        .assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
+    )
     notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
-    assert "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column" in notes
+    assert (
+        "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column"
+        in notes
+    )
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks
-    remarks = drafted(tmp_path, table.assign(Gyro=np.repeat(table["Gyro"].to_numpy()[::10], 10))).remarks
+    remarks = drafted(
+        tmp_path, table.assign(Gyro=np.repeat(table["Gyro"].to_numpy()[::10], 10))
+    ).remarks
     assert any(one.startswith("yaw_rate: ") for one in remarks)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
-def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_format(tmp_path, suffix):
+def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_format(
+    tmp_path, suffix
+):
     d = drive()
     table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 9999.0
@@ -516,26 +824,46 @@ def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_form
 def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path, excess):
     d = drive()
     table = usual(d).assign(Speed=3.6 * excess * d["vx"])
-    found = proposed(tmp_path, table.assign(**{f"WheelSpeed{corner.upper()}": 3.6 * RADIUS * d[f"wheel_{corner}"] for corner in CORNERS}))
+    found = proposed(
+        tmp_path,
+        table.assign(
+            **{
+                f"WheelSpeed{corner.upper()}": 3.6 * RADIUS * d[f"wheel_{corner}"]
+                for corner in CORNERS
+            }
+        ),
+    )
     assert "km/h at the rim by the speed" in found["wheel_speed_rl"].evidence
     too_much = excess > 1.0
-    assert ("5 % too much by the wheels" in found["vx"].asked, "vx km/h +1 0.952" in found["vx"].others) == (too_much, too_much)
-    assert any("too much by ay over yaw_rate" in note for note in proposals_of(tmp_path, table).notes) == too_much
+    assert (
+        "5 % too much by the wheels" in found["vx"].asked,
+        "vx km/h +1 0.952" in found["vx"].others,
+    ) == (too_much, too_much)
+    assert (
+        any("too much by ay over yaw_rate" in note for note in proposals_of(tmp_path, table).notes)
+        == too_much
+    )
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
-def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motions_is_read(tmp_path, suffix):
+def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motions_is_read(
+    tmp_path, suffix
+):
     d = drive()
     table = usual(d).assign(Gyro=d["r"])
     if suffix == ".csv":
-        table = table.rename(columns={"Speed": "Speed [km/h]", "Gyro": "Gyro [deg/s]", "LatAcc": "LatAcc [g]"})
+        table = table.rename(
+            columns={"Speed": "Speed [km/h]", "Gyro": "Gyro [deg/s]", "LatAcc": "LatAcc [g]"}
+        )
     examined = inspect("my_car", [written(tmp_path / f"lap{suffix}", table)])
     found = examined.proposals.by_channel
     assert (found["yaw_rate"].unit, found["vx"].unit, found["ay"].unit) == ("rad/s", "km/h", "g")
     assert "by its header in deg/s" in found["yaw_rate"].asked
     assert (found["vx"].asked, found["ay"].asked) == ("", "")
     own = read_back(draft(examined))
-    np.testing.assert_allclose(own["yaw_rate"], np.interp(own.time - own.time[0], d["t"], d["r"]), atol=1e-4)
+    np.testing.assert_allclose(
+        own["yaw_rate"], np.interp(own.time - own.time[0], d["t"], d["r"]), atol=1e-4
+    )
 
 
 def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
@@ -550,7 +878,10 @@ def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
 def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path):
     d = drive()
     counts = np.round(1500.0 + 8000.0 * d["steer"])
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Steer").assign(steer_us=counts))])
+    examined = inspect(
+        "my_car",
+        [write(tmp_path / "lap.csv", usual(d).drop(columns="Steer").assign(steer_us=counts))],
+    )
     taken, left = ask(examined, interactive=False)
     assert {question.key: question.proposed for question in left}["steer_us"] == "-"
     assert "steer" not in draft(taken).channels
@@ -561,7 +892,14 @@ def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(t
 
 @pytest.mark.parametrize(
     ("name", "unit"),
-    [("vy_ms", "m/s"), ("v_lat_ms", "m/s"), ("wheel_speed_fl_ms", "m/s"), ("gps_v_ms", "m/s"), ("valve_ms", "ms"), ("speed_age_ms", "ms")],
+    [
+        ("vy_ms", "m/s"),
+        ("v_lat_ms", "m/s"),
+        ("wheel_speed_fl_ms", "m/s"),
+        ("gps_v_ms", "m/s"),
+        ("valve_ms", "ms"),
+        ("speed_age_ms", "ms"),
+    ],
 )
 def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
     assert unit_in_name(name) == unit
@@ -576,7 +914,9 @@ def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
     made = drafted(tmp_path, mixed)
     assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= made.channels
     own = read_back(made)
-    np.testing.assert_allclose(own["vx"], np.interp(own.time - own.time[0], d["t"], d["vx"]), atol=0.2)
+    np.testing.assert_allclose(
+        own["vx"], np.interp(own.time - own.time[0], d["t"], d["vx"]), atol=0.2
+    )
     assert own.duration == pytest.approx(120.0, abs=0.2)
 
 
@@ -596,8 +936,14 @@ def test_the_unit_says_of_what_a_name_is(name, unit, role):
 
 def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
     d = drive()
-    back = {name: -d[name][::-1] if name in ("vx", "vy", "r") else d[name][::-1] for name in d if name != "t"}
-    d = {"t": np.arange(2 * len(d["t"])) / 50.0} | {name: np.concatenate([d[name], back[name]]) for name in back}
+    back = {
+        name: -d[name][::-1] if name in ("vx", "vy", "r") else d[name][::-1]
+        for name in d
+        if name != "t"
+    }
+    d = {"t": np.arange(2 * len(d["t"])) / 50.0} | {
+        name: np.concatenate([d[name], back[name]]) for name in back
+    }
     found = proposed(tmp_path, usual(d).drop(columns="Beta").assign(v_lat=d["vy"]))
     assert {name: found[name].column for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {
         "vx": "Speed",
@@ -605,12 +951,22 @@ def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
         "ay": "LatAcc",
         "vy_ref": "v_lat",
     }
-    assert {(found[name].sign, found[name].asked) for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {(1, "")}
+    assert {
+        (found[name].sign, found[name].asked) for name in ("vx", "yaw_rate", "ay", "vy_ref")
+    } == {(1, "")}
 
 
 def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(tmp_path):
     d = drive()
-    table = pd.DataFrame({"t": d["t"], "encoder": 100.0 * d["vx"], "gyro": d["r"], "mocap_vx": d["vx"], "mocap_vy": d["vy"]})
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "encoder": 100.0 * d["vx"],
+            "gyro": d["r"],
+            "mocap_vx": d["vx"],
+            "mocap_vy": d["vy"],
+        }
+    )
     found = proposed(tmp_path, table)
     assert (found["vx"].column, found["vx_ref"].column) == ("encoder", "mocap_vx")
     assert found["vx"].factor == pytest.approx(0.01, rel=0.01)
@@ -618,35 +974,69 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
 
 @pytest.mark.parametrize(
     ("encoding", "speed", "rate"),
-    [("cp932", "車速[km/h]", "ヨーレート[°/s]"), ("cp932", "速度[km/h]", "角速度[deg/s]"), ("cp1252", "„v“", "‰r")],
+    [
+        ("cp932", "車速[km/h]", "ヨーレート[°/s]"),
+        ("cp932", "速度[km/h]", "角速度[deg/s]"),
+        ("cp1252", "„v“", "‰r"),
+    ],
 )
-def test_names_in_shift_jis_are_read_and_windows_1252_is_not_taken_for_it(tmp_path, encoding, speed, rate):
+def test_names_in_shift_jis_are_read_and_windows_1252_is_not_taken_for_it(
+    tmp_path, encoding, speed, rate
+):
     table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding=encoding)])
-    assert [examined.proposals.by_channel[name].column for name in ("vx", "yaw_rate")] == [speed, rate]
+    assert [examined.proposals.by_channel[name].column for name in ("vx", "yaw_rate")] == [
+        speed,
+        rate,
+    ]
     assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
 
 
 def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
     d = drive()
     table = pd.DataFrame(
-        {"t": d["t"], "Speed [cm/s]": 100.0 * d["vx"], "Gyro [mrad/s]": 1e3 * d["r"], "LatAcc [mg]": 1e3 * d["ay"] / 9.80665}
+        {
+            "t": d["t"],
+            "Speed [cm/s]": 100.0 * d["vx"],
+            "Gyro [mrad/s]": 1e3 * d["r"],
+            "LatAcc [mg]": 1e3 * d["ay"] / 9.80665,
+        }
     )
-    made = drafted(tmp_path, table.assign(**{"LongAcc [mm/s^2]": 1e3 * d["ax"], "VLat [m per s]": d["vx"] * np.tan(d["sideslip"])}))
-    assert {one.channel for one in made.examined.proposals.channels if not one.asked} == {"vx", "yaw_rate", "ay", "ax", "vy_ref"}
-    assert next(note for note in made.notes if "no unit that vehest knows" in note).startswith("'m per s' of 'VLat [m per s]'")
+    made = drafted(
+        tmp_path,
+        table.assign(
+            **{"LongAcc [mm/s^2]": 1e3 * d["ax"], "VLat [m per s]": d["vx"] * np.tan(d["sideslip"])}
+        ),
+    )
+    assert {one.channel for one in made.examined.proposals.channels if not one.asked} == {
+        "vx",
+        "yaw_rate",
+        "ay",
+        "ax",
+        "vy_ref",
+    }
+    assert next(note for note in made.notes if "no unit that vehest knows" in note).startswith(
+        "'m per s' of 'VLat [m per s]'"
+    )
     for name, expected in (("vx", d["vx"]), ("yaw_rate", d["r"]), ("ay", d["ay"]), ("ax", d["ax"])):
         np.testing.assert_allclose(read_back(made)[name], expected, atol=1e-4 * np.ptp(expected))
 
 
 def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
     table = usual(drive())
-    files = [write(tmp_path / "lap_1.csv", table), write(tmp_path / "lap_2.csv", usual(drive(100.0)))]
+    files = [
+        write(tmp_path / "lap_1.csv", table),
+        write(tmp_path / "lap_2.csv", usual(drive(100.0))),
+    ]
     assert not draft(inspect("my_car", files)).remarks
     write(files[1], usual(drive(100.0)).assign(Steer=1.5 * table["Steer"]))
     (remark,) = draft(inspect("my_car", files)).remarks
-    assert remark.startswith("handwheel: in 'lap_2', 1.5 times as large in the same turn as in 'lap_1'")
-    write(files[1], usual(drive(100.0)).assign(Steer=0.0))  # a sensor that is not plugged in is no other car
+    assert remark.startswith(
+        "handwheel: in 'lap_2', 1.5 times as large in the same turn as in 'lap_1'"
+    )
+    write(
+        files[1], usual(drive(100.0)).assign(Steer=0.0)
+    )  # a sensor that is not plugged in is no other car
     assert not any("another car" in one for one in draft(inspect("my_car", files)).remarks)
 
 
@@ -657,17 +1047,24 @@ def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     table.loc[2000:2499, "Speed"] = 10.8
     for name, sign in (("Gyro", -1.0), ("Steer", 1.0), ("LatAcc", 1.0)):
         table.loc[2000:2499, name] *= sign * slow[back]
-    assert any(one.startswith("vx: has no sign: the car goes backwards") for one in drafted(tmp_path, table).remarks)
+    assert any(
+        one.startswith("vx: has no sign: the car goes backwards")
+        for one in drafted(tmp_path, table).remarks
+    )
 
 
 def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path):
     d = drive()
-    table = usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
+    table = (
+        usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
+    )
     write(tmp_path / "lap_1.csv", table)
     other = table[:5000].copy()
     other.loc[100:200, "RoadWheel [deg]"] = 170.0
     examined = inspect("my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", other)])
-    assert {question.key: question.proposed for question in questions_of(examined)}["RoadWheel [deg]"] == "-"
+    assert {question.key: question.proposed for question in questions_of(examined)}[
+        "RoadWheel [deg]"
+    ] == "-"
     assert "steer" not in draft(ask(examined, interactive=False)[0]).channels
 
 

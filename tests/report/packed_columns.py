@@ -11,7 +11,11 @@ from vehest.report.explorer import GAP
 def unpacked(content):
     """Columns of what `explorer_json` says, as the page reads them."""
     n = content["length"]
-    raw = np.frombuffer(zlib.decompress(base64.b64decode(content["data"])), np.uint8).reshape(-1, 2, n).astype(np.uint16)
+    raw = (
+        np.frombuffer(zlib.decompress(base64.b64decode(content["data"])), np.uint8)
+        .reshape(-1, 2, n)
+        .astype(np.uint16)
+    )
     codes = np.cumsum(raw[:, 0] + (raw[:, 1] << 8), axis=1, dtype=np.uint16)
     return {
         name: np.where(own == GAP, np.nan, low + scale * own.astype(np.float64))

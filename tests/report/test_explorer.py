@@ -14,9 +14,13 @@ def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay
     rng = np.random.default_rng(1)
     values = 30.0 * rng.standard_normal(5_000)
     values[100:120] = np.nan
-    described, data = packed({"values": values, "constant": np.full(5_000, -2.5), "nothing": np.full(5_000, np.nan)})
+    described, data = packed(
+        {"values": values, "constant": np.full(5_000, -2.5), "nothing": np.full(5_000, np.nan)}
+    )
     back = unpacked({"length": 5_000, "columns": described, "data": data})
-    assert np.nanmax(np.abs(back["values"] - values)) <= 0.5 * np.ptp(values[np.isfinite(values)]) / 65_534 * (1 + 1e-9)
+    assert np.nanmax(np.abs(back["values"] - values)) <= 0.5 * np.ptp(
+        values[np.isfinite(values)]
+    ) / 65_534 * (1 + 1e-9)
     assert np.array_equal(np.isnan(back["values"]), np.isnan(values))
     assert (back["constant"] == -2.5).all()
     assert np.isnan(back["nothing"]).all()
@@ -25,7 +29,11 @@ def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay
 def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate_and_starts_anew_after_a_gap():
     n, step = 4_001, 0.05
     x, y = reckoned_course(np.full(n, 20.0), np.full(n, -1.0), np.full(n, 0.2), step)
-    radius, angle, heading = np.hypot(20.0, 1.0) / 0.2, 0.2 * step * np.arange(n), np.arctan2(-1.0, 20.0)
+    radius, angle, heading = (
+        np.hypot(20.0, 1.0) / 0.2,
+        0.2 * step * np.arange(n),
+        np.arctan2(-1.0, 20.0),
+    )
     assert x == pytest.approx(radius * (np.sin(angle + heading) - np.sin(heading)), abs=0.01)
     assert y == pytest.approx(-radius * (np.cos(angle + heading) - np.cos(heading)), abs=0.01)
     vx = np.array([1.0, 1.0, np.nan, 1.0, 1.0, 1.0])
@@ -35,7 +43,9 @@ def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate_and_starts_a
 
 
 def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
-    one, two, far, none = bars_of([0.2, 0.4, 50.0, np.nan], [0.1, 0.3, 40.0, np.nan], [0.4, 0.5, 60.0, np.nan])
+    one, two, far, none = bars_of(
+        [0.2, 0.4, 50.0, np.nan], [0.1, 0.3, 40.0, np.nan], [0.4, 0.5, 60.0, np.nan]
+    )
     assert none is None
     assert one["at"] > 0
     assert two["at"] == pytest.approx(2 * one["at"], abs=0.1)
@@ -44,7 +54,15 @@ def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
 
 
 def test_bars_go_with_their_rows_into_the_page_and_into_no_other_file(tmp_path):
-    frame = pd.DataFrame({"name": ["a", "b"], "error": [1.0, 2.0], "low": [0.5, 1.5], "high": [1.5, 2.5], "interval": ["x", "y"]})
+    frame = pd.DataFrame(
+        {
+            "name": ["a", "b"],
+            "error": [1.0, 2.0],
+            "low": [0.5, 1.5],
+            "high": [1.5, 2.5],
+            "interval": ["x", "y"],
+        }
+    )
     columns = {"name": Column("name"), "interval": Column("interval", bar=("error", "low", "high"))}
     write_document(Document("Bars", [Table("bars", "Bars.", frame, columns)]), tmp_path)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -25,33 +25,65 @@ def said(part):
     return " ".join(verdict_of(part, "test")[0])
 
 
-def test_the_one_below_all_others_is_recommended_with_its_interval_what_it_beats_and_the_seed_chosen_on_validation(part):
+def test_the_one_below_all_others_is_recommended_with_its_interval_what_it_beats_and_the_seed_chosen_on_validation(
+    part,
+):
     found = verdict_of(without(part, "luenberger", "gru"), "test")
     words = " ".join(found[0])
     assert "**Use KS-NN linear + bias, P = 2.** Expected RMSE(β) " in words
-    assert "It beats v = 0 and the static map." in words or "It beats the static map and v = 0." in words
+    assert (
+        "It beats v = 0 and the static map." in words
+        or "It beats the static map and v = 0." in words
+    )
     low, high = (float(text) for text in words.split("(", 2)[2].split(")")[0].split(" to "))
     assert 0.0 < low < high
     assert (found[1].estimator, found[1].seed) == ("ksnn", 1)
 
 
 def test_two_that_are_alike_are_not_told_apart(part):
-    twins = [replace(model, variant="twin", title="Its twin") for model in part.models if model.estimator == "gru"]
+    twins = [
+        replace(model, variant="twin", title="Its twin")
+        for model in part.models
+        if model.estimator == "gru"
+    ]
     rows = part.metrics[part.metrics["estimator"] == "gru"].assign(variant="twin")
     own = without(part, "ksnn", "luenberger")
-    words = said(replace(own, models=[*own.models, *twins], metrics=pd.concat([part.metrics, rows], ignore_index=True)))
+    words = said(
+        replace(
+            own,
+            models=[*own.models, *twins],
+            metrics=pd.concat([part.metrics, rows], ignore_index=True),
+        )
+    )
     assert words.startswith("**Take ")
-    assert all(text in words for text in ("**No estimator can be called best:** ", " has the lowest error and is not told apart from "))
+    assert all(
+        text in words
+        for text in (
+            "**No estimator can be called best:** ",
+            " has the lowest error and is not told apart from ",
+        )
+    )
     assert "**Use" not in words
-    assert "**Use" not in said(without(part, "zero", "static_map", "luenberger", "gru")), "without the baselines"
+    assert "**Use" not in said(without(part, "zero", "static_map", "luenberger", "gru")), (
+        "without the baselines"
+    )
 
 
 def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_commands_take(part):
     """Luenberger comes first in the list, and GRU, alike on the test, has the lowest error on validation."""
     metrics = part.metrics.copy()
-    metrics.loc[(metrics["estimator"] == "gru") & (metrics["test_set"] == "validation") & (metrics["metric"] == "rmse_vy"), "value"] = 0.01
+    metrics.loc[
+        (metrics["estimator"] == "gru")
+        & (metrics["test_set"] == "validation")
+        & (metrics["metric"] == "rmse_vy"),
+        "value",
+    ] = 0.01
     gru = next(model for model in part.models if model.estimator == "gru")
-    alike = [replace(model, evaluation_folder=gru.evaluation_folder) for model in part.models if model.estimator == "luenberger"]
+    alike = [
+        replace(model, evaluation_folder=gru.evaluation_folder)
+        for model in part.models
+        if model.estimator == "luenberger"
+    ]
     own = replace(without(part, "ksnn", "luenberger"), metrics=metrics)
     found = verdict_of(replace(own, models=[*own.models, *alike]), "test")
     assert found[1] is not None
@@ -67,9 +99,20 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
     vy[round(60.5 * 20)] = 10.0
     vx[round(84.0 * 20) : round(84.5 * 20)], vy[round(84.0 * 20) : round(84.5 * 20)] = 0.0003, 0.02
     file = tmp_path / "lap.parquet"
-    write_recording(replace(recording, channels={**recording.channels, "vx": vx, "vy_ref": vy}), file)
-    words = said(replace(part, protocol=replace(part.protocol, least_speed=0.1), references={("toy", "lap"): file}))
-    assert "The score counts 94 % of the test, without the first 1.5 s of its 1 range, **which hide the largest sideslip** (" in words
+    write_recording(
+        replace(recording, channels={**recording.channels, "vx": vx, "vy_ref": vy}), file
+    )
+    words = said(
+        replace(
+            part,
+            protocol=replace(part.protocol, least_speed=0.1),
+            references={("toy", "lap"): file},
+        )
+    )
+    assert (
+        "The score counts 94 % of the test, without the first 1.5 s of its 1 range, **which hide the largest sideslip** ("
+        in words
+    )
     assert "; 2.1 % of what is scored is standstill, with a sideslip of 0." in words
     assert "hide" not in said(part)
 
@@ -83,15 +126,23 @@ def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
 def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
     still = drive()
     file = tmp_path / "lap.parquet"
-    write_recording(replace(still, channels={**still.channels, "vy_ref": 0.01 * still["vy_ref"]}), file)
+    write_recording(
+        replace(still, channels={**still.channels, "vy_ref": 0.01 * still["vy_ref"]}), file
+    )
     found = verdict_of(replace(part, references={("toy", "lap"): file}), "test")
-    assert found[0][0].startswith("**These recordings cannot rank estimators**, because they hardly excite sideslip (")
+    assert found[0][0].startswith(
+        "**These recordings cannot rank estimators**, because they hardly excite sideslip ("
+    )
     assert found[1] is None
 
 
 def test_a_bound_that_an_estimator_goes_below_does_not_make_a_drive_silent(part):
-    rows = part.metrics[(part.metrics["metric"] == "rmse_sideslip") & (part.metrics["test_set"] == "test")]
-    bounded = pd.concat([part.metrics, rows.assign(metric="floor_cramer_rao", value=90.0)], ignore_index=True)
+    rows = part.metrics[
+        (part.metrics["metric"] == "rmse_sideslip") & (part.metrics["test_set"] == "test")
+    ]
+    bounded = pd.concat(
+        [part.metrics, rows.assign(metric="floor_cramer_rao", value=90.0)], ignore_index=True
+    )
     assert "cannot rank" not in said(replace(part, metrics=bounded))
     own = bounded.assign(value=bounded["value"].where(bounded["metric"] != "rmse_sideslip", 95.0))
     assert "tells sideslip to no better than 90° (Cramér-Rao)" in said(replace(part, metrics=own))
@@ -102,19 +153,33 @@ def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
     minutes = 0.0
     for start, stop in ((2.0, 40.0), (42.0, 58.0), (60.0, 85.0)):
         minutes += float((np.abs(recording.cut(start, stop)["ay"]) > 4.0).sum()) / 20.0 / 60.0
-    assert f"Your recordings hold {minutes:.1f} min beyond 4 m/s²: {3 * minutes:.0f} more would halve the interval." in said(part)
+    assert (
+        f"Your recordings hold {minutes:.1f} min beyond 4 m/s²: {3 * minutes:.0f} more would halve the interval."
+        in said(part)
+    )
 
 
 def test_families_that_lack_channels_are_named_with_them(part):
-    lines = not_compared(replace(part, failed={"lstm-states_5-seed0": "not done yet: no time was left, the same command goes on"}))
+    lines = not_compared(
+        replace(
+            part,
+            failed={
+                "lstm-states_5-seed0": "not done yet: no time was left, the same command goes on"
+            },
+        )
+    )
     assert lines[0].startswith("lstm-states_5-seed0: not done yet")
     assert any(line.startswith("learned_ukf: lacks ") and "motor_speed" in line for line in lines)
     assert not any(line.startswith(("lstm:", "ksnn:", "zero:")) for line in lines)
 
 
 def test_the_terminal_says_what_the_report_says(part):
-    artefacts = StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], [])
+    artefacts = StudyArtefacts(
+        "toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], []
+    )
     lines = verdict(artefacts)
-    assert lines[0].replace("*", "") in str(documents(artefacts)["report"].blocks[0]).replace("*", "").replace("`", "")
+    assert lines[0].replace("*", "") in str(documents(artefacts)["report"].blocks[0]).replace(
+        "*", ""
+    ).replace("`", "")
     model = lines[2].split()[2]
     assert any(model == own.model_folder.name for own in part.models)

@@ -59,49 +59,76 @@ def fill(driver, label, value):
 def views(driver):
     """First and last time that each trace shows [s]."""
     plots = "document.querySelector('figure.live').explorer.plots"
-    return driver.execute_script(f"return {plots}.map(plot => [plot.scales.x.min, plot.scales.x.max])")
+    return driver.execute_script(
+        f"return {plots}.map(plot => [plot.scales.x.min, plot.scales.x.max])"
+    )
 
 
 def press(driver, text):
-    (button,) = [own for own in driver.find_elements("css selector", ".views button, .filters button") if own.text == text]
+    (button,) = [
+        own
+        for own in driver.find_elements("css selector", ".views button, .filters button")
+        if own.text == text
+    ]
     button.click()
 
 
-def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_all_rows_those_of_the_leaderboard(chromium, toy):
+def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_all_rows_those_of_the_leaderboard(
+    chromium, toy
+):
     path, ranked, _ = toy
     opened(chromium, path)
     fill(chromium, "speed from [m/s]", "30")
     fill(chromium, "|ay| from [m/s²]", "4")
     fill(chromium, "|ay| to [m/s²]", "10")
     recording = drive()
-    time, vx, vy_ref, ay = recording.time, recording["vx"], recording["vy_ref"], np.abs(recording["ay"])
+    time, vx, vy_ref, ay = (
+        recording.time,
+        recording["vx"],
+        recording["vy_ref"],
+        np.abs(recording["ay"]),
+    )
     rows = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9) & (vx >= 30) & (ay >= 4) & (ay <= 10)
     assert 20 < rows.sum() < 400
-    vy = vy_ref + 0.15 * np.sin(3.0 * time + 1 + 0.1)  # the KS-NN of the seed that validation chooses
+    vy = vy_ref + 0.15 * np.sin(
+        3.0 * time + 1 + 0.1
+    )  # the KS-NN of the seed that validation chooses
     error = np.degrees(np.arctan2(vy, vx) - np.arctan2(vy_ref, vx))[rows]
-    assert board(chromium)["KS-NN linear + bias, P = 2"][0] == pytest.approx(math.sqrt(np.mean(error**2)), abs=1e-3)
+    assert board(chromium)["KS-NN linear + bias, P = 2"][0] == pytest.approx(
+        math.sqrt(np.mean(error**2)), abs=1e-3
+    )
     assert f"{rows.sum()} of" in chromium.find_element("css selector", ".said").text
     press(chromium, "all rows")
     shown = board(chromium)
     assert len(shown) == len(FAMILIES)
     for row in ranked.to_dict("records"):
-        assert shown[row["title"]] == pytest.approx((row["rmse_sideslip_chosen"], row["rmse_vy"]), abs=1e-3)
+        assert shown[row["title"]] == pytest.approx(
+            (row["rmse_sideslip_chosen"], row["rmse_vy"]), abs=1e-3
+        )
 
 
 def test_browser_unpacks_what_was_packed(chromium, toy):
     path, _, document = toy
     opened(chromium, path)
-    (explorer,) = [block.interactive for block in document.blocks if getattr(block, "interactive", "")]
+    (explorer,) = [
+        block.interactive for block in document.blocks if getattr(block, "interactive", "")
+    ]
     known = unpacked(json.loads(explorer))
     for name in ("vx", "vy", "vy2", "x"):
-        read = chromium.execute_script(f"return [...document.querySelector('figure.live').explorer.columns['{name}']]")
+        read = chromium.execute_script(
+            f"return [...document.querySelector('figure.live').explorer.columns['{name}']]"
+        )
         assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)
 
 
 def test_all_traces_zoom_together_and_back(chromium, hour):
     opened(chromium, hour)
     assert len(views(chromium)) == 3 + 1 + 3  # v, β and its error; health; three channels
-    for text, view in {"": (0.0, 3599.95), "busiest 20 s": (100.0, 120.0), "whole range": (0.0, 3599.95)}.items():
+    for text, view in {
+        "": (0.0, 3599.95),
+        "busiest 20 s": (100.0, 120.0),
+        "whole range": (0.0, 3599.95),
+    }.items():
         if text:
             press(chromium, text)
         assert all(shown == pytest.approx(view) for shown in views(chromium))
@@ -113,7 +140,9 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
     opened(chromium, hour)
     over = chromium.find_elements("css selector", ".u-over")[1]
     quarter = over.size["width"] // 4
-    ActionChains(chromium).move_to_element_with_offset(over, -quarter, 0).click_and_hold().move_by_offset(quarter, 0).release().perform()
+    ActionChains(chromium).move_to_element_with_offset(
+        over, -quarter, 0
+    ).click_and_hold().move_by_offset(quarter, 0).release().perform()
     for start, stop in views(chromium):
         assert start == pytest.approx(900.0, abs=30.0)
         assert stop == pytest.approx(1800.0, abs=30.0)
@@ -123,20 +152,26 @@ def test_errors_can_be_taken_over_the_stretch_in_view(chromium, hour):
     opened(chromium, hour)
     press(chromium, "busiest 20 s")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
-    assert chromium.find_element("css selector", ".said").text.startswith("401 of 72000 samples, 20.1 s")
+    assert chromium.find_element("css selector", ".said").text.startswith(
+        "401 of 72000 samples, 20.1 s"
+    )
 
 
 def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
-    header = chromium.find_element("xpath", "//figure[@id='table-leaderboard_test']//th/button[contains(., 'interval')]")
+    header = chromium.find_element(
+        "xpath", "//figure[@id='table-leaderboard_test']//th/button[contains(., 'interval')]"
+    )
     header.click()
     header.click()
     rows = chromium.find_elements("css selector", "#table-leaderboard_test tbody tr")
     assert rows[0].text.startswith(ranked.iloc[-1]["title"])
     button = rows[0].find_element("css selector", "button.command")
     button.click()
-    assert chromium.find_element("css selector", "#table-leaderboard_test p.command code").text == button.get_attribute("data-command")
+    assert chromium.find_element(
+        "css selector", "#table-leaderboard_test p.command code"
+    ).text == button.get_attribute("data-command")
     assert button.get_attribute("data-command").startswith("vehest estimate ")
     assert rows[0].find_element("css selector", "a").get_dom_attribute("href").startswith("../../")
 
@@ -154,13 +189,17 @@ def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium, to
     chromium.find_element("id", "theme").click()
     assert paper() == grounds[other]
     image = chromium.find_element("css selector", "#figure-errors_test img")
-    assert image.value_of_css_property("color-scheme") == other  # by which an SVG image picks its colours
+    assert (
+        image.value_of_css_property("color-scheme") == other
+    )  # by which an SVG image picks its colours
     chromium.execute_script("localStorage.clear()")
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_page_is_accessible_fits_its_width_and_complains_of_nothing(chromium, hour, toy, width, scheme):
+def test_page_is_accessible_fits_its_width_and_complains_of_nothing(
+    chromium, hour, toy, width, scheme
+):
     for path in (hour, toy[0]):
         opened(chromium, path, width=width, scheme=scheme)
         assert axe_violations(chromium) == []
@@ -178,13 +217,20 @@ def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(c
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
     part = study(tmp_path / "study", tests)
     write_document(
-        documents(StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], []))["report"], tmp_path
+        documents(
+            StudyArtefacts(
+                "toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], []
+            )
+        )["report"],
+        tmp_path,
     )
     opened(chromium, tmp_path / "report.html", width=390)
     assert chromium.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     opened(chromium, tmp_path / "report.html", width=1280)
     shown = chromium.execute_script("return document.querySelector('main').innerText")
-    assert all(words in shown for words in ("Verdict", "Use KS-NN", "95 % interval", "vehest export"))
+    assert all(
+        words in shown for words in ("Verdict", "Use KS-NN", "95 % interval", "vehest export")
+    )
     assert "FVU" not in shown
     assert len(shown.split()) <= 1500
     assert chromium.execute_script(CUT) == []
@@ -192,7 +238,9 @@ def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(c
     assert all(chromium.execute_script(gaps))
     first = "return document.querySelector('figure.live').explorer.detail.label"
     assert f"Use {chromium.execute_script(first)}." in shown
-    chromium.execute_script("document.querySelectorAll('details').forEach((section) => (section.open = true))")
+    chromium.execute_script(
+        "document.querySelectorAll('details').forEach((section) => (section.open = true))"
+    )
     assert "FVU" in chromium.execute_script("return document.querySelector('main').innerText")
     assert chromium.execute_script(CUT) == []
 

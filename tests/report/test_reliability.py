@@ -9,11 +9,25 @@ from vehest.report.style import line_of
 
 def test_each_estimator_is_drawn_and_named_at_its_line_and_labels_keep_their_order_a_step_apart():
     rows = [
-        Reliability("Zero", line_of("zero"), np.array([0.4, 0.6, 0.85, 0.9]), np.array([0.3, 0.5, 0.7, 0.8]), np.full(4, 0.97)),
-        Reliability("Static map", line_of("static_map"), np.array([0.5, 0.7, 0.9, 0.95]), np.full(4, np.nan), np.full(4, np.nan)),
+        Reliability(
+            "Zero",
+            line_of("zero"),
+            np.array([0.4, 0.6, 0.85, 0.9]),
+            np.array([0.3, 0.5, 0.7, 0.8]),
+            np.full(4, 0.97),
+        ),
+        Reliability(
+            "Static map",
+            line_of("static_map"),
+            np.array([0.5, 0.7, 0.9, 0.95]),
+            np.full(4, np.nan),
+            np.full(4, np.nan),
+        ),
     ]
     [axes] = reliability_figure((0.5, 0.68, 0.9, 0.95), rows).axes
     assert [text.get_text() for text in axes.texts] == ["Zero", "Static map"]
-    assert [line.get_ydata().tolist() for line in axes.lines[1:]] == [row.coverage.tolist() for row in rows]
+    assert [line.get_ydata().tolist() for line in axes.lines[1:]] == [
+        row.coverage.tolist() for row in rows
+    ]
     placed = _apart([0.99, 0.98, 0.5, 1.0], 0.05, 1.0)
     assert placed == pytest.approx([0.95, 0.9, 0.5, 1.0])

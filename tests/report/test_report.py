@@ -22,7 +22,15 @@ from vehest.evaluation.blocks import read_segments, segments_of, write_segments
 from vehest.evaluation.metrics import UNITS, Protocol, accuracy, score
 from vehest.report.document import Column, Document, Figure, Table, formatted, write_document
 from vehest.report.figures import decimated
-from vehest.report.style import MISSING, decimals_for, fixed, line_of, lines_of, on_dark, significant
+from vehest.report.style import (
+    MISSING,
+    decimals_for,
+    fixed,
+    line_of,
+    lines_of,
+    on_dark,
+    significant,
+)
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
 from vehest.studies.drive import comparison, leaderboard
 from vehest.studies.kit.timings import timings_of_study
@@ -34,7 +42,11 @@ PROTOCOL = Protocol(rate_hz=RATE, warm_up_seconds=2.0, skip_seconds=1.5)
 # (estimator, variant, title) -> for each seed, the size of its error on the validation and on the test range
 FAMILIES = {
     ("luenberger", "luenberger", "Luenberger"): [(0.30, 0.30)],
-    ("ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"): [(0.12, 0.05), (0.08, 0.15), (0.10, 0.11)],
+    ("ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"): [
+        (0.12, 0.05),
+        (0.08, 0.15),
+        (0.10, 0.11),
+    ],
     ("gru", "states_5", "GRU | 5 <states>"): [(0.20, 0.20), (0.20, 0.22)],
     ("zero", "zero", "Zero (v = 0)"): [(1.50, 1.50)],
     ("static_map", "static_map", "Static map"): [(0.70, 0.70)],
@@ -47,14 +59,22 @@ def drive(seconds=90.0):
     yaw_rate = 0.4 * np.sin(0.5 * time)
     vx = 30.0 + 4.0 * np.sin(0.1 * time)
     vy = 0.8 * np.sin(0.5 * time + 0.3) * (1.0 + 0.5 * np.sin(0.07 * time))
-    channels = {"vx": vx, "yaw_rate": yaw_rate, "ax": 0.4 * np.cos(0.1 * time), "ay": vx * yaw_rate, "vy_ref": vy}
+    channels = {
+        "vx": vx,
+        "yaw_rate": yaw_rate,
+        "ax": 0.4 * np.cos(0.1 * time),
+        "ay": vx * yaw_rate,
+        "vy_ref": vy,
+    }
     return Recording("lap", "car", RATE, 0.0, channels, kind="simulated")
 
 
 def estimate_of(recording, span, size, phase):
     part = recording.cut(span.start - PROTOCOL.warm_up_seconds, span.stop)
     vy = part["vy_ref"] + size * np.sin(3.0 * part.time + phase)
-    return Estimate("lap", "any", RATE, part.start_time, {"vy": vy, "sideslip": np.arctan2(vy, part["vx"])})
+    return Estimate(
+        "lap", "any", RATE, part.start_time, {"vy": vy, "sideslip": np.arctan2(vy, part["vx"])}
+    )
 
 
 def study(folder, tests=None):
@@ -66,17 +86,28 @@ def study(folder, tests=None):
     for number, ((estimator, variant, title), sizes) in enumerate(FAMILIES.items()):
         for seed, (on_validation, on_test) in enumerate(sizes):
             home = folder / f"{estimator}-{seed}"
-            model = EvaluatedModel(estimator, variant, title, seed, home / "model", home / "evaluation")
+            model = EvaluatedModel(
+                estimator, variant, title, seed, home / "model", home / "evaluation"
+            )
             models.append(model)
             for test_set, spans in {"validation": split.validation, **tests}.items():
                 size = on_validation if test_set == "validation" else on_test
                 parts = []
                 for position, span in enumerate(spans):
                     estimate = estimate_of(recording, span, size, number + 0.1 * seed)
-                    write_estimate(estimate, model.evaluation_folder / test_set / f"{position}.parquet")
+                    write_estimate(
+                        estimate, model.evaluation_folder / test_set / f"{position}.parquet"
+                    )
                     parts.append(score(estimate, recording, span, PROTOCOL))
                 segments = segments_of(parts, RATE)
-                blocks = {**(read_segments(model.evaluation_folder / "blocks.csv") if test_set != "validation" else {}), test_set: segments}
+                blocks = {
+                    **(
+                        read_segments(model.evaluation_folder / "blocks.csv")
+                        if test_set != "validation"
+                        else {}
+                    ),
+                    test_set: segments,
+                }
                 write_segments(model.evaluation_folder / "blocks.csv", blocks)
                 rows += metric_rows(model, test_set, accuracy(parts))
             epochs = 10 + seed if estimator in LEARNT_IN_EPOCHS else 0
@@ -100,8 +131,24 @@ def study(folder, tests=None):
 
 
 def metric_rows(model, test_set, metrics):
-    head = ("toy", model.estimator, model.variant, "toy", "toy", "simulated", test_set, "all", "nominal", RATE, "causal", model.seed)
-    return [(*head, name, value, UNITS.get(name, "1"), math.nan, math.nan) for name, value in metrics.items()]
+    head = (
+        "toy",
+        model.estimator,
+        model.variant,
+        "toy",
+        "toy",
+        "simulated",
+        test_set,
+        "all",
+        "nominal",
+        RATE,
+        "causal",
+        model.seed,
+    )
+    return [
+        (*head, name, value, UNITS.get(name, "1"), math.nan, math.nan)
+        for name, value in metrics.items()
+    ]
 
 
 def history(epochs):
@@ -113,7 +160,9 @@ def history(epochs):
 
 def with_value(artefacts, value, **where):
     metrics = artefacts.metrics.copy()
-    hit = np.logical_and.reduce([(metrics[name] == wanted).to_numpy() for name, wanted in where.items()])
+    hit = np.logical_and.reduce(
+        [(metrics[name] == wanted).to_numpy() for name, wanted in where.items()]
+    )
     assert hit.any()
     metrics.loc[hit, "value"] = value
     return replace(artefacts, metrics=metrics)
@@ -137,15 +186,26 @@ def written(artefacts, tmp_path_factory):
     return folder
 
 
-def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test_and_the_lower_one_in_a_tie(artefacts):
+def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test_and_the_lower_one_in_a_tie(
+    artefacts,
+):
     row = row_of(leaderboard(artefacts), "ksnn")
     assert row["seed"] == 1  # lowest on validation, highest on test
-    assert row["rmse_sideslip_chosen"] == row["rmse_sideslip_max"] > row["rmse_sideslip"] > row["rmse_sideslip_min"]
+    assert (
+        row["rmse_sideslip_chosen"]
+        == row["rmse_sideslip_max"]
+        > row["rmse_sideslip"]
+        > row["rmse_sideslip_min"]
+    )
     tied = with_value(artefacts, 0.05, estimator="ksnn", test_set="validation", metric="rmse_vy")
     for own in (tied, replace(tied, models=list(reversed(tied.models)))):
         assert row_of(leaderboard(own), "ksnn")["seed"] == 0
     single = row_of(leaderboard(artefacts), "luenberger")
-    assert (math.isnan(single["epochs"]), math.isnan(single["rmse_sideslip_std"]), single["n_seeds"]) == (True, True, 1)
+    assert (
+        math.isnan(single["epochs"]),
+        math.isnan(single["rmse_sideslip_std"]),
+        single["n_seeds"],
+    ) == (True, True, 1)
 
 
 def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
@@ -154,7 +214,9 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
     scored = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9)
     vx, vy_ref = recording["vx"][scored], recording["vy_ref"][scored]
     rmse = []
-    for seed, (_, size) in enumerate(FAMILIES["ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"]):
+    for seed, (_, size) in enumerate(
+        FAMILIES["ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"]
+    ):
         vy = vy_ref + size * np.sin(3.0 * time[scored] + 1 + 0.1 * seed)
         error = np.degrees(np.arctan(vy / vx) - np.arctan(vy_ref / vx))
         rmse.append(math.sqrt(sum(error**2) / len(error)))
@@ -164,9 +226,13 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
     assert row["rmse_sideslip_chosen"] == pytest.approx(rmse[1], rel=1e-12)
     assert row["rmse_sideslip"] == pytest.approx(math.sqrt(np.mean(np.square(rmse))), rel=1e-9)
     assert row["rmse_sideslip_median"] == pytest.approx(sorted(rmse)[1], rel=1e-12)
-    assert (row["rmse_sideslip_min"], row["rmse_sideslip_max"]) == pytest.approx((min(rmse), max(rmse)), rel=1e-12)
+    assert (row["rmse_sideslip_min"], row["rmse_sideslip_max"]) == pytest.approx(
+        (min(rmse), max(rmse)), rel=1e-12
+    )
     mean = sum(rmse) / 3
-    assert row["rmse_sideslip_std"] == pytest.approx(math.sqrt(sum((value - mean) ** 2 for value in rmse) / 2), rel=1e-9)
+    assert row["rmse_sideslip_std"] == pytest.approx(
+        math.sqrt(sum((value - mean) ** 2 for value in rmse) / 2), rel=1e-9
+    )
     assert row["rmse_vy"] == pytest.approx(math.sqrt(np.mean((chosen_vy - vy_ref) ** 2)), rel=1e-12)
     assert row["fvu"] == pytest.approx(np.var(chosen_vy - vy_ref) / np.var(vy_ref), rel=1e-9)
     assert row["max_error_sideslip"] == pytest.approx(max(abs(chosen_error)), rel=1e-12)
@@ -175,7 +241,10 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
 
 
 def test_leaderboard_is_sorted_by_the_sideslip_error_over_all_seeds_within_each_test_set(tmp_path):
-    spans = {"late": (Span("toy", "lap", 60.0, 85.0),), "early": (Span("toy", "lap", 60.0, 66.0), Span("toy", "lap", 70.0, 80.0))}
+    spans = {
+        "late": (Span("toy", "lap", 60.0, 85.0),),
+        "early": (Span("toy", "lap", 60.0, 66.0), Span("toy", "lap", 70.0, 80.0)),
+    }
     artefacts = study(tmp_path, spans)
     board = leaderboard(artefacts)
     assert board["test_set"].tolist() == ["late"] * 5 + ["early"] * 5
@@ -183,15 +252,27 @@ def test_leaderboard_is_sorted_by_the_sideslip_error_over_all_seeds_within_each_
         assert part["rmse_sideslip"].is_monotonic_increasing
     document = comparison(artefacts)
     names = [block.name for block in document.blocks if not isinstance(block, str)]
-    assert {"leaderboard_late", "leaderboard_early", "traces_late", "traces_early", "zoom_early"} <= set(names)
+    assert {
+        "leaderboard_late",
+        "leaderboard_early",
+        "traces_late",
+        "traces_early",
+        "zoom_early",
+    } <= set(names)
 
 
-def test_narrower_subsets_and_other_conditions_do_not_enter_nor_does_a_way_through_csv(artefacts, tmp_path):
+def test_narrower_subsets_and_other_conditions_do_not_enter_nor_does_a_way_through_csv(
+    artefacts, tmp_path
+):
     other = artefacts.metrics.assign(value=99.0)
-    metrics = pd.concat([artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")])
+    metrics = pd.concat(
+        [artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")]
+    )
     artefacts.metrics.to_csv(tmp_path / "metrics.csv", index=False)
     for own in (metrics, pd.read_csv(tmp_path / "metrics.csv")):
-        pd.testing.assert_frame_equal(leaderboard(replace(artefacts, metrics=own)), leaderboard(artefacts))
+        pd.testing.assert_frame_equal(
+            leaderboard(replace(artefacts, metrics=own)), leaderboard(artefacts)
+        )
 
 
 def test_diverged_estimator_comes_last_and_shows_dashes(artefacts):
@@ -200,20 +281,38 @@ def test_diverged_estimator_comes_last_and_shows_dashes(artefacts):
     board = leaderboard(artefacts)
     assert board["estimator"].tolist()[-1] == "gru"
     document = comparison(artefacts)
-    table = next(block for block in document.blocks if isinstance(block, Table) and block.name == "leaderboard_test")
+    table = next(
+        block
+        for block in document.blocks
+        if isinstance(block, Table) and block.name == "leaderboard_test"
+    )
     headers, rows, _ = formatted(table)
     cells = dict(zip(headers, rows[-1], strict=True))
     assert cells["estimator"].startswith("GRU")
-    assert {cells[name] for name in headers if name.startswith(("RMSE", "FVU", "chosen", "median", "p99", "peak", "s.d."))} == {MISSING}
-    assert any("No finite error" in block and "GRU" in block for block in document.blocks if isinstance(block, str))
+    assert {
+        cells[name]
+        for name in headers
+        if name.startswith(("RMSE", "FVU", "chosen", "median", "p99", "peak", "s.d."))
+    } == {MISSING}
+    assert any(
+        "No finite error" in block and "GRU" in block
+        for block in document.blocks
+        if isinstance(block, str)
+    )
 
 
 def test_two_values_for_one_run_and_several_seeds_without_validation_metrics_are_refused(artefacts):
-    twin = with_value(artefacts, 7.0, estimator="gru", seed=1, test_set="test", metric="rmse_vy").metrics
+    twin = with_value(
+        artefacts, 7.0, estimator="gru", seed=1, test_set="test", metric="rmse_vy"
+    ).metrics
     with pytest.raises(DataError, match=r"rmse_vy of gru/states_5, seed 1, on 'test' is both"):
         leaderboard(replace(artefacts, metrics=pd.concat([artefacts.metrics, twin])))
     with pytest.raises(DataError, match="no metrics on the validation range"):
-        leaderboard(replace(artefacts, metrics=artefacts.metrics[artefacts.metrics["test_set"] != "validation"]))
+        leaderboard(
+            replace(
+                artefacts, metrics=artefacts.metrics[artefacts.metrics["test_set"] != "validation"]
+            )
+        )
 
 
 def with_rows(artefacts, metrics, subset="all"):
@@ -223,28 +322,47 @@ def with_rows(artefacts, metrics, subset="all"):
 
 
 def table_of(artefacts, name):
-    return next((block for block in comparison(artefacts).blocks if isinstance(block, Table) and block.name == name), None)
+    return next(
+        (
+            block
+            for block in comparison(artefacts).blocks
+            if isinstance(block, Table) and block.name == name
+        ),
+        None,
+    )
 
 
 def test_bound_stands_beside_the_errors_and_floors_are_tabled_from_the_spread_down(artefacts):
     def bounds(of):
         headers, rows, _ = formatted(table_of(of, "leaderboard_test"))
-        return [row[headers.index("bound [deg]")] for row in rows] if "bound [deg]" in headers else []
+        return (
+            [row[headers.index("bound [deg]")] for row in rows] if "bound [deg]" in headers else []
+        )
 
-    assert (bounds(artefacts), bounds(with_rows(artefacts, {"floor_cramer_rao": 0.125}))) == ([], ["0.125"] * 5)
+    assert (bounds(artefacts), bounds(with_rows(artefacts, {"floor_cramer_rao": 0.125}))) == (
+        [],
+        ["0.125"] * 5,
+    )
     frame = table_of(artefacts, "floors_test").frame
-    assert frame["what"].tolist()[:2] == ["v = 0: the reference itself", "noise of the reference, at least"]
+    assert frame["what"].tolist()[:2] == [
+        "v = 0: the reference itself",
+        "noise of the reference, at least",
+    ]
     scored = drive().cut(61.5, 85.0)
     assert frame["vy"].iloc[0] == pytest.approx(np.sqrt(np.mean(scored["vy_ref"] ** 2)))
     assert (frame["vy"].iloc[1:] < frame["vy"].iloc[0]).all()
     assert "u, ω, a_y, a_x" in frame["inputs"].tolist()
-    assert not any("δ" in inputs for inputs in frame["inputs"]), "there is no steering angle in this drive"
+    assert not any("δ" in inputs for inputs in frame["inputs"]), (
+        "there is no steering angle in this drive"
+    )
 
 
 def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts):
     assert table_of(artefacts, "regimes_test") is None
     known = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
-    known = with_value(known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip")
+    known = with_value(
+        known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip"
+    )
     headers, rows, _ = formatted(table_of(known, "regimes_test"))
     assert headers == ["estimator", "turning (38 %)"]
     assert {row[0]: row[1] for row in rows}["KS-NN linear + bias, P = 2"] == "0.500"
@@ -256,18 +374,30 @@ def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
     def warned(**floors):
         return " ".join(warnings_of(with_rows(artefacts, floors)))
 
-    assert not any(words in warned(floor_cramer_rao=0.1, floor_reference=0.01) for words in ("silent", "close to the noise"))
+    assert not any(
+        words in warned(floor_cramer_rao=0.1, floor_reference=0.01)
+        for words in ("silent", "close to the noise")
+    )
     assert "silent" not in warned(floor_cramer_rao=1.2)
     blind = with_value(with_rows(artefacts, {"floor_cramer_rao": 1.2}), 1.5, metric="rmse_sideslip")
-    assert "`test` is a silent drive: what the estimators read tells sideslip to no better than 1.2°" in " ".join(warnings_of(blind))
+    assert (
+        "`test` is a silent drive: what the estimators read tells sideslip to no better than 1.2°"
+        in " ".join(warnings_of(blind))
+    )
     assert "is close to the noise of the reference, at least 0.05°" in warned(floor_reference=0.05)
 
 
-def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(artefacts, tmp_path):
+def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(
+    artefacts, tmp_path
+):
     whole = drive()
-    write_recording(whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet")
+    write_recording(
+        whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet"
+    )
     without = replace(artefacts, references={("toy", "lap"): tmp_path / "lap.parquet"})
-    assert warnings_of(without) == [line for line in warnings_of(artefacts) if "lateral acceleration" not in line]
+    assert warnings_of(without) == [
+        line for line in warnings_of(artefacts) if "lateral acceleration" not in line
+    ]
     names = [block.name for block in comparison(without).blocks if isinstance(block, Figure)]
     assert "zoom_test" in names
     assert "errors_over_ay_test" not in names
@@ -284,15 +414,31 @@ def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts):
     assert best["estimator"] == "ksnn"
     assert f"**{best['title']}** has the lowest sideslip error" in text
     assert "below every other candidate, v = 0 and the static map, each by more than chance" in text
-    assert "5 estimators with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 epochs a network" in text
-    twin = [replace(model, variant="twin", title="Twin") for model in artefacts.models if model.estimator == "ksnn"]
+    assert (
+        "5 estimators with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 epochs a network"
+        in text
+    )
+    twin = [
+        replace(model, variant="twin", title="Twin")
+        for model in artefacts.models
+        if model.estimator == "ksnn"
+    ]
     rows = artefacts.metrics[artefacts.metrics["estimator"] == "ksnn"].assign(variant="twin")
-    twins = replace(artefacts, models=[*artefacts.models, *twin], metrics=pd.concat([artefacts.metrics, rows]))
-    alone = replace(artefacts, models=[model for model in artefacts.models if model.estimator not in ("zero", "static_map")])
+    twins = replace(
+        artefacts, models=[*artefacts.models, *twin], metrics=pd.concat([artefacts.metrics, rows])
+    )
+    alone = replace(
+        artefacts,
+        models=[
+            model for model in artefacts.models if model.estimator not in ("zero", "static_map")
+        ],
+    )
     apart = "was not compared with v = 0 and which was not compared with the static map"
     for own, why in ((twins, "which is not told apart from Twin"), (alone, apart)):
         assert all(words in words_of(own) for words in ("**no estimator can be called best**", why))
-    without = replace(artefacts, models=[model for model in artefacts.models if model.estimator != "ksnn"])
+    without = replace(
+        artefacts, models=[model for model in artefacts.models if model.estimator != "ksnn"]
+    )
     assert ["PCT/IT2023/050058" in words_of(own) for own in (artefacts, without)] == [True, False]
 
 
@@ -306,18 +452,29 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
         assert row["rmse_sideslip_low"] < row["rmse_sideslip_median"] < row["rmse_sideslip_high"]
 
 
-def test_report_says_how_it_was_made_and_on_its_first_page_whether_data_are_real(artefacts, written):
+def test_report_says_how_it_was_made_and_on_its_first_page_whether_data_are_real(
+    artefacts, written
+):
     for kind, words in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         bars, traces, _, headline = comparison(replace(artefacts, kinds={"toy": kind})).blocks[:4]
         assert f"on test set `test` ({kind}; " in bars.caption
         assert (traces.name, headline.startswith(words)) == ("traces_test", True)
     text = (written / "report.md").read_text(encoding="utf-8")
-    for words in ("`vehest run pipelines/toy.yaml`", "at 20 Hz", "up to 2 s before", "the first 1.5 s", "Training: by hand.", "60 to 85 s"):
+    for words in (
+        "`vehest run pipelines/toy.yaml`",
+        "at 20 Hz",
+        "up to 2 s before",
+        "the first 1.5 s",
+        "Training: by hand.",
+        "60 to 85 s",
+    ):
         assert words in text
 
 
 def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artefacts):
-    assert not any(words in words_of(artefacts) for words in ("hardly excites sideslip", "limit of"))
+    assert not any(
+        words in words_of(artefacts) for words in ("hardly excites sideslip", "limit of")
+    )
     short = [replace(model, training={"max_epochs": 11}) for model in artefacts.models]
     assert (
         "Training ended at its limit, and longer training may lower the error: KS-NN linear + bias, P = 2 (11 epochs, 2 of 3 seeds)"
@@ -325,19 +482,33 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
 
 
-def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_figures_name_no_date(written):
+def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_figures_name_no_date(
+    written,
+):
     text = (written / "report.md").read_text(encoding="utf-8")
     targets = re.findall(r"\]\(([^)]+)\)", text)
     assert len(targets) == 5 + 2 * 5
     assert all((written / target).stat().st_size > 0 for target in targets)
-    assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {*targets, "report.md", "report.html"}
+    assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {
+        *targets,
+        "report.md",
+        "report.html",
+    }
     lines = text.splitlines()
     tables = [len(re.findall(r"(?<!\\)\|", line)) for line in lines if line.startswith("| ")]
-    assert set(tables) == {4, 6, 7, 12}  # one bar more than columns, in a cell "\|" stands for a bar
+    assert set(tables) == {
+        4,
+        6,
+        7,
+        12,
+    }  # one bar more than columns, in a cell "\|" stands for a bar
     assert any(r"GRU \| 5 &lt;states>" in line for line in lines)
     for path in (written / "figures").iterdir():
         content = path.read_bytes()
-        assert not any(word in content for word in (b"Software", b"Matplotlib v", b"dc:date", b"tIME", b"tEXt", b"dc:creator")), path
+        assert not any(
+            word in content
+            for word in (b"Software", b"Matplotlib v", b"dc:date", b"tIME", b"tEXt", b"dc:creator")
+        ), path
 
 
 def test_csv_tables_read_back_with_every_digit(artefacts, written):
@@ -363,22 +534,42 @@ write_document(comparison(study(made)), report)
 """
 
 
-def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(artefacts, written, tmp_path):
+def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
+    artefacts, written, tmp_path
+):
     places = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # that of this process is drawn
-    made, report = tmp_path / artefacts.references["toy", "lap"].parent.name, tmp_path / written.name
-    subprocess.run([sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places], env=environment, check=True)
+    made, report = (
+        tmp_path / artefacts.references["toy", "lap"].parent.name,
+        tmp_path / written.name,
+    )
+    subprocess.run(
+        [sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places],
+        env=environment,
+        check=True,
+    )
     files = [path.relative_to(written) for path in written.rglob("*.*")]
-    assert (len(files), sum(file.suffix in (".png", ".svg") for file in files)) == (2 + 5 + 2 * 5, 2 * 5)
+    assert (len(files), sum(file.suffix in (".png", ".svg") for file in files)) == (
+        2 + 5 + 2 * 5,
+        2 * 5,
+    )
     for file in files:
         assert (report / file).read_bytes() == (written / file).read_bytes(), file
 
 
 def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path):
     frame = pd.DataFrame({"train_seconds": [1.5]})
-    document = Document("Words", ["Only words.", Table("first", "First.", pd.DataFrame({"a": [1]}))])
-    write_document(document, tmp_path, on_page=["## Times", Table("timings", "What it took.", frame)])
-    assert {path.name for path in tmp_path.rglob("*.*")} == {"report.md", "report.html", "first.csv"}
+    document = Document(
+        "Words", ["Only words.", Table("first", "First.", pd.DataFrame({"a": [1]}))]
+    )
+    write_document(
+        document, tmp_path, on_page=["## Times", Table("timings", "What it took.", frame)]
+    )
+    assert {path.name for path in tmp_path.rglob("*.*")} == {
+        "report.md",
+        "report.html",
+        "first.csv",
+    }
     assert "took" not in (tmp_path / "report.md").read_text(encoding="utf-8")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert Page(page).rows[-2:] == [["train_seconds"], ["1.50"]]
@@ -393,14 +584,29 @@ def test_times_are_medians_over_seeds_by_part_and_estimator():
         for part, slower in (("there", 1.0), ("back", 2.0))
         for seed in (0, 1, 2)
         for test in ("one", "two")
-        for metric, value in (("train_seconds", slower * (10.0 + seed**2)), ("step_seconds", 2e-4), ("search_seconds", 3.0 + seed))
+        for metric, value in (
+            ("train_seconds", slower * (10.0 + seed**2)),
+            ("step_seconds", 2e-4),
+            ("search_seconds", 3.0 + seed),
+        )
     ]
-    table = pd.DataFrame(rows, columns=["part", "estimator", "variant", "seed", "test_set", "metric", "value"])
+    table = pd.DataFrame(
+        rows, columns=["part", "estimator", "variant", "seed", "test_set", "metric", "value"]
+    )
     titles = {("gru", "states_5"): "GRU", ("zero", "zero"): "Zero"}
-    heading, shown = timings_of_study([(part, own, titles) for part, own in table.groupby("part", sort=False)])
+    heading, shown = timings_of_study(
+        [(part, own, titles) for part, own in table.groupby("part", sort=False)]
+    )
     headers, cells, _ = formatted(shown)
-    assert (heading, headers[:2], headers[-1]) == ("## Times", ["part", "estimator"], "of a training: search [s]")
-    assert cells == [["there", "GRU", "3", "11", "35", "0.20", "4.0"], ["back", "GRU", "3", "22", "70", "0.20", "4.0"]]
+    assert (heading, headers[:2], headers[-1]) == (
+        "## Times",
+        ["part", "estimator"],
+        "of a training: search [s]",
+    )
+    assert cells == [
+        ["there", "GRU", "3", "11", "35", "0.20", "4.0"],
+        ["back", "GRU", "3", "22", "70", "0.20", "4.0"],
+    ]
     assert timings_of_study([("", table[:0], titles)]) == []
 
 
@@ -418,7 +624,11 @@ class Page(HTMLParser):
         values = {name: value or "" for name, value in attrs}
         self.tags.append(tag)
         self.attributes += attrs
-        self.loads += [(tag, values[name]) for name in ("src", "href", "srcset", "data", "poster", "action") if name in values]
+        self.loads += [
+            (tag, values[name])
+            for name in ("src", "href", "srcset", "data", "poster", "action")
+            if name in values
+        ]
         if values.get("http-equiv") == "Content-Security-Policy":
             self.policy = values["content"]
         if tag == "tr":
@@ -442,7 +652,9 @@ def test_page_loads_nothing_from_anywhere(written):
     assert page.loads, "figures are embedded"
     models = {target for tag, target in page.loads if tag == "a" and not target.startswith("data:")}
     assert len(models) == len(FAMILIES)
-    assert all(target.startswith("../../") and target.endswith("/model/") for target in models)  # as the folders of this test are called
+    assert all(
+        target.startswith("../../") and target.endswith("/model/") for target in models
+    )  # as the folders of this test are called
     assert all(target.startswith("data:") for _, target in page.loads if target not in models)
     assert not {"link", "iframe", "object", "embed", "base"} & set(page.tags)
     assert page.policy.startswith("default-src 'none'")
@@ -459,23 +671,31 @@ def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefa
     assert len(rows) == 3  # bars, standing, with links to the model, and seeds
     assert all(fixed(best["rmse_sideslip"], 3) in row for row in rows[:2])
     assert any(row[0].splitlines()[0] == "GRU | 5 <states>" for row in page.rows)
-    images = [base64.b64decode(target.split(",", 1)[1]) for tag, target in page.loads if tag == "img"]
+    images = [
+        base64.b64decode(target.split(",", 1)[1]) for tag, target in page.loads if tag == "img"
+    ]
     assert len(images) == 5
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
 
 
-def test_paths_of_figures_are_given_to_a_hundredth_of_a_point_and_pages_are_small_or_left_out(tmp_path):
+def test_paths_of_figures_are_given_to_a_hundredth_of_a_point_and_pages_are_small_or_left_out(
+    tmp_path,
+):
     static = MatplotlibFigure()
     static.add_subplot().plot(np.sin(np.arange(200.0)))
     document = Document("One", ["Only words.", Figure("line", "A line.", static)])
     write_document(document, tmp_path, page=False)
-    paths = re.findall(r'\bd="([^"]*)"', (tmp_path / "figures" / "line.svg").read_text(encoding="utf-8"))
+    paths = re.findall(
+        r'\bd="([^"]*)"', (tmp_path / "figures" / "line.svg").read_text(encoding="utf-8")
+    )
     assert max(len(path) for path in paths) > 1000
     assert not any(re.search(r"\.\d{3}", path) for path in paths)
     assert not (tmp_path / "report.html").exists()
     assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# One\n\nOnly words.\n")
     write_document(document, tmp_path)
-    assert (tmp_path / "report.html").stat().st_size < 60_000, "without interactive figures the library is left out"
+    assert (tmp_path / "report.html").stat().st_size < 60_000, (
+        "without interactive figures the library is left out"
+    )
 
 
 @pytest.mark.parametrize("names", [["a", "a"], ["a/b"], [".."], ["A"]])
@@ -485,31 +705,52 @@ def test_document_refuses_names_that_cannot_name_its_files(names):
 
 
 def test_table_columns_line_up_with_the_digits_asked_for_and_dashes_for_missing_values():
-    frame = pd.DataFrame({"error": [0.31234, 0.78, math.nan], "count": [12, 345678, 9], "name": ["a", None, "c"]})
+    frame = pd.DataFrame(
+        {"error": [0.31234, 0.78, math.nan], "count": [12, 345678, 9], "name": ["a", None, "c"]}
+    )
     _, rows, numeric = formatted(Table("t", "", frame, {name: Column(name) for name in frame}))
     assert numeric == [True, True, False]
-    assert rows == [["0.312", "12", "a"], ["0.780", "345\N{NARROW NO-BREAK SPACE}678", MISSING], [MISSING, "9", "c"]]
-    assert [significant(value) for value in (0.43512, 12.3456, 0.0, math.nan, -0.0261)] == ["0.435", "12.3", "0", MISSING, "−0.0261"]
+    assert rows == [
+        ["0.312", "12", "a"],
+        ["0.780", "345\N{NARROW NO-BREAK SPACE}678", MISSING],
+        [MISSING, "9", "c"],
+    ]
+    assert [significant(value) for value in (0.43512, 12.3456, 0.0, math.nan, -0.0261)] == [
+        "0.435",
+        "12.3",
+        "0",
+        MISSING,
+        "−0.0261",
+    ]
     assert (decimals_for([0.31, 0.44, 12.0]), decimals_for([math.nan])) == (3, 0)
 
 
 def test_each_family_has_one_hue_each_estimator_a_line_and_colours_stand_out_on_dark_and_light_pages():
     assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
     assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
-    names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [("luenberger", ""), ("new", "x")]
+    names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [
+        ("luenberger", ""),
+        ("new", "x"),
+    ]
     lines = lines_of(names)
     assert len(set(lines.values())) == len(names)
 
     def luminance(colour):
         parts = [int(colour[start : start + 2], 16) / 255 for start in (1, 3, 5)]
-        linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+        linear = [
+            part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+        ]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
     def contrast(one, other):
         high, low = sorted((luminance(one), luminance(other)), reverse=True)
         return (high + 0.05) / (low + 0.05)
 
-    ksnn = [("ksnn", f"{kind}_{bias}_p2") for kind in ("linear", "nonlinear") for bias in ("bias", "no_bias")]
+    ksnn = [
+        ("ksnn", f"{kind}_{bias}_p2")
+        for kind in ("linear", "nonlinear")
+        for bias in ("bias", "no_bias")
+    ]
     for name in [("luenberger", ""), ("gru", ""), ("lstm", ""), ("heavy_ekf", ""), *ksnn]:
         assert contrast(line_of(*name).colour, "#ffffff") > 2.0, name
         assert contrast(on_dark(line_of(*name).colour), on_dark("#ffffff")) > 3.0, name

@@ -27,32 +27,53 @@ HOSTILE = (
 
 
 def _document(name):
-    table = Table("names", f"Of {name}.", pd.DataFrame({"n": [name], "x": [1.0]}), {"n": Column(name), "x": Column("x")})
-    return Document(name, [f"The data are {name}.", f"Recording {as_text(name)}, {as_code(name)}.", table])
+    table = Table(
+        "names",
+        f"Of {name}.",
+        pd.DataFrame({"n": [name], "x": [1.0]}),
+        {"n": Column(name), "x": Column("x")},
+    )
+    return Document(
+        name, [f"The data are {name}.", f"Recording {as_text(name)}, {as_code(name)}.", table]
+    )
 
 
 def _rendered(folder):
     """The Markdown file as a lenient viewer shows it, and the page."""
     lenient = MarkdownIt("commonmark", {"html": True}).enable("table")
     lenient.validateLink = lambda url: True
-    return lenient.render((folder / "report.md").read_text(encoding="utf-8")), (folder / "report.html").read_text(encoding="utf-8")
+    return lenient.render((folder / "report.md").read_text(encoding="utf-8")), (
+        folder / "report.html"
+    ).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_name_ends_as_text_in_both_forms_of_a_report_and_reads_as_it_is_written(tmp_path, name):
+def test_a_hostile_name_ends_as_text_in_both_forms_of_a_report_and_reads_as_it_is_written(
+    tmp_path, name
+):
     (tmp_path / "plain").mkdir()
     (tmp_path / "hostile").mkdir()
     write_document(_document("plain"), tmp_path / "plain")
     write_document(_document(name), tmp_path / "hostile")
-    for calm, shown in zip(_rendered(tmp_path / "plain"), _rendered(tmp_path / "hostile"), strict=True):
+    for calm, shown in zip(
+        _rendered(tmp_path / "plain"), _rendered(tmp_path / "hostile"), strict=True
+    ):
         expected, seen = Page(calm), Page(shown)
         assert seen.tags.count("script") == expected.tags.count("script")
         assert seen.tags.count("img") == expected.tags.count("img") == 0
         assert seen.tags.count("td") == expected.tags.count("td"), "a cell stays one cell"
         assert not any(key.startswith("on") for key, _ in seen.attributes)
-        assert not any(key in ("href", "src") and re.match(r"\s*javascript:", value or "", re.I) for key, value in seen.attributes)
+        assert not any(
+            key in ("href", "src") and re.match(r"\s*javascript:", value or "", re.I)
+            for key, value in seen.attributes
+        )
     lenient = MarkdownIt("commonmark", {"html": True})
-    line = " ".join(name.split()).replace("\u202e", r"\u202e").replace("\x1b", r"\x1b").replace("\x9b", r"\x9b")
+    line = (
+        " ".join(name.split())
+        .replace("\u202e", r"\u202e")
+        .replace("\x1b", r"\x1b")
+        .replace("\x9b", r"\x9b")
+    )
     for form in (as_text, as_code):
         seen = Page(lenient.render(f"Name: {form(name)}"))
         assert seen.text.strip() == f"Name: {line}"
@@ -64,4 +85,6 @@ def test_honest_markdown_stays_as_it_is(tmp_path):
     write_document(Document("Honest", [text]), tmp_path)
     assert text in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert as_text("KS-NN (Revs) sim_quickstart, 20 Hz") == "KS-NN (Revs) sim_quickstart, 20 Hz"
-    assert as_code("vehest run pipelines/quickstart.yaml") == "`vehest run pipelines/quickstart.yaml`"
+    assert (
+        as_code("vehest run pipelines/quickstart.yaml") == "`vehest run pipelines/quickstart.yaml`"
+    )

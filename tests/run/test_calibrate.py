@@ -17,18 +17,30 @@ from vehest.run.calibrate import STAGE, calibration_of, trust_of
 from vehest.trust.bands import LEVELS
 from vehest.trust.record import About, Trust, write_trust
 
-TRAIN = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+TRAIN = (
+    "estimator=luenberger",
+    "split=mine",
+    "training.grid=1",
+    "training.max_evaluations=5",
+    "tracking=none",
+)
 
 
 def metrics_of(folder):
     """(test set, subset, metric) -> row."""
     table = pd.read_csv(folder / "metrics.csv")
-    return table[table["condition"] == "nominal"].set_index(["test_set", "subset", "metric"]).to_dict("index")
+    return (
+        table[table["condition"] == "nominal"]
+        .set_index(["test_set", "subset", "metric"])
+        .to_dict("index")
+    )
 
 
 def without_validation(place):
     tests = {"test": [{"recording": "three"}]}
-    place.change("conf/split/blind.yaml", name="blind", dataset="mine", train=[], validation=[], tests=tests)
+    place.change(
+        "conf/split/blind.yaml", name="blind", dataset="mine", train=[], validation=[], tests=tests
+    )
 
 
 @pytest.fixture
@@ -36,7 +48,11 @@ def evaluated(place):
     """A place, a model and its evaluation."""
     out, err = place.once("train", *TRAIN, "--json")
     assert "calibrate  luenberger-luenberger-seed0-trust bands by" in err
-    return place, Path(json.loads(out)["model"]), Path(json.loads(place.once("eval", *TRAIN, "--json")[0])["folder"])
+    return (
+        place,
+        Path(json.loads(out)["model"]),
+        Path(json.loads(place.once("eval", *TRAIN, "--json")[0])["folder"]),
+    )
 
 
 def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
@@ -56,8 +72,19 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
     lap, out = place.folder / "lap.csv", tmp_path / "estimate.csv"
     drive = planar_drive(20.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv(lap, index=False)
-    for name, folder in (("here", place.folder / model), ("away", shutil.copytree(place.folder / model, tmp_path / "away"))):
-        said, _ = place.done("estimate", str(folder), str(lap), "-o", str(out), f"output={tmp_path / 'other'}", "--json")
+    for name, folder in (
+        ("here", place.folder / model),
+        ("away", shutil.copytree(place.folder / model, tmp_path / "away")),
+    ):
+        said, _ = place.done(
+            "estimate",
+            str(folder),
+            str(lap),
+            "-o",
+            str(out),
+            f"output={tmp_path / 'other'}",
+            "--json",
+        )
         with open(out, encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
         found = any(row.get("band_sideslip") for row in rows)
@@ -65,7 +92,9 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
         assert ("this model has no calibration" in json.loads(said)["verdict"]) != found
 
 
-def test_estimates_hold_the_bands_of_the_calibration_twice_as_wide_where_the_test_is_said_to_be_elsewhere(evaluated):
+def test_estimates_hold_the_bands_of_the_calibration_twice_as_wide_where_the_test_is_said_to_be_elsewhere(
+    evaluated,
+):
     place, model, evaluation = evaluated
     estimate = read_estimate(evaluation / "test" / "0.parquet")
     assert np.array_equal(np.isfinite(estimate["band_vy"]), np.isfinite(estimate["vy"]))
@@ -75,7 +104,10 @@ def test_estimates_hold_the_bands_of_the_calibration_twice_as_wide_where_the_tes
     assert estimate["band_sideslip"].max() <= math.pi
     place, _, evaluation = evaluated
     out = place("eval", *TRAIN, "evaluation.elsewhere='other, test'", "--json")[1]
-    here, there = (read_estimate(folder / "test" / "0.parquet") for folder in (evaluation, Path(json.loads(out)["folder"])))
+    here, there = (
+        read_estimate(folder / "test" / "0.parquet")
+        for folder in (evaluation, Path(json.loads(out)["folder"]))
+    )
     np.testing.assert_allclose(there["band_vy"], 2.0 * here["band_vy"])
 
 
@@ -87,14 +119,18 @@ def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleratio
             assert 0.0 <= row["low"] <= row["value"] <= row["high"] <= 1.0
     shares = [rows["test", "all", f"coverage_{level}"]["value"] for level in (50, 68, 90, 95)]
     assert shares == sorted(shares)
-    assert rows["test", "all", "interval_score"]["value"] >= rows["test", "all", "width_90"]["value"]
+    assert (
+        rows["test", "all", "interval_score"]["value"] >= rows["test", "all", "width_90"]["value"]
+    )
     assert ("test", "ay_2_4", "coverage_90") in rows
     assert ("validation", "all", "coverage_90") in rows
 
 
 def test_a_run_calibrates_each_model_once_and_shows_it(place):
     _, err = place.once("run", "small", "tracking=none")
-    assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == ["done"] * 4
+    assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == [
+        "done"
+    ] * 4
     [report] = (place.folder / "outputs" / "report").iterdir()
     assert (report / "tables" / "bands_test.csv").is_file()
     assert "reliability_test" in (report / "report.md").read_text()
@@ -102,14 +138,21 @@ def test_a_run_calibrates_each_model_once_and_shows_it(place):
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE} == {"skipped"}
 
 
-def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_folder_comes_first(evaluated, tmp_path):
+def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_folder_comes_first(
+    evaluated, tmp_path
+):
     place, model, evaluation = evaluated
     found = calibration_of(model, place.folder / "outputs")
     (found.folder / "trust.yaml").unlink()
     before = (model / "manifest.json").stat().st_mtime_ns
     outcome = place.told("eval", *TRAIN)
-    assert outcome | {"skipped": True} == outcome, "the same calibration leaves the evaluation up to date"
-    assert (Path(outcome["folder"]), (model / "manifest.json").stat().st_mtime_ns) == (evaluation, before)
+    assert outcome | {"skipped": True} == outcome, (
+        "the same calibration leaves the evaluation up to date"
+    )
+    assert (Path(outcome["folder"]), (model / "manifest.json").stat().st_mtime_ns) == (
+        evaluation,
+        before,
+    )
     place, model, _ = evaluated
     write_trust(Trust(About("luenberger", note="mine")), model)
     assert trust_of(model, place.folder / "outputs").about.note == "mine"
@@ -119,8 +162,13 @@ def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_fo
 def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_along(evaluated):
     place, model, _ = evaluated
     without_validation(place)
-    folder = Path(place.told("eval", "--model", str(model), "split=blind", "tracking=none")["folder"])
-    assert read_artefact(folder).inputs["calibration"] == calibration_of(model, place.folder / "outputs").digest
+    folder = Path(
+        place.told("eval", "--model", str(model), "split=blind", "tracking=none")["folder"]
+    )
+    assert (
+        read_artefact(folder).inputs["calibration"]
+        == calibration_of(model, place.folder / "outputs").digest
+    )
 
 
 def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place):
@@ -128,15 +176,24 @@ def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place)
     zero = ("estimator=zero", "split=blind", "tracking=none")
     assert place("train", *zero)[0] == 0
     out, err = place.done("eval", *zero, "--json")
-    assert "note    calibrate  zero-zero-seed0 has no calibration, so its estimates have no bands" in err
+    assert (
+        "note    calibrate  zero-zero-seed0 has no calibration, so its estimates have no bands"
+        in err
+    )
     folder = Path(json.loads(out)["folder"])
     assert ("test", "all", "coverage_90") not in metrics_of(folder)
     assert "band_vy" not in read_estimate(folder / "test" / "0.parquet").channels
     assert not (place.folder / "outputs" / STAGE).exists()
 
 
-def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_have_seen_the_test(place):
-    place.change("conf/split/mine.yaml", validation=[{"recording": "three"}], tests={"test": [{"recording": "two"}]})
+def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_have_seen_the_test(
+    place,
+):
+    place.change(
+        "conf/split/mine.yaml",
+        validation=[{"recording": "three"}],
+        tests={"test": [{"recording": "two"}]},
+    )
     without_validation(place)
     model = place.told("train", "estimator=zero", "split=mine", "tracking=none")["model"]
     assert calibration_of(Path(model), place.folder / "outputs") is not None

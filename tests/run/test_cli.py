@@ -28,7 +28,11 @@ from vehest.trust.health import reason_in_words
 
 
 def _statuses(err):
-    return [tuple(line.split()[:2]) for line in err.splitlines() if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")]
+    return [
+        tuple(line.split()[:2])
+        for line in err.splitlines()
+        if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")
+    ]
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
@@ -38,7 +42,11 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     made = place.files()
 
     again, err = place.done("run", "small", "tracking=none")
-    assert ({status for status, _ in _statuses(err)}, again, place.files()) == ({"skipped"}, out, made)
+    assert ({status for status, _ in _statuses(err)}, again, place.files()) == (
+        {"skipped"},
+        out,
+        made,
+    )
 
     (place.folder / "README.md").write_text("changed")
     place.change("conf/dataset/mine.yaml", citation="somebody else", licence="another")
@@ -60,31 +68,64 @@ def test_two_processes_give_the_same_numbers_as_one_and_a_dry_run_makes_nothing(
     place.done("run", "small", "--jobs", "2", "tracking=none", "output=two")
     for model in (place.folder / "one" / "train").iterdir():
         other = place.folder / "two" / "train" / model.name
-        assert (model / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
+        assert (model / "model.safetensors").read_bytes() == (
+            other / "model.safetensors"
+        ).read_bytes()
 
 
 def test_a_failed_job_is_reported_and_the_others_are_kept(place):
-    sweeps = [PIPELINE["sweeps"][0], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
+    sweeps = [
+        PIPELINE["sweeps"][0],
+        [
+            "estimator=ksnn",
+            "estimator.n_hidden=0",
+            "estimator.bias=true",
+            "training.learning_rate=1e6",
+        ],
+    ]
     place.change("pipelines/small.yaml", sweeps=sweeps)
     code, out, err = place("run", "small", "tracking=none")
     assert code == 5
-    assert "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert (
+        "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss"
+        in err
+    )
     assert "Traceback" not in err
-    kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
+    kept = {
+        folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()
+    }
     assert kept == {"luenberger-luenberger"}
-    assert all(words in out for words in ("Luenberger", "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss"))
+    assert all(
+        words in out
+        for words in (
+            "Luenberger",
+            "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss",
+        )
+    )
     (report,) = (place.folder / "outputs").glob("report/*/report.md")
-    assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
+    assert (
+        "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss"
+        in report.read_text()
+    )
     assert not (place.folder / "results").exists()
 
 
 def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     place.once("run", "small", "tracking=none")
-    place.refused("report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run")
+    place.refused(
+        "report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run"
+    )
     outcome = place.told("report", "small", "tracking=none")
     assert outcome["leaderboard"][0]["test_set"] == "test"
     metrics = pd.read_csv(Path(outcome["report"]).parent / "metrics.csv")
-    assert list(metrics.columns[:6]) == ["study", "estimator", "variant", "trained_on", "dataset", "kind"]
+    assert list(metrics.columns[:6]) == [
+        "study",
+        "estimator",
+        "variant",
+        "trained_on",
+        "dataset",
+        "kind",
+    ]
     assert set(metrics["kind"]) == {"simulated"}
     assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs"} <= set(metrics["metric"])
     assert not any("seconds" in metric for metric in set(metrics["metric"]))
@@ -102,7 +143,11 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
 def test_train_eval_estimate_report_one_by_one(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
     trained = place.told("train", *arguments)
-    assert (trained["status"], trained["n_parameters"], place.told("train", *arguments)["skipped"]) == ("complete", 28, True)
+    assert (
+        trained["status"],
+        trained["n_parameters"],
+        place.told("train", *arguments)["skipped"],
+    ) == ("complete", 28, True)
     assert place.told("train", *arguments, "--force")["skipped"] is False
 
     by_overrides = place.told("eval", *arguments)
@@ -113,12 +158,25 @@ def test_train_eval_estimate_report_one_by_one(place):
     channels = {name: entry for name, entry in DATASET["channels"].items() if name != "vy_ref"}
     place.change("conf/dataset/lap.yaml", **DATASET | {"name": "lap", "channels": channels})
     for out in ("out.parquet", "out.csv"):
-        assert place.told("estimate", name, "lap.csv", "dataset=lap", "-o", out)["estimated"] == 600 - 30
+        assert (
+            place.told("estimate", name, "lap.csv", "dataset=lap", "-o", out)["estimated"]
+            == 600 - 30
+        )
     frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
-    assert list(frame.columns) == ["time", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"]
+    assert list(frame.columns) == [
+        "time",
+        "vy",
+        "sideslip",
+        "band_vy",
+        "band_sideslip",
+        "health",
+        "health_reason",
+    ]
     for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
         assert np.allclose(frame[column], text[column], equal_nan=True), column
-    assert [reason_in_words(code) for code in frame["health_reason"]] == text["health_reason"].fillna("").tolist()
+    assert [reason_in_words(code) for code in frame["health_reason"]] == text[
+        "health_reason"
+    ].fillna("").tolist()
 
     model = vehest.load_model(trained["model"])
     estimate = vehest.estimate(model, vehest.read_recording("lap.csv", ["dataset=lap"]))
@@ -131,11 +189,18 @@ def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
     truth = planar_drive(30.0, 100.0, seed=1, noise=0.02)
     for name in ("vx", "yaw_rate", "ay", "ax", "vy_ref"):
         assert np.allclose(recording[name], truth[name], rtol=0, atol=1e-9), name
-    assert read_recording(Path(place.told("downsample", "mine", "rate_hz=20")["folder"]) / "one.parquet").rate_hz == 20.0
+    assert (
+        read_recording(
+            Path(place.told("downsample", "mine", "rate_hz=20")["folder"]) / "one.parquet"
+        ).rate_hz
+        == 20.0
+    )
 
 
 def test_data_commands_list_show_and_check(place, monkeypatch):
-    monkeypatch.setattr(inspect_data, "choices", lambda _: ["ferrari_250lm", "mine", "sim_quickstart"])
+    monkeypatch.setattr(
+        inspect_data, "choices", lambda _: ["ferrari_250lm", "mine", "sim_quickstart"]
+    )
     rows = place.told("data", "list")
     assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
@@ -147,14 +212,23 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     assert "follows ay - vx·yaw_rate" in out
     assert "yaw_rate" in place("data", "channels")[1]
     assert "one: simulated" in place("data", "show", "mine")[1]
-    frame = pd.DataFrame({"time": 1672875115.4 + np.arange(100) / 100.0, "vx": np.linspace(20.0, 21.0, 100)})
+    frame = pd.DataFrame(
+        {"time": 1672875115.4 + np.arange(100) / 100.0, "vx": np.linspace(20.0, 21.0, 100)}
+    )
     frame.to_csv(place.folder / "unix.csv", index=False)
-    assert "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples" in place("data", "show", "unix.csv")[1]
+    assert (
+        "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples"
+        in place("data", "show", "unix.csv")[1]
+    )
 
 
 def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"))
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"),
+    )
     found = {item["name"]: item for item in place.told("doctor")}
     assert (found["compiled recursions"]["level"], found["extras"]["level"]) == ("ok", "warning")
     assert "Optuna need 'vehest[tuning]': pip install" in found["extras"]["message"]
@@ -165,7 +239,9 @@ def test_help_shows_choices_and_answers_quickly(place):
     assert all(words in out for words in ("luenberger", "ferrari_drive"))
     code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
     code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
 
 
@@ -177,13 +253,20 @@ def test_help_shows_choices_and_answers_quickly(place):
             lambda table: table.drop(index=range(100, 200)),
             ("one.csv': 1 gaps, the longest of 1.01 s after 0.99 s", "dataset.clock=interpolate"),
         ),
-        (lambda table: table.assign(LatAcc=table["LatAcc"].where(table.index != 500)), ("one.csv", "'ay' holds 1 NaN between 5 s and 5 s")),
+        (
+            lambda table: table.assign(LatAcc=table["LatAcc"].where(table.index != 500)),
+            ("one.csv", "'ay' holds 1 NaN between 5 s and 5 s"),
+        ),
     ],
 )
 def test_bad_tables_are_one_clear_line_whatever_reads_them(place, change, says):
     path = place.folder / "raw" / "one.csv"
     change(pd.read_csv(path)).to_csv(path, index=False)
-    for command in (("ingest", "mine"), ("train", "split=mine", "tracking=none"), ("run", "small", "tracking=none")):
+    for command in (
+        ("ingest", "mine"),
+        ("train", "split=mine", "tracking=none"),
+        ("run", "small", "tracking=none"),
+    ):
         assert place.refused(*command, says=says)[0] in (3, 4)
     assert place.files() == set()
 
@@ -200,7 +283,13 @@ def test_empty_and_truncated_files_and_degrees_taken_as_radians_are_one_clear_li
     place.refused("ingest", "mine", says="one.csv' is empty")
     whole = (place.folder / "raw" / "one.parquet").read_bytes()
     (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
-    place.refused("ingest", "mine", "dataset.files=one.parquet", code=3, says=("one.parquet' is truncated or damaged", "truncated"))
+    place.refused(
+        "ingest",
+        "mine",
+        "dataset.files=one.parquet",
+        code=3,
+        says=("one.parquet' is truncated or damaged", "truncated"),
+    )
 
 
 TRAIN = ("train", "split=mine", "tracking=none")
@@ -211,21 +300,57 @@ TESTED = [{"recording": "three"}]
 @pytest.mark.parametrize(
     ("changes", "command", "code", "says"),
     [
-        ({}, ("ingest", "mine", "root=/no/such/folder"), 4, "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA"),
+        (
+            {},
+            ("ingest", "mine", "root=/no/such/folder"),
+            4,
+            "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA",
+        ),
         ({}, ("ingest", "mine", "dataset.colour=red"), 2, ""),
         ({}, ("eval", "split=mine", "tracking=none"), 4, ""),
         ({}, ("estimate", "nothing", "lap.csv"), 4, ""),
         ({}, (*TRAIN, "split.train=[{recording: four}]"), None, "has no recording 'four'"),
-        ({}, (*TRAIN, "split.tests.test=[{recording: one, start: 5, stop: 10}]"), None, "share samples of recording 'one'"),
-        *(({}, (*TRAIN, words), None, "") for words in ("output=null", "seed=-1", "training.max_epochs=.inf", "estimator.rate_hz=200")),
+        (
+            {},
+            (*TRAIN, "split.tests.test=[{recording: one, start: 5, stop: 10}]"),
+            None,
+            "share samples of recording 'one'",
+        ),
+        *(
+            ({}, (*TRAIN, words), None, "")
+            for words in (
+                "output=null",
+                "seed=-1",
+                "training.max_epochs=.inf",
+                "estimator.rate_hz=200",
+            )
+        ),
         ({}, (*TRAIN, "downsample.transforms=[1]"), None, ""),
-        *(({}, ("run", "small", words), None, "") for words in ("evaluation.rate_hz=abc", "split=quickstart")),
+        *(
+            ({}, ("run", "small", words), None, "")
+            for words in ("evaluation.rate_hz=abc", "split=quickstart")
+        ),
         ({}, ("downsample", "mine"), None, ""),
-        ({}, (*RUN, "--minutes", "0.000001"), 3, ("no estimator was done in this time", "goes on with: luenberger-luenberger-seed0")),
+        (
+            {},
+            (*RUN, "--minutes", "0.000001"),
+            3,
+            ("no estimator was done in this time", "goes on with: luenberger-luenberger-seed0"),
+        ),
         ({}, (*RUN, "--minutes", "0"), 2, "--minutes must be positive, not 0"),
         ({"study": ""}, RUN, 2, "is not a pipeline"),
-        ({"sweeps": [["estimator=gru"], ["estimator=lstm", "evaluation.rate_hz=10"]]}, RUN, 2, "must agree in 'evaluation'"),
-        ({"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]}, RUN, 2, "two jobs are both called gru-states_5-seed0"),
+        (
+            {"sweeps": [["estimator=gru"], ["estimator=lstm", "evaluation.rate_hz=10"]]},
+            RUN,
+            2,
+            "must agree in 'evaluation'",
+        ),
+        (
+            {"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]},
+            RUN,
+            2,
+            "two jobs are both called gru-states_5-seed0",
+        ),
         ({"tests": {"validation": TESTED}}, TRAIN, 2, "a test set cannot be called 'validation'"),
         ({"tests": {"../x": TESTED}}, TRAIN, 2, "becomes part of file names"),
         ({"tests": {"t": []}}, TRAIN, 2, "test set 't' is empty"),
@@ -233,16 +358,31 @@ TESTED = [{"recording": "three"}]
 )
 def test_what_makes_no_sense_is_refused_in_one_line(place, changes, command, code, says):
     if changes:
-        place.change("conf/split/mine.yaml" if "tests" in changes else "pipelines/small.yaml", **changes)
+        place.change(
+            "conf/split/mine.yaml" if "tests" in changes else "pipelines/small.yaml", **changes
+        )
     assert place.refused(*command, code=code, says=says)[0] in (2, 3, 4)
     assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
 
 
-def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_nothing(place, monkeypatch):
-    place.once("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_nothing(
+    place, monkeypatch
+):
+    place.once(
+        "train",
+        "estimator=luenberger",
+        "split=mine",
+        "training.grid=1",
+        "training.max_evaluations=5",
+        "tracking=none",
+    )
     drive = planar_drive(10.0, 20.0).without_references()
     slow = pd.DataFrame({"time": drive.time, **drive.channels})
-    for name, table in (("slow", slow), ("less", slow.drop(columns="ax")), ("lap", slow.assign(time=slow["time"] / 5.0))):
+    for name, table in (
+        ("slow", slow),
+        ("less", slow.drop(columns="ax")),
+        ("lap", slow.assign(time=slow["time"] / 5.0)),
+    ):
         table.to_csv(f"{name}.csv", index=False)
     Path("parts.parquet").mkdir()
     for name, out, says in (
@@ -254,8 +394,20 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     ):
         place.refused("estimate", "luenberger", name, "-o", out, says=says)
         assert not Path("out.parquet").exists()
-    swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
-    place.refused("eval", "--model", "luenberger", "split=mine", *swapped, "tracking=none", code=2, says="shares samples with the ranges")
+    swapped = (
+        "split.train=[{recording: three}]",
+        "split.tests.test=[{recording: one, start: 5, stop: 20}]",
+    )
+    place.refused(
+        "eval",
+        "--model",
+        "luenberger",
+        "split=mine",
+        *swapped,
+        "tracking=none",
+        code=2,
+        says="shares samples with the ranges",
+    )
     monkeypatch.delenv("VEHEST_DATA")
     place.refused("ingest", "mine", code=4, says="no data root is set")
 
@@ -268,7 +420,9 @@ def test_truncated_artefact_is_made_again(place):
     assert (place.told(*arguments)["skipped"], weights.read_bytes() == whole) == (False, True)
 
 
-def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(place, monkeypatch):
+def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(
+    place, monkeypatch
+):
     outputs = place.folder / "outputs"
 
     class OneEvaluation(TimeLimit):
@@ -282,7 +436,10 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
         code, out, err = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out
-    assert "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on" in out
+    assert (
+        "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on"
+        in out
+    )
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
     assert "GRU" in out
@@ -301,7 +458,9 @@ def test_only_the_study_as_it_is_written_is_published(place):
     assert str(place.folder) not in text + (results / "provenance.json").read_text()
     (results / "metrics.csv").unlink()
     (results / "provenance.json").unlink()
-    place.refused("run", "small", "tracking=none", code=2, says="holds files that vehest did not publish")
+    place.refused(
+        "run", "small", "tracking=none", code=2, says="holds files that vehest did not publish"
+    )
 
 
 def test_a_model_remembers_how_its_recordings_were_prepared(place):
@@ -313,11 +472,21 @@ def test_a_model_remembers_how_its_recordings_were_prepared(place):
     assert by_name["folder"] == by_overrides["folder"]
     unfiltered = place.told("eval", "--model", model, *arguments, "downsample.transforms=[]")
     assert unfiltered["rmse_sideslip.test"] != by_name["rmse_sideslip.test"]
-    references = {json.dumps(read_artefact(Path(outcome["folder"])).inputs["reference of mine/three"]) for outcome in (by_name, unfiltered)}
+    references = {
+        json.dumps(read_artefact(Path(outcome["folder"])).inputs["reference of mine/three"])
+        for outcome in (by_name, unfiltered)
+    }
     assert len(references) == 1, "what is scored against is never filtered"
 
 
-BUDGET = ("split=mine", "training.max_epochs=8", "training.patience=8", "training.checkpoint_seconds=0", "tracking=none", "--json")
+BUDGET = (
+    "split=mine",
+    "training.max_epochs=8",
+    "training.patience=8",
+    "training.checkpoint_seconds=0",
+    "tracking=none",
+    "--json",
+)
 SAVES = (supervised, "save_checkpoint")  # once an epoch
 
 
@@ -341,9 +510,15 @@ def _epochs(place, monkeypatch, *arguments):
 
 @pytest.mark.parametrize(
     ("number", "code", "options", "first"),
-    [(signal.SIGINT, 130, (), 4), (signal.SIGTERM, 143, (), 4), (signal.SIGTERM, 143, ("--force",), 1)],
+    [
+        (signal.SIGINT, 130, (), 4),
+        (signal.SIGTERM, 143, (), 4),
+        (signal.SIGTERM, 143, ("--force",), 1),
+    ],
 )
-def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(place, monkeypatch, number, code, options, first):
+def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(
+    place, monkeypatch, number, code, options, first
+):
     with monkeypatch.context() as patch:
         patch.setattr(*SAVES, Striking(supervised.save_checkpoint, 3, number))
         ended, _, err = place("train", *BUDGET)
@@ -352,7 +527,9 @@ def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(pla
     (model,) = (place.folder / "outputs" / "train").iterdir()
     assert read_artefact(model).status == "interrupted"
     assert not any(ASIDE_PREFIX in name for name in place.files())
-    assert _epochs(place, monkeypatch, *options)[0][0] == first, "from the checkpoint, with --force from the start"
+    assert _epochs(place, monkeypatch, *options)[0][0] == first, (
+        "from the checkpoint, with --force from the start"
+    )
 
 
 def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, monkeypatch):
@@ -362,7 +539,10 @@ def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, m
     assert epochs[0] == 4
     _, whole = _epochs(place, monkeypatch, "output=undisturbed")
     assert resumed["epochs"] == whole["epochs"] == 8
-    weights = [(Path(model) / "model.safetensors").read_bytes() for model in (resumed["model"], whole["model"])]
+    weights = [
+        (Path(model) / "model.safetensors").read_bytes()
+        for model in (resumed["model"], whole["model"])
+    ]
     assert weights[0] == weights[1]
     assert not any("checkpoint" in name for name in place.files())
 
@@ -379,15 +559,27 @@ def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, mo
         assert sum(name.endswith(".parquet") for name in place.files()) == 2, "it was in the middle"
     assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
     assert len(place.told("ingest", "mine")["recordings"]) == 3
-    assert not any(ASIDE_PREFIX in name for name in place.files()), "what the killed run left is cleared away"
+    assert not any(ASIDE_PREFIX in name for name in place.files()), (
+        "what the killed run left is cleared away"
+    )
 
 
 def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
     place.change("pipelines/small.yaml", sweeps=PIPELINE["sweeps"][:2])
-    endless = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none")
-    process = start([sys.executable, "-m", "vehest", "run", "small", "--jobs", "2", *endless], cwd=place.folder)
+    endless = (
+        "training.max_epochs=100000",
+        "training.patience=100000",
+        "training.checkpoint_seconds=0",
+        "tracking=none",
+    )
+    process = start(
+        [sys.executable, "-m", "vehest", "run", "small", "--jobs", "2", *endless], cwd=place.folder
+    )
     wait_for(lambda: list((place.folder / "outputs" / "checkpoints").glob("*/*")), process)
-    children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+    children = [
+        int(pid)
+        for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    ]
     assert children
     process.kill()
     wait_for(lambda: not any(map(is_alive, children)))

@@ -22,7 +22,10 @@ def drive():
 
 def written(folder, name, drive, error, **columns):
     rng = np.random.default_rng(1)
-    table = {"time": drive.time, "vy": drive["vy_ref"] + error * np.sin(2.0 * drive.time + rng.uniform(0, 6.0))}
+    table = {
+        "time": drive.time,
+        "vy": drive["vy_ref"] + error * np.sin(2.0 * drive.time + rng.uniform(0, 6.0)),
+    }
     file = folder / f"{name}.csv"
     pd.DataFrame(table | columns).to_csv(file, index=False)
     return file
@@ -39,19 +42,28 @@ def test_errors_are_those_that_were_put_in(drive, tmp_path):
 def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_path, capsys):
     vy = drive["vy_ref"] + 0.1
     beta = np.degrees(np.arctan2(vy, drive["vx"]))
-    pd.DataFrame({"Time [s]": drive.time, "Beta [deg]": beta}).to_csv(tmp_path / "angle.csv", index=False)
+    pd.DataFrame({"Time [s]": drive.time, "Beta [deg]": beta}).to_csv(
+        tmp_path / "angle.csv", index=False
+    )
     pd.DataFrame({"t": drive.time, "V_y": vy}).to_csv(tmp_path / "speed.csv", index=False)
-    angle, speed = (read_estimate_table(tmp_path / f"{name}.csv", drive) for name in ("angle", "speed"))
+    angle, speed = (
+        read_estimate_table(tmp_path / f"{name}.csv", drive) for name in ("angle", "speed")
+    )
     assert angle["vy"] == pytest.approx(speed["vy"], abs=1e-9)
     assert capsys.readouterr().err == ""
-    pd.DataFrame({"t": drive.time, "beta": 100.0 * beta}).to_csv(tmp_path / "nameless.csv", index=False)
+    pd.DataFrame({"t": drive.time, "beta": 100.0 * beta}).to_csv(
+        tmp_path / "nameless.csv", index=False
+    )
     read_estimate_table(tmp_path / "nameless.csv", drive)
     assert "nameless.csv': sideslip_ref: " in (said := capsys.readouterr().err)
     assert "beyond what a vehicle can do" in said
 
 
 def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):
-    estimates = {name: read_estimate_table(written(tmp_path, name, drive, size), drive) for name, size in (("good", 0.01), ("bad", 0.6))}
+    estimates = {
+        name: read_estimate_table(written(tmp_path, name, drive, size), drive)
+        for name, size in (("good", 0.01), ("bad", 0.6))
+    }
     found = compare_estimates(drive, estimates)
     assert found["rows"][0]["estimate"] == "good"
     assert {row["estimate"] for row in found["rows"]} == {"good", "bad", "zero", "static_map"}
@@ -63,9 +75,24 @@ def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp
 def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
     """With lateral velocity turned in the second half, a map of the other half is wrong in both."""
     turned = np.where(drive.time < drive.start_time + 60.0, drive["vy_ref"], -drive["vy_ref"])
-    other = Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, {**drive.channels, "vy_ref": turned})
-    estimate = Estimate(other.id, "true", other.rate_hz, other.start_time, {"vy": turned, "sideslip": np.zeros(len(other))})
-    rows = {row["estimate"]: row["rmse_vy"] for row in compare_estimates(other, {"true": estimate})["rows"]}
+    other = Recording(
+        drive.id,
+        drive.vehicle,
+        drive.rate_hz,
+        drive.start_time,
+        {**drive.channels, "vy_ref": turned},
+    )
+    estimate = Estimate(
+        other.id,
+        "true",
+        other.rate_hz,
+        other.start_time,
+        {"vy": turned, "sideslip": np.zeros(len(other))},
+    )
+    rows = {
+        row["estimate"]: row["rmse_vy"]
+        for row in compare_estimates(other, {"true": estimate})["rows"]
+    }
     assert rows["static_map"] > rows["zero"] > rows["true"]
 
 
@@ -79,15 +106,31 @@ def test_other_clocks_and_columns_are_refused_with_the_file_that_has_them(drive,
 
 def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):
     table = pd.read_csv(place.folder / "raw" / "three.csv")
-    pd.DataFrame({"time": table["Time"], "vy": table["Vy"] + 0.1}).to_csv(tmp_path / "mine.csv", index=False)
-    assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "tracking=none")[0] == 0
+    pd.DataFrame({"time": table["Time"], "vy": table["Vy"] + 0.1}).to_csv(
+        tmp_path / "mine.csv", index=False
+    )
+    assert (
+        place("train", "estimator=luenberger", "split=mine", "training.grid=1", "tracking=none")[0]
+        == 0
+    )
     raw = str(place.folder / "raw")
     out, err = place.done(
-        "compare", f"{raw}/three.csv", str(tmp_path / "mine.csv"), "dataset=mine", "-m", "luenberger", "-m", "pretrained", "--json"
+        "compare",
+        f"{raw}/three.csv",
+        str(tmp_path / "mine.csv"),
+        "dataset=mine",
+        "-m",
+        "luenberger",
+        "-m",
+        "pretrained",
+        "--json",
     )
     rows = {row["estimate"] for row in json.loads(out)["rows"]}
     assert rows == {"mine", "luenberger", "pretrained", "zero", "static_map"}
     assert "learnt on this recording" not in err
     _, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
     assert "warning: 'luenberger' learnt on this recording: its row is no test" in err
-    assert place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1] == "error: name at least one estimate to compare"
+    assert (
+        place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1]
+        == "error: name at least one estimate to compare"
+    )

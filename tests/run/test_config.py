@@ -14,7 +14,9 @@ from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import jobs_of, read_study
 
 
-def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(elsewhere):
+def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(
+    elsewhere,
+):
     estimators, splits = choices("estimator"), choices("split")
     for at, estimator in enumerate(estimators):
         split = splits[at * len(splits) // len(estimators)]
@@ -22,13 +24,20 @@ def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless
         assert (config["estimator"]["name"], config["split"]["name"]) == (estimator, split)
     assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
     assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
-    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
+    assert (
+        compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"]
+        == "supervised"
+    )
 
 
 def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
     (elsewhere / "conf" / "estimator").mkdir(parents=True)
-    (elsewhere / "conf" / "estimator" / "gru.yaml").write_text("name: gru\nrate_hz: 20\nwindow: 10\nn_states: 3\n")
-    (elsewhere / "conf" / "estimator" / "mine.yaml").write_text("# My own.\nname: ksnn\nn_local: 4\n")
+    (elsewhere / "conf" / "estimator" / "gru.yaml").write_text(
+        "name: gru\nrate_hz: 20\nwindow: 10\nn_states: 3\n"
+    )
+    (elsewhere / "conf" / "estimator" / "mine.yaml").write_text(
+        "# My own.\nname: ksnn\nn_local: 4\n"
+    )
     assert compose_config("train", ["estimator=gru"])["estimator"]["window"] == 10
     assert compose_config("train", ["estimator=mine"])["estimator"]["n_local"] == 4
     assert compose_config("train", ["estimator=lstm"])["estimator"]["window"] == 30
@@ -38,7 +47,10 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, "),
+        (
+            ["estimator=ksn"],
+            r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, ",
+        ),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
         (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),
@@ -48,19 +60,34 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
     ],
 )
 def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
-    said = refusal(lambda: compose_config("train" if overrides else "ingest", overrides), ConfigurationError)
+    said = refusal(
+        lambda: compose_config("train" if overrides else "ingest", overrides), ConfigurationError
+    )
     assert re.search(message, said)
-    assert "did you mean pipelines/quickstart.yaml?" in refusal(lambda: read_study("quikstart"), MissingError)
+    assert "did you mean pipelines/quickstart.yaml?" in refusal(
+        lambda: read_study("quikstart"), MissingError
+    )
 
 
 def test_sweeps_expand_to_every_combination_that_of_the_ferrari_to_35_jobs(elsewhere):
-    jobs = expand(["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"])
-    assert (len(jobs), jobs[0]) == (12, ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"])
+    jobs = expand(
+        ["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"]
+    )
+    assert (len(jobs), jobs[0]) == (
+        12,
+        ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"],
+    )
     assert len({tuple(job) for job in jobs}) == 12
     configs = [job.config for job in jobs_of(read_study("ferrari_drive"), [])[""]]
     names = [config["estimator"]["name"] for config in configs]
     baselines = {"zero": 1, "kinematic": 1, "data_sheet": 1, "static_map": 1}
-    assert {name: names.count(name) for name in set(names)} == {**baselines, "luenberger": 1, "ksnn": 20, "gru": 5, "lstm": 5}
+    assert {name: names.count(name) for name in set(names)} == {
+        **baselines,
+        "luenberger": 1,
+        "ksnn": 20,
+        "gru": 5,
+        "lstm": 5,
+    }
     assert all(config["evaluation"]["rate_hz"] == 20 for config in configs)
     assert [span["start"] for span in configs[0]["split"]["train"]] == [150]
 
@@ -78,21 +105,35 @@ def test_every_split_and_every_set_of_keys_of_shipped_pipelines_composes(elsewhe
     for part in pipeline.parts.values():
         assert part.split in choices("split")
         for job in chain(*map(expand, part.sweeps)):
-            words = [word for word in [*part.overrides, *job] if not word.lstrip("+").startswith("split.")]
-            keys = frozenset(word if (key := word.partition("=")[0]) in GROUPS else key for word in words)
+            words = [
+                word
+                for word in [*part.overrides, *job]
+                if not word.lstrip("+").startswith("split.")
+            ]
+            keys = frozenset(
+                word if (key := word.partition("=")[0]) in GROUPS else key for word in words
+            )
             if keys not in COMPOSED:
                 compose_config("eval", words)
                 COMPOSED.add(keys)
 
 
 def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
-    configs = [job.config for job in jobs_of(read_study("quickstart"), ["training.learning_rate=0.01"])[""]]
-    rates = {config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs}
-    fitted_otherwise = dict.fromkeys(("zero", "kinematic", "data_sheet", "static_map", "luenberger"))
+    configs = [
+        job.config for job in jobs_of(read_study("quickstart"), ["training.learning_rate=0.01"])[""]
+    ]
+    rates = {
+        config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs
+    }
+    fitted_otherwise = dict.fromkeys(
+        ("zero", "kinematic", "data_sheet", "static_map", "luenberger")
+    )
     assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
     seeds = [job.config["seed"] for job in jobs_of(read_study("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
-    assert "suits no sweep" in refusal(lambda: jobs_of(read_study("quickstart"), ["training.momentum=0.9"]), ConfigurationError)
+    assert "suits no sweep" in refusal(
+        lambda: jobs_of(read_study("quickstart"), ["training.momentum=0.9"]), ConfigurationError
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +148,13 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
         ("vehest report --check fer", 3, {"ferrari_drive"}),
     ],
 )
-def test_commands_options_choices_and_studies_are_completed(elsewhere, monkeypatch, capsys, words, position, offered):
-    for name, value in (("COMP_WORDS", words), ("COMP_CWORD", str(position)), ("_VEHEST_COMPLETE", "complete_bash")):
+def test_commands_options_choices_and_studies_are_completed(
+    elsewhere, monkeypatch, capsys, words, position, offered
+):
+    for name, value in (
+        ("COMP_WORDS", words),
+        ("COMP_CWORD", str(position)),
+        ("_VEHEST_COMPLETE", "complete_bash"),
+    ):
         monkeypatch.setenv(name, value)
     assert offered <= set(run_vehest(capsys)[1].split())

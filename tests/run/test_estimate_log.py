@@ -10,7 +10,9 @@ from scipy.io import loadmat
 
 from conftest import planar_drive
 
-asammdf = pytest.importorskip("asammdf", reason="the measurements of these tests are written by asammdf")
+asammdf = pytest.importorskip(
+    "asammdf", reason="the measurements of these tests are written by asammdf"
+)
 COLUMNS = ("vx", "yaw_rate", "ay", "ax")
 DESCRIBED = "dataset=mine"
 
@@ -28,7 +30,9 @@ def described(place):
     units = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "ax": "m/s²"}
     channels = {name: {"column": f"Veh_{name}", "unit": unit} for name, unit in units.items()}
     Path("conf/dataset/mine.yaml").unlink()
-    place.change("conf/dataset/mine.yaml", name="mine", source="mdf", rate_hz=100, channels=channels)
+    place.change(
+        "conf/dataset/mine.yaml", name="mine", source="mdf", rate_hz=100, channels=channels
+    )
     return place, drive
 
 
@@ -45,7 +49,9 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
         assert np.array_equal(vy.samples, table["vy"], equal_nan=True)
         assert (vy.unit, measurement.get("vehest_sideslip").unit) == ("m/s", "rad")
         assert np.array_equal(measurement.get("vehest_health", raw=True).samples, table["health"])
-        assert [text.decode().removeprefix("-") for text in words.samples] == table["health_reason"].fillna("").tolist()
+        assert [text.decode().removeprefix("-") for text in words.samples] == table[
+            "health_reason"
+        ].fillna("").tolist()
 
 
 def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
@@ -61,7 +67,18 @@ def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
 
 def test_tables_and_older_measurements_do_not_become_one_of_mdf_4(described):
     place, drive = described
-    place.refused("estimate", "lap.csv", "-o", "beta.mf4", code=2, says="'lap.csv' with further channels, which is no .mf4")
-    write_mdf(Path("old.mf4"), {"bus": [asammdf.Signal(drive[name], drive.time, name=f"Veh_{name}") for name in COLUMNS]}, "3.30")
+    place.refused(
+        "estimate",
+        "lap.csv",
+        "-o",
+        "beta.mf4",
+        code=2,
+        says="'lap.csv' with further channels, which is no .mf4",
+    )
+    write_mdf(
+        Path("old.mf4"),
+        {"bus": [asammdf.Signal(drive[name], drive.time, name=f"Veh_{name}") for name in COLUMNS]},
+        "3.30",
+    )
     place.refused("estimate", "old.mf4", DESCRIBED, "-o", "beta.mf4", code=3, says="is of MDF 3.30")
     assert not Path("beta.mf4").exists()

@@ -24,7 +24,12 @@ def drive_of(seed, seconds=30.0):
 @pytest.fixture(scope="module")
 def model():
     """An observer with what was learnt of how far it can be trusted."""
-    return vehest.train("luenberger", [drive_of(1)], [drive_of(2)], ("training.grid=1", "training.max_evaluations=5"))
+    return vehest.train(
+        "luenberger",
+        [drive_of(1)],
+        [drive_of(2)],
+        ("training.grid=1", "training.max_evaluations=5"),
+    )
 
 
 @pytest.fixture
@@ -37,7 +42,9 @@ def saved(place, model):
 def lap(changes=None):
     """Write lap.csv: a drive with some of its channels replaced."""
     drive = drive_of(4).without_references()
-    pd.DataFrame({"time": drive.time, **drive.channels, **(changes or {})}).to_csv("lap.csv", index=False)
+    pd.DataFrame({"time": drive.time, **drive.channels, **(changes or {})}).to_csv(
+        "lap.csv", index=False
+    )
 
 
 def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved):
@@ -51,7 +58,9 @@ def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved):
 def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refuses_it(saved):
     lap({"vx": np.zeros(3000)})
     said = "vx: never changes: 0 m/s throughout"
-    saved.refused("estimate", "own", "lap.csv", "-o", "out.csv", "--strict", code=3, says=f"'lap.csv': {said}")
+    saved.refused(
+        "estimate", "own", "lap.csv", "-o", "out.csv", "--strict", code=3, says=f"'lap.csv': {said}"
+    )
     assert not Path("out.csv").exists()
     out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv", "--json")
     assert (err, json.loads(out)["findings"]) == (f"warning: {said}\n", [said])
@@ -62,9 +71,14 @@ def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refu
 
 @pytest.mark.parametrize(
     ("factor", "check", "message"),
-    [(-1.0, "sign", "ay and vx·yaw_rate disagree in sign"), (1.0 / GRAVITY, "unit", "ay is in g; set its unit")],
+    [
+        (-1.0, "sign", "ay and vx·yaw_rate disagree in sign"),
+        (1.0 / GRAVITY, "unit", "ay is in g; set its unit"),
+    ],
 )
-def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accepted(saved, factor, check, message):
+def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accepted(
+    saved, factor, check, message
+):
     lap({"ay": factor * drive_of(4)["ay"]})
     code, line = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
     assert code == 3
@@ -83,9 +97,13 @@ def in_parts(monkeypatch, seconds=7.0):
 
 
 @pytest.mark.parametrize("name", ["own", "self_calibrating", "pretrained"])
-def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(saved, monkeypatch, name):
+def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(
+    saved, monkeypatch, name
+):
     speed, lost = np.array(drive_of(4)["vx"]), slice(1200, 1500)
-    speed[lost] = -30.0  # which no guard believes: the estimators wait, and start anew across a seam
+    speed[
+        lost
+    ] = -30.0  # which no guard believes: the estimators wait, and start anew across a seam
     for end, changes in ((".csv", {}), (".parquet", {"vx": speed})):
         lap(changes)
         if end == ".parquet":
@@ -98,16 +116,27 @@ def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_who
         if end == ".csv":
             assert Path("parts.csv").read_bytes() == Path("whole.csv").read_bytes()
         else:
-            pd.testing.assert_frame_equal(pd.read_parquet("parts.parquet"), pd.read_parquet("whole.parquet"), check_exact=True)
+            pd.testing.assert_frame_equal(
+                pd.read_parquet("parts.parquet"), pd.read_parquet("whole.parquet"), check_exact=True
+            )
             assert pq.ParquetFile("parts.parquet").num_row_groups == 5
         assert {**parts, "out": "", "findings": []} == {**whole, "out": "", "findings": []}
 
 
 @pytest.mark.parametrize(
     ("row", "column", "cell"),
-    [(2500, "ay", np.nan), (2500, "vx", "text"), (2500, "time", 99.0), (2999, "vx", 1e9), (1500, "time", 15.004), (0, "yaw_rate", np.inf)],
+    [
+        (2500, "ay", np.nan),
+        (2500, "vx", "text"),
+        (2500, "time", 99.0),
+        (2999, "vx", 1e9),
+        (1500, "time", 15.004),
+        (0, "yaw_rate", np.inf),
+    ],
 )
-def test_bad_rows_have_the_same_line_in_parts_and_nothing_is_written(saved, monkeypatch, row, column, cell):
+def test_bad_rows_have_the_same_line_in_parts_and_nothing_is_written(
+    saved, monkeypatch, row, column, cell
+):
     lap()
     table = pd.read_csv("lap.csv").astype({column: object})
     table.loc[row, column] = cell
@@ -126,17 +155,28 @@ def test_online_says_what_estimate_says_of_the_whole_drive(model):
     batch = vehest.estimate(model, faulty)
     stepper = vehest.online(model)
     assert stepper.horizon_steps == 0
-    said = [stepper.step({name: values[k] for name, values in channels.items()}) for k in range(len(drive))]
-    assert set(batch.channels) == {"vx", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"} == set(said[-1])
+    said = [
+        stepper.step({name: values[k] for name, values in channels.items()})
+        for k in range(len(drive))
+    ]
+    assert (
+        set(batch.channels)
+        == {"vx", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"}
+        == set(said[-1])
+    )
     assert (batch["health"] > 0).any()
     for name, values in batch.channels.items():
-        np.testing.assert_allclose([step.get(name, np.nan) for step in said], values, rtol=0.0, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            [step.get(name, np.nan) for step in said], values, rtol=0.0, atol=1e-9, err_msg=name
+        )
 
 
 def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
     vehest.save_model(model, tmp_path / "own")
     assert read_trust(tmp_path / "own").bands is not None
-    before, after = (vehest.estimate(own, drive_of(4)) for own in (model, vehest.load_model(tmp_path / "own")))
+    before, after = (
+        vehest.estimate(own, drive_of(4)) for own in (model, vehest.load_model(tmp_path / "own"))
+    )
     assert {"band_vy", "band_sideslip", "health", "health_reason"} <= set(before.channels)
     for name, values in before.channels.items():
         np.testing.assert_array_equal(after[name], values, err_msg=name)
@@ -144,9 +184,16 @@ def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
 
 def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_why(saved):
     alone = vehest.train("static_map", [drive_of(1)], [])
-    assert not {"band_vy", "band_sideslip"} & set(vehest.estimate(alone, drive_of(4)).channels), "nothing to calibrate by"
+    assert not {"band_vy", "band_sideslip"} & set(vehest.estimate(alone, drive_of(4)).channels), (
+        "nothing to calibrate by"
+    )
     zero = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
-    assert set(vehest.estimate(zero, drive_of(4)).channels) == {"vy", "sideslip", "health", "health_reason"}
+    assert set(vehest.estimate(zero, drive_of(4)).channels) == {
+        "vy",
+        "sideslip",
+        "health",
+        "health_reason",
+    }
     vehest.save_model(zero, saved.folder / "zero")
     trust = read_trust(saved.folder / "zero")
     assert (trust.bands, trust.guard, trust.health) == (None, None, None)
@@ -160,7 +207,10 @@ def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda text: text[: len(text) // 2].rsplit("\n", 1)[0] + "\n  x: [", "cannot be read as YAML"),
+        (
+            lambda text: text[: len(text) // 2].rsplit("\n", 1)[0] + "\n  x: [",
+            "cannot be read as YAML",
+        ),
         (lambda text: "", "does not say how far a model can be trusted"),
         (lambda text: yaml.safe_dump({**yaml.safe_load(text), "bands": {"vy": "wide"}}), "bands"),
     ],

@@ -35,20 +35,28 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
     folder = place.folder / "raw" / "my_log"
     folder.mkdir()
     log_of(data_root).to_csv(folder / "lap.csv", index=False)
-    for name, content in re.findall(r"```yaml\n# ((?:conf|pipelines)/\S+)\n(.*?)```", page, re.DOTALL):
+    for name, content in re.findall(
+        r"```yaml\n# ((?:conf|pipelines)/\S+)\n(.*?)```", page, re.DOTALL
+    ):
         (place.folder / name).write_text(content, encoding="utf-8")
     code, out, err = logged("data", "check", "my_log")
     assert (code, err) == (0, "")
     (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
     assert said in out.splitlines()
     out, _ = logged.done("data", "usable", "my_log")
-    for line in ("ax: transforms: [{name: acceleration_from_speed}] of vx", "vy_ref: transforms: [{name: velocity_from_sideslip}]"):
+    for line in (
+        "ax: transforms: [{name: acceleration_from_speed}] of vx",
+        "vy_ref: transforms: [{name: velocity_from_sideslip}]",
+    ):
         assert line in page
         assert line in out
     (transforms,) = re.findall(r"```yaml\n(transforms:.*?)```", page, re.DOTALL)
     file = logged.folder / "conf" / "dataset" / "my_log.yaml"
     file.write_text(
-        file.read_text(encoding="utf-8").replace("{column: AccY, unit: m/s²}", "{column: AccY, unit: m/s², sign: -1}") + transforms
+        file.read_text(encoding="utf-8").replace(
+            "{column: AccY, unit: m/s²}", "{column: AccY, unit: m/s², sign: -1}"
+        )
+        + transforms
     )
     out, _ = logged.done("data", "check", "my_log")
     assert "ay points the other way" not in out
@@ -57,5 +65,11 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
     assert "test set 'test' is too short to tell estimators apart: no interval, no winner" in out
     report = next((logged.folder / "outputs" / "report").glob("my_log-*")) / "report.md"
     text = report.read_text(encoding="utf-8")
-    assert all(words in text for words in ("but the test is too short to tell estimators apart", "from 14 s after its start"))
+    assert all(
+        words in text
+        for words in (
+            "but the test is too short to tell estimators apart",
+            "from 14 s after its start",
+        )
+    )
     assert "1.393e+09" not in text

@@ -16,14 +16,30 @@ from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
 from vehest.run.config import compose_config
 from vehest.run.estimate import findings_of, pretrained_folder, wheelbase_findings
-from vehest.run.identify import LATENESS, Normal, posterior_of, prior_of, record_of, together, without_prior
+from vehest.run.identify import (
+    LATENESS,
+    Normal,
+    posterior_of,
+    prior_of,
+    record_of,
+    together,
+    without_prior,
+)
 from vehest.sources.base import open_source
 
 PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
 
 
 def lap(seed, seconds=120.0, angle=1.0):
-    samples, vy = drive(seconds, seed, PLANTED["compliance"], PLANTED["rear_axle"], PLANTED["leakage"], 0.2, angle=angle)
+    samples, vy = drive(
+        seconds,
+        seed,
+        PLANTED["compliance"],
+        PLANTED["rear_axle"],
+        PLANTED["leakage"],
+        0.2,
+        angle=angle,
+    )
     return dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True)), vy
 
 
@@ -33,24 +49,46 @@ def recording(name, channels):
 
 @pytest.fixture(scope="module")
 def model():
-    return with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": 2.7, "cg_to_rear_axle": 1.25})
+    return with_settings(
+        load_model(pretrained_folder("self_calibrating")),
+        {"wheelbase": 2.7, "cg_to_rear_axle": 1.25},
+    )
 
 
 def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(model):
-    record = record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
+    record = record_of(
+        model,
+        {
+            name: posterior_of(model, recording(name, lap(seed)[0]))
+            for name, seed in (("one", 0), ("two", 1))
+        },
+    )
     for name, truth in PLANTED.items():
         number = getattr(record, name)
-        assert number.identified_on == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike
+        assert number.identified_on == (
+            () if name == "rear_axle" else ("one", "two")
+        )  # nearly one speed: C u and b/u are alike
         assert abs(number.value - truth) < 2.0 * number.deviation
     for offsets in record.offsets.values():
         assert abs(offsets["ay"].value - 0.2) < offsets["ay"].deviation
     channels, vy = lap(2, 20.0)
-    errors = [np.mean((one.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2) for one in (model, calibrated(model, record))]
+    errors = [
+        np.mean((one.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2)
+        for one in (model, calibrated(model, record))
+    ]
     assert errors[1] < 0.7 * errors[0]
 
 
 def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
-    still = recording("still", {"yaw_rate": np.zeros(600), "vx": np.full(600, 30.0), "ay": np.full(600, 0.1), "ax": np.zeros(600)})
+    still = recording(
+        "still",
+        {
+            "yaw_rate": np.zeros(600),
+            "vx": np.full(600, 30.0),
+            "ay": np.full(600, 0.1),
+            "ax": np.zeros(600),
+        },
+    )
     found = record_of(model, {"still": posterior_of(model, still)})
     assert not any(getattr(found, name).identified_on for name in LIMITS)
     assert calibrated(model, found).settings == model.settings
@@ -58,7 +96,10 @@ def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
 
 def test_a_drive_that_steady_cornering_explains_better_than_the_bank_tells_nothing(model):
     steady = with_settings(model, {"steady_odds": 1e12})
-    known, found = (record_of(model, {"one": posterior_of(own, recording("one", lap(0)[0]))}) for own in (model, steady))
+    known, found = (
+        record_of(model, {"one": posterior_of(own, recording("one", lap(0)[0]))})
+        for own in (model, steady)
+    )
     assert known.leakage.identified_on
     assert [getattr(found, name) for name in ("leakage", "rear_axle", "compliance")] == [
         Number(*prior_of(model)[name][:2]) for name in ("leakage", "rear_axle", "compliance")
@@ -72,11 +113,15 @@ def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
     posteriors = {}
     for name, (mean, deviation) in likelihoods.items():
         variance = 1.0 / (1.0 / prior[1] ** 2 + 1.0 / deviation**2)
-        posteriors[name] = Normal(variance * (prior.mean / prior.deviation**2 + mean / deviation**2), math.sqrt(variance))
+        posteriors[name] = Normal(
+            variance * (prior.mean / prior.deviation**2 + mean / deviation**2), math.sqrt(variance)
+        )
         assert without_prior(prior, posteriors[name]) == pytest.approx((mean, deviation))
     both = together(prior, posteriors)
     precision = 1.0 / 4.0 + 1.0 + 4.0
-    assert (both.value, both.deviation) == pytest.approx(((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5))
+    assert (both.value, both.deviation) == pytest.approx(
+        ((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5)
+    )
     assert both.identified_on == ("a", "b")
     assert together(prior, posteriors | {"c": Normal(-1.0, 0.4)}).deviation > 2.0 * both.deviation
     assert together(prior, {"d": prior}) == Number(prior.mean, prior.deviation)
@@ -94,7 +139,11 @@ def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
 def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(model):
     channels, _ = lap(3)
     late = channels | {
-        "yaw_rate": np.interp(np.arange(len(channels["vx"])) - 0.04 * RATE, np.arange(len(channels["vx"])), channels["yaw_rate"])
+        "yaw_rate": np.interp(
+            np.arange(len(channels["vx"])) - 0.04 * RATE,
+            np.arange(len(channels["vx"])),
+            channels["yaw_rate"],
+        )
     }
     on_time, found = (posterior_of(model, recording("lap", own)) for own in (channels, late))
     for name in ("compliance", "rear_axle"):
@@ -109,12 +158,18 @@ def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(
 def test_identify_writes_a_record_from_which_estimate_starts(place):
     for name, seed in (("one", 0), ("two", 1), ("three", 2)):
         channels, _ = lap(seed, 40.0)
-        pd.DataFrame({"time": np.arange(len(channels["vx"])) / RATE, **channels}).to_csv(f"{name}.csv", index=False)
+        pd.DataFrame({"time": np.arange(len(channels["vx"])) / RATE, **channels}).to_csv(
+            f"{name}.csv", index=False
+        )
     known = ("estimator.wheelbase=2.7", "estimator.cg_to_rear_axle=1.25")
     code, out, err = place("identify", "one.csv", "two.csv", *known, "-o", "car.yaml", "--json")
     assert code == 0, err
     said, kept = json.loads(out), read_car(place.folder / "car.yaml")
-    assert said["leakage"]["value"] == kept.leakage.value == pytest.approx(PLANTED["leakage"], abs=0.03)
+    assert (
+        said["leakage"]["value"]
+        == kept.leakage.value
+        == pytest.approx(PLANTED["leakage"], abs=0.03)
+    )
     code, out, err = place("identify", "one.csv", "-o", "again.yaml")
     assert "identified on" in out
     assert place("estimate", "three.csv", "-o", "cold.csv")[0] == 0
@@ -122,23 +177,42 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert code == 0, err
     assert json.loads(out)["car"] == "car.yaml"
     assert np.abs(pd.read_csv("warm.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
-    assert "leave the model out" in place.refused("estimate", "pretrained", "three.csv", "--car", "car.yaml")[1]
-    smooth = place.told("estimate", "three.csv", *known, "estimator.smoothed=true", "-o", "smooth.csv")
+    assert (
+        "leave the model out"
+        in place.refused("estimate", "pretrained", "three.csv", "--car", "car.yaml")[1]
+    )
+    smooth = place.told(
+        "estimate", "three.csv", *known, "estimator.smoothed=true", "-o", "smooth.csv"
+    )
     assert smooth["samples"] > 0
     assert np.abs(pd.read_csv("smooth.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
     assert "estimator.smooth" in place.refused("estimate", "three.csv", "estimator.smooth=true")[1]
     pd.read_csv("three.csv").drop(columns="ax").to_csv("no_ax.csv", index=False)
-    assert place.told("estimate", "no_ax.csv", "estimator.measured_ax=false", "-o", "no_ax.parquet")["samples"] > 0
+    assert (
+        place.told("estimate", "no_ax.csv", "estimator.measured_ax=false", "-o", "no_ax.parquet")[
+            "samples"
+        ]
+        > 0
+    )
     (place.folder / "other.yaml").write_text("precious: 1\n")
     assert "other.yaml" in place.refused("identify", "one.csv", "-o", "other.yaml")[1]
     assert "must end in .yaml" in place.refused("identify", "one.csv", "-o", "car.txt")[1]
     assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
-    pd.DataFrame({"time": [0.0, 0.01], "yaw_rate": [0.1, 0.11], "vx": [10.0, 10.1], "ay": [1.0, 1.1], "ax": [0.0, 0.1]}).to_csv(
-        "short.csv", index=False
-    )
+    pd.DataFrame(
+        {
+            "time": [0.0, 0.01],
+            "yaw_rate": [0.1, 0.11],
+            "vx": [10.0, 10.1],
+            "ay": [1.0, 1.1],
+            "ax": [0.0, 0.1],
+        }
+    ).to_csv("short.csv", index=False)
     assert "too short" in place.refused("identify", "short.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()
-    assert prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0] == kept.leakage.value
+    assert (
+        prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0]
+        == kept.leakage.value
+    )
 
 
 @pytest.mark.parametrize(
@@ -153,19 +227,43 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
 def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
     """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
     time = np.arange(0.0, 60.0, 1.0 / RATE)
-    speed, curvature = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]), np.where(time < 20.0, 0.09, 0.01)
-    channels = {"yaw_rate": speed * curvature * scale**-0.5, "vx": speed * scale**0.5, "ay": speed**2 * curvature, "ax": 0.0 * time}
-    sized = with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase})
-    found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if one.check == "wheelbase"]
+    speed, curvature = (
+        np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]),
+        np.where(time < 20.0, 0.09, 0.01),
+    )
+    channels = {
+        "yaw_rate": speed * curvature * scale**-0.5,
+        "vx": speed * scale**0.5,
+        "ay": speed**2 * curvature,
+        "ax": 0.0 * time,
+    }
+    sized = with_settings(
+        load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase}
+    )
+    found = [
+        one
+        for one in findings_of(recording("lap", channels), sized, ["sign", "unit"])
+        if one.check == "wheelbase"
+    ]
     assert len(found) == (words is not None)
     assert words is None or re.search(words, found[0].message)
 
 
 @pytest.mark.parametrize(
     ("dataset", "wheelbase"),
-    [("dart", 0.175), ("roboracer", 0.33), ("f1tenth", 0.33), ("ferrari_250lm", 2.4), ("s90", 2.941), ("tum", 3.0), ("av21", 3.0)],
+    [
+        ("dart", 0.175),
+        ("roboracer", 0.33),
+        ("f1tenth", 0.33),
+        ("ferrari_250lm", 2.4),
+        ("s90", 2.941),
+        ("tum", 3.0),
+        ("av21", 3.0),
+    ],
 )
-def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(data_root, dataset, wheelbase):
+def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(
+    data_root, dataset, wheelbase
+):
     config = compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
     moving = [one for one in open_source(config).recordings() if np.mean(one["vx"] > 1.0) > 0.2]
     assert moving
@@ -188,7 +286,12 @@ def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large
 )
 def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(elsewhere, change, words):
     number = {"value": 0.01, "deviation": 0.01}
-    numbers = {"leakage": number, "rear_axle": number, "compliance": number, "grip": {"value": 9.0, "deviation": 1.0}}
+    numbers = {
+        "leakage": number,
+        "rear_axle": number,
+        "compliance": number,
+        "grip": {"value": 9.0, "deviation": 1.0},
+    }
     honest = {"format": 1, "wheelbase": 2.7, "cg_to_rear_axle": None, **numbers, "offsets": {}}
     file = elsewhere / "car.yaml"
     file.write_text(yaml.safe_dump(honest))

@@ -39,24 +39,36 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monke
         failing(broken, "three", DataError("'three.csv' is unwell"))
         code, _, err = place("ingest", "mine")
         assert (code, err.strip()) == (3, "error: 'three.csv' is unwell")
-        assert [folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")] == []
+        assert [
+            folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")
+        ] == []
     assert slow == ["one", "two"]
     folder = Path(place.told("ingest", "mine")["folder"])
-    assert (slow, sorted(file.stem for file in folder.glob("*.parquet"))) == (["one", "two", "three"], ["one", "three", "two"])
-    assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [folder.name], "nothing is left beside it"
+    assert (slow, sorted(file.stem for file in folder.glob("*.parquet"))) == (
+        ["one", "two", "three"],
+        ["one", "three", "two"],
+    )
+    assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [
+        folder.name
+    ], "nothing is left beside it"
 
 
 def test_a_part_of_other_settings_is_not_used(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("unwell"))
         assert place("ingest", "mine")[0] == 3
-    assert (place("ingest", "mine", "dataset.vehicle=another")[0], slow) == (0, ["one", "two", "one", "three", "two"])
+    assert (place("ingest", "mine", "dataset.vehicle=another")[0], slow) == (
+        0,
+        ["one", "two", "one", "three", "two"],
+    )
 
 
 def test_the_second_process_compiles_health_first(place, slow, monkeypatch):
     monkeypatch.setattr("vehest.run.ingest.has_to_compile", lambda kernel: True)
     monkeypatch.setattr("vehest.run.ingest.compile_health", lambda *_: slow.append("health"))
-    monkeypatch.setattr("vehest.run.ingest.launch", lambda tasks, jobs, stop, report: launch(tasks, 1, stop, report))
+    monkeypatch.setattr(
+        "vehest.run.ingest.launch", lambda tasks, jobs, stop, report: launch(tasks, 1, stop, report)
+    )
     folder = Path(place.told("ingest", "mine", "--jobs", "2")["folder"])
     assert (slow, len(list(folder.glob("*.parquet")))) == (["one", "health", "three", "two"], 3)
     slow.clear()

@@ -19,7 +19,15 @@ from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
 from vehest.run.launchers.base import RunOptions, chosen_launcher
-from vehest.run.launchers.clusters import NotShared, pack, run_task, slurm_parameters, task_of, unpack, versions_here
+from vehest.run.launchers.clusters import (
+    NotShared,
+    pack,
+    run_task,
+    slurm_parameters,
+    task_of,
+    unpack,
+    versions_here,
+)
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
@@ -30,12 +38,28 @@ SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 def job(output, seed=0):
     training = {"max_epochs": 10}
-    config = {"estimator": {"name": "net", "kind": "small"}, "training": training, "seed": seed, "train": [], "validation": []}
-    return TrainJob(StagePlan("train", f"net-seed{seed}", config, {}, "code", output), config["estimator"], training, SPLIT, seed, {})
+    config = {
+        "estimator": {"name": "net", "kind": "small"},
+        "training": training,
+        "seed": seed,
+        "train": [],
+        "validation": [],
+    }
+    return TrainJob(
+        StagePlan("train", f"net-seed{seed}", config, {}, "code", output),
+        config["estimator"],
+        training,
+        SPLIT,
+        seed,
+        {},
+    )
 
 
 def made_in(output):
-    return make(job(output).plan, lambda folder: (folder / "model.safetensors").write_text("weights") and None)
+    return make(
+        job(output).plan,
+        lambda folder: (folder / "model.safetensors").write_text("weights") and None,
+    )
 
 
 def test_progress_has_no_more_bars_than_fit_a_terminal():
@@ -52,7 +76,14 @@ def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(t
     unpack({there: files})
     assert read_artefact(there).digest == made.digest
     with pytest.raises(DataError, match="gone or truncated"):
-        unpack({tmp_path / "other" / "train" / made.folder.name: {**files, "model.safetensors": b"weigh"}})
+        unpack(
+            {
+                tmp_path / "other" / "train" / made.folder.name: {
+                    **files,
+                    "model.safetensors": b"weigh",
+                }
+            }
+        )
     assert not list((tmp_path / "other" / "train").iterdir())
 
 
@@ -70,10 +101,18 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
 
 
 def test_a_machine_with_other_versions_or_without_the_output_root_does_nothing(tmp_path):
-    spec = replace(task_of(0, Group([job(tmp_path)], SPLIT), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
+    spec = replace(
+        task_of(0, Group([job(tmp_path)], SPLIT), tmp_path, tmp_path),
+        versions={**versions_here(), "torch": "1.0"},
+    )
     with pytest.raises(MissingError, match=r"torch .* instead of 1\.0; install the same versions"):
         run_task(spec, {}, lambda: False)
-    spec = task_of(0, Group([job(tmp_path / "out")], SPLIT), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
+    spec = task_of(
+        0,
+        Group([job(tmp_path / "out")], SPLIT),
+        tmp_path / "out",
+        tmp_path / "out" / "clusters" / "run-0",
+    )
     with pytest.raises(NotShared):
         run_task(spec, None, lambda: False)
     assert not list(tmp_path.iterdir())
@@ -93,15 +132,33 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert not old.exists()
 
 
-def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_back_failures_as_values(place, monkeypatch):
-    place.refused("run", "small", "--slurm", "minutes=5", says="--slurm is for --launcher slurm, not for local")
-    place.refused("sweep", "split=mine", "--launcher", "dask", says="--launcher must be one of local, ray, slurm")
+def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_back_failures_as_values(
+    place, monkeypatch
+):
+    place.refused(
+        "run",
+        "small",
+        "--slurm",
+        "minutes=5",
+        says="--slurm is for --launcher slurm, not for local",
+    )
+    place.refused(
+        "sweep",
+        "split=mine",
+        "--launcher",
+        "dask",
+        says="--launcher must be one of local, ray, slurm",
+    )
     launcher = chosen_launcher(RunOptions(jobs=1), place.folder, FINE)
     assert isinstance(launcher, LocalLauncher)
     (done,) = launcher.launch([Group([job(place.folder)], SPLIT)], StopSignals(), lambda *_: None)
     assert isinstance(done.outcome, Failure)
     real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "ray" else real(name, *rest))
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *rest: None if name == "ray" else real(name, *rest),
+    )
     place.refused("run", "small", "--launcher", "ray", code=4, says="pip install 'vehest[ray]'")
 
 
@@ -109,9 +166,18 @@ def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_ba
     ("where", "says"),
     [
         (RunOptions(address="auto"), "--address is for --launcher ray and slurm, not for local"),
-        (RunOptions(launcher="ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
-        (RunOptions(launcher="slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
-        (RunOptions(launcher="slurm", address="local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
+        (
+            RunOptions(launcher="ray", slurm=("minutes=5",)),
+            "--slurm is for --launcher slurm, not for ray",
+        ),
+        (
+            RunOptions(launcher="slurm", address="host:6379"),
+            "must be left out for --launcher slurm, or be 'local'",
+        ),
+        (
+            RunOptions(launcher="slurm", address="local", slurm=("minutes=soon",)),
+            "--slurm minutes must be a positive number, not 'soon'",
+        ),
         (
             RunOptions(launcher="slurm", address="local", slurm=("nodes=4",)),
             "--slurm 'nodes=4' must be NAME=VALUE with one of the names account",
@@ -125,9 +191,19 @@ def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_what_jobs_ask_of_slurm_has_the_names_of_submitit_and_without_slurm_a_line_says_where_to_run(tmp_path, monkeypatch):
+def test_what_jobs_ask_of_slurm_has_the_names_of_submitit_and_without_slurm_a_line_says_where_to_run(
+    tmp_path, monkeypatch
+):
     asked = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
-    assert asked == {"slurm_partition": "long", "timeout_min": 90, "mem_gb": 1.5, "cpus_per_task": 1, "name": "vehest"}
+    assert asked == {
+        "slurm_partition": "long",
+        "timeout_min": 90,
+        "mem_gb": 1.5,
+        "cpus_per_task": 1,
+        "name": "vehest",
+    }
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert "there is no SLURM here" in refusal(lambda: chosen_launcher(RunOptions(launcher="slurm"), tmp_path, FINE), MissingError)
+    assert "there is no SLURM here" in refusal(
+        lambda: chosen_launcher(RunOptions(launcher="slurm"), tmp_path, FINE), MissingError
+    )

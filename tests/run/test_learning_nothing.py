@@ -15,15 +15,35 @@ def steered(place):
     """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
     place.add_steered()
     tests = {"test": [{"recording": "second"}]}
-    place.change("conf/split/whole.yaml", name="whole", dataset="steered", train=[], validation=[], tests=tests)
+    place.change(
+        "conf/split/whole.yaml",
+        name="whole",
+        dataset="steered",
+        train=[],
+        validation=[],
+        tests=tests,
+    )
     parts = {"train": [{"recording": "first"}], "validation": [{"recording": "second", "stop": 10}]}
-    place.change("conf/split/cut.yaml", name="cut", dataset="steered", **parts, tests={"test": [{"recording": "second", "start": 10}]})
+    place.change(
+        "conf/split/cut.yaml",
+        name="cut",
+        dataset="steered",
+        **parts,
+        tests={"test": [{"recording": "second", "start": 10}]},
+    )
     return place
 
 
-def test_whole_recording_is_a_test_without_training_and_the_model_is_the_same_for_every_split(steered):
-    folders = [steered.told("train", *OWN_NOISE, f"split={split}")["model"] for split in ("whole", "cut")]
-    assert (folders[0], steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0]) == (folders[1], 0)
+def test_whole_recording_is_a_test_without_training_and_the_model_is_the_same_for_every_split(
+    steered,
+):
+    folders = [
+        steered.told("train", *OWN_NOISE, f"split={split}")["model"] for split in ("whole", "cut")
+    ]
+    assert (
+        folders[0],
+        steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0],
+    ) == (folders[1], 0)
     other = steered.told("train", *OWN_NOISE, "split=cut", "downsample.method=decimate")["model"]
     assert other != folders[0], "how recordings are prepared is part of a model"
     figures = steered.told("eval", *OWN_NOISE, "split=whole")
@@ -31,7 +51,9 @@ def test_whole_recording_is_a_test_without_training_and_the_model_is_the_same_fo
     assert figures["n_parameters.test"] == 0
     assert "step_seconds.test" not in figures, "offline: there is no online step to time"
     rows = pd.read_csv(Path(figures["folder"]) / "metrics.csv", keep_default_na=False)
-    assert set(zip(rows["trained_on"], rows["mode"], rows["test_set"], strict=True)) == {("", "offline", "test")}
+    assert set(zip(rows["trained_on"], rows["mode"], rows["test_set"], strict=True)) == {
+        ("", "offline", "test")
+    }
 
 
 def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
@@ -39,7 +61,14 @@ def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
     out, err = steered.done("train", *arguments, "--json")
     assert (json.loads(out)["n_parameters"], "3 parameters" in err) == (3, True)
     assert math.isfinite(steered.told("eval", *arguments)["step_seconds.test"])
-    steered.refused("eval", "--model", json.loads(out)["model"], "split=whole", "tracking=none", says="shares samples with")
+    steered.refused(
+        "eval",
+        "--model",
+        json.loads(out)["model"],
+        "split=whole",
+        "tracking=none",
+        says="shares samples with",
+    )
     said = "split 'whole' has nothing to train on, and estimator 'ksnn' learns"
     steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none", says=said)
 

@@ -9,15 +9,30 @@ from vehest.data.store import read_recording
 
 def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):
     place.change("conf/dataset/mine.yaml", reference_point="unknown")
-    place.change("pipelines/levers.yaml", study="levers", report="drive", split="mine", sweeps=[["estimator=zero"]])
+    place.change(
+        "pipelines/levers.yaml",
+        study="levers",
+        report="drive",
+        split="mine",
+        sweeps=[["estimator=zero"]],
+    )
     shown = place.told("run", "levers", "tracking=none", "output=out")
     table = pd.read_csv(next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv")
     tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
-    levers, nominal = (tests[tests["condition"] == name].set_index("metric")["value"] for name in ("best_lever_arm", "nominal"))
+    levers, nominal = (
+        tests[tests["condition"] == name].set_index("metric")["value"]
+        for name in ("best_lever_arm", "nominal")
+    )
     assert set(levers.index) == {"rmse_vy", "rmse_sideslip", "fvu", "lever_arm"}
-    assert levers["lever_arm"] == 0.5  # v is about -2.2 m·r, so v = 0 lies as far ahead as is allowed
-    recording = read_recording(next((place.folder / "out" / "downsample").glob("mine-20hz-*")) / "three.parquet")
+    assert (
+        levers["lever_arm"] == 0.5
+    )  # v is about -2.2 m·r, so v = 0 lies as far ahead as is allowed
+    recording = read_recording(
+        next((place.folder / "out" / "downsample").glob("mine-20hz-*")) / "three.parquet"
+    )
     late = recording.time >= recording.start_time + 1.5 - 1e-9
     rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
     assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
-    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [pytest.approx(nominal["rmse_sideslip"])]
+    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [
+        pytest.approx(nominal["rmse_sideslip"])
+    ]

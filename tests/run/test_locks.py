@@ -40,7 +40,9 @@ def held_elsewhere(output, stage, name):
         process.communicate()
 
 
-def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(tmp_path):
+def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(
+    tmp_path,
+):
     lock, said = Lock(tmp_path, "train", "a model"), []
     asked = iter([False, False, True])
     with held_elsewhere(tmp_path, "train", "a model") as holder:
@@ -48,7 +50,9 @@ def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_wh
         assert lock.holder.startswith(f"process {holder.pid} on ")
         with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
             assert not mine
-        assert [(waiting.stage, waiting.label, str(holder.pid) in waiting.holder) for waiting in said] == [("train", "a model", True)]
+        assert [
+            (waiting.stage, waiting.label, str(holder.pid) in waiting.holder) for waiting in said
+        ] == [("train", "a model", True)]
         os.kill(holder.pid, signal.SIGKILL)
         holder.wait()
         assert lock.take()
@@ -58,10 +62,16 @@ def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_wh
 def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, monkeypatch):
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: kernel == group.FLOOR_KERNEL)
     asked = iter([False, False, True])
-    with held_elsewhere(tmp_path, "compile", "health"), group._compiled_by_one(tmp_path, lambda: next(asked)):
+    with (
+        held_elsewhere(tmp_path, "compile", "health"),
+        group._compiled_by_one(tmp_path, lambda: next(asked)),
+    ):
         assert next(asked, "all") == "all"
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: False)
-    with held_elsewhere(tmp_path, "compile", "health"), group._compiled_by_one(tmp_path, pytest.fail):
+    with (
+        held_elsewhere(tmp_path, "compile", "health"),
+        group._compiled_by_one(tmp_path, pytest.fail),
+    ):
         pass
 
 
@@ -76,7 +86,10 @@ def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
 
 
 def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path):
-    plans = [StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", tmp_path) for seed in range(3)]
+    plans = [
+        StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", tmp_path)
+        for seed in range(3)
+    ]
     jobs = [TrainJob(plan, {}, {}, None, seed, {}) for seed, plan in enumerate(plans)]
     first, second = jobs[0].plan.lock, jobs[1].plan.lock
     assert first.take()
@@ -106,7 +119,12 @@ def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
     assert place("ingest", "mine")[0] == 0
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
     with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
-        waiting = start([*COMMAND, "ingest", "mine", "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        waiting = start(
+            [*COMMAND, "ingest", "mine", "--force"],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         line = waiting.stderr.readline()
         assert line.split()[:3] == ["waiting", "ingest", folder.name]
         assert f"process {holder.pid} on " in line
@@ -118,12 +136,21 @@ def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("stage", ["ingest", "train"])
 def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place, stage, number, code):
-    command = ["ingest", "mine"] if stage == "ingest" else ["train", "split=mine", "training.max_epochs=1", "tracking=none"]
+    command = (
+        ["ingest", "mine"]
+        if stage == "ingest"
+        else ["train", "split=mine", "training.max_epochs=1", "tracking=none"]
+    )
     assert place(*command)[0] == 0
     before = place.files()
     [folder] = (place.folder / "outputs" / stage).iterdir()
     with held_elsewhere(place.folder / "outputs", stage, folder.name):
-        waiting = start([*COMMAND, *command, "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        waiting = start(
+            [*COMMAND, *command, "--force"],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         while "waiting" not in (line := waiting.stderr.readline()):
             assert line, "it ended without waiting"
         waiting.send_signal(number)
@@ -166,15 +193,24 @@ print(at_once(1, "alone"), at_once(3, "together"))
 """
 
 
-def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(place):
+def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(
+    place,
+):
     from mlflow import MlflowClient
 
-    done = subprocess.run([sys.executable, "-c", SIDE_BY_SIDE], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", SIDE_BY_SIDE], capture_output=True, text=True, check=False
+    )
     said = {file.name: file.read_text() for file in place.folder.glob("said-*")}
     assert done.stdout == "[0] [0, 0, 0]\n", (done.stderr, said)
     alone, together = place.folder / "alone", place.folder / "together"
     assert _contents(together) == _contents(alone)
-    lines = [line.split() for text in said.values() for line in text.splitlines() if line.startswith("done")]
+    lines = [
+        line.split()
+        for text in said.values()
+        for line in text.splitlines()
+        if line.startswith("done")
+    ]
     made = [tuple(words[1:3]) for words in lines]
     assert len(made) == 2 * len(set(made)), "each is made once alone and once by one of the three"
     client = MlflowClient(f"sqlite:///{together / 'mlflow.db'}")
@@ -182,7 +218,9 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
     runs = [run for run in found if run.data.tags["vehest.stage"] != "study"]
     assert len(found) == len(runs) + 1, "and one above them"
     tracked = _artefacts(together, ("train", "calibrate", "evaluate"))
-    assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(artefact.key for artefact in tracked)
+    assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(
+        artefact.key for artefact in tracked
+    )
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert not list((together / "checkpoints").rglob("*"))
 
@@ -190,15 +228,23 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
 def test_a_training_made_again_leaves_its_evaluation_up_to_date(place):
     arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
     place.told("train", *arguments)
-    assert [place.told(*words)["skipped"] for words in (("eval", *arguments), ("train", *arguments, "--force"))] == [False, False]
+    assert [
+        place.told(*words)["skipped"]
+        for words in (("eval", *arguments), ("train", *arguments, "--force"))
+    ] == [False, False]
     evaluated = place.told("eval", *arguments)
     assert evaluated["skipped"] is True
     assert min(evaluated["train_seconds.test"], evaluated["step_seconds.test"]) > 0
 
 
 def _artefacts(output, stages):
-    return [read_artefact(folder) for stage in stages for folder in sorted((output / stage).iterdir())]
+    return [
+        read_artefact(folder) for stage in stages for folder in sorted((output / stage).iterdir())
+    ]
 
 
 def _contents(output):
-    return {own.folder.name: own.digest for own in _artefacts(output, ("ingest", "downsample", "train", "calibrate", "evaluate"))}
+    return {
+        own.folder.name: own.digest
+        for own in _artefacts(output, ("ingest", "downsample", "train", "calibrate", "evaluate"))
+    }

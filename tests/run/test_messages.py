@@ -36,7 +36,10 @@ def _shows_only_text(text):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("trian",), "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options"),
+        (
+            ("trian",),
+            "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options",
+        ),
         (("train", "--nope"), "'vehest train --help' lists commands and options"),
         (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
         (("run", "small", "--jobs", "0"), "invalid value for '--jobs'"),
@@ -49,8 +52,26 @@ def _shows_only_text(text):
         (("sweep", "split=mine", "limits=5", "--dry-run"), ""),
         (("sweep", "split=mine", "limits.jobs=1,2", "--dry-run"), ""),
         (("sweep", "split=mine", "seed=range(6)", "limits.jobs=5", "--dry-run"), ""),
-        (("sweep", "split=mine", "seed=range(200)", "training.patience=range(1,100)", "--dry-run"), "19800 jobs"),
-        (("sweep", "split=mine", "seed=range(200)", "training.patience=range(1,100)", "--dry-run"), "limits.jobs=NUMBER"),
+        (
+            (
+                "sweep",
+                "split=mine",
+                "seed=range(200)",
+                "training.patience=range(1,100)",
+                "--dry-run",
+            ),
+            "19800 jobs",
+        ),
+        (
+            (
+                "sweep",
+                "split=mine",
+                "seed=range(200)",
+                "training.patience=range(1,100)",
+                "--dry-run",
+            ),
+            "limits.jobs=NUMBER",
+        ),
         *(
             (("sweep", "split=mine", f"seed={value}", "--dry-run"), words)
             for value, words in (
@@ -72,12 +93,22 @@ def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
 
 
 def test_hostile_names_reach_the_terminal_as_text(place):
-    place.change("conf/dataset/mine.yaml", **dict.fromkeys(("title", "licence", "citation", "vehicle"), HOSTILE))
-    (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{HOSTILE.replace('/', '')}.csv")
+    place.change(
+        "conf/dataset/mine.yaml",
+        **dict.fromkeys(("title", "licence", "citation", "vehicle"), HOSTILE),
+    )
+    (place.folder / "raw" / "one.csv").rename(
+        place.folder / "raw" / f"{HOSTILE.replace('/', '')}.csv"
+    )
     table = pd.read_csv(place.folder / "raw" / "two.csv").rename(columns={"Yaw": HOSTILE})
     table.to_csv(place.folder / "raw" / "two.csv", index=False)
     good = "dataset.files='[!t]*.csv'"
-    for arguments in (("data", "show", "mine", good), ("data", "check", "mine"), ("config", "ingest", "dataset=mine"), ("ingest", "mine")):
+    for arguments in (
+        ("data", "show", "mine", good),
+        ("data", "check", "mine"),
+        ("config", "ingest", "dataset=mine"),
+        ("ingest", "mine"),
+    ):
         code, out, err = place(*arguments)
         assert "defect" not in err
         assert _shows_only_text(out + err), arguments
@@ -93,7 +124,11 @@ def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_befo
         assert _shows_only_text(out)
         assert read(out)["output"] == hostile
     assert "β" in as_yaml({"name": "β"})
-    emit(False, None, [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])])
+    emit(
+        False,
+        None,
+        [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])],
+    )
     out = capsys.readouterr().out
     assert _shows_only_text(out)
     assert "[bold]name[/]" in out
@@ -110,7 +145,12 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     messages = Messages()
     seen = io.StringIO()
     messages.console = type(messages.console)(
-        file=seen, force_terminal=terminal, color_system=None, soft_wrap=True, width=200, highlight=False
+        file=seen,
+        force_terminal=terminal,
+        color_system=None,
+        soft_wrap=True,
+        width=200,
+        highlight=False,
     )
     messages.line("done", "train", HOSTILE + "\\", HOSTILE)
     messages.warn(f"first\n{HOSTILE}")
@@ -136,9 +176,21 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     out.encode("utf-8")
     assert json.loads(out)["recordings"][0]["id"] == os.fsdecode(b"lap\xff")
     assert r"lap\udcff: real" in place("data", "show", lap)[1]
-    assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")[0] == 0
+    assert (
+        place(
+            "train",
+            "estimator=luenberger",
+            "split=mine",
+            "training.grid=1",
+            "training.max_evaluations=5",
+            "tracking=none",
+        )[0]
+        == 0
+    )
     for name in (b"out\xfe.parquet", b"out\xfe.csv"):
-        assert place.told("estimate", "luenberger", lap, "-o", os.fsdecode(name))["out"] == os.fsdecode(name)
+        assert place.told("estimate", "luenberger", lap, "-o", os.fsdecode(name))[
+            "out"
+        ] == os.fsdecode(name)
         assert name in os.listdir(b".")
     code, line = place.refused("data", "show", os.fsdecode(b"other\xff.csv"))
     assert (code, r"'other\udcff.csv' is neither" in line) == (2, True)
@@ -147,28 +199,63 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
 def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(place):
     name = os.fsdecode(b"one\xff")
     (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{name}.csv")
-    place.change("conf/split/mine.yaml", train=[{"recording": "three"}], tests={"test": [{"recording": name}]})
+    place.change(
+        "conf/split/mine.yaml",
+        train=[{"recording": "three"}],
+        tests={"test": [{"recording": name}]},
+    )
     sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
-    hostile = {"title": "T <script>alert(1)</script>", "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))"}
+    hostile = {
+        "title": "T <script>alert(1)</script>",
+        "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))",
+    }
     place.change("pipelines/small.yaml", sweeps=sweeps, **hostile)
     report = Path(place.told("run", "small", "tracking=none")["report"])
     assert r"recording one\\udcff" in report.with_suffix(".md").read_text(encoding="utf-8")
-    for text in (report.read_text(encoding="utf-8"), report.with_suffix(".md").read_text(encoding="utf-8")):
+    for text in (
+        report.read_text(encoding="utf-8"),
+        report.with_suffix(".md").read_text(encoding="utf-8"),
+    ):
         assert "T &lt;script" in text
-        assert not any(words in text for words in ("<script>alert", "<img src=x", 'href="javascript'))
+        assert not any(
+            words in text for words in ("<script>alert", "<img src=x", 'href="javascript')
+        )
     assert "[x](javascript" not in report.with_suffix(".md").read_text(encoding="utf-8")
     assert r"one\udcff" in (report.parent / "tables" / "ranges.csv").read_text(encoding="utf-8")
 
 
 def test_ranges_count_what_they_expand_to_and_the_limit_of_jobs_is_raised_by_an_override(place):
-    for text in ("range(7)", "range(2,9,3)", "range(9,2,-3)", "range(0,1,0.1)", "range(5,1,-0.25)", "1,2,3", "choice(a,b)", "glob(k*)"):
+    for text in (
+        "range(7)",
+        "range(2,9,3)",
+        "range(9,2,-3)",
+        "range(0,1,0.1)",
+        "range(5,1,-0.25)",
+        "1,2,3",
+        "choice(a,b)",
+        "glob(k*)",
+    ):
         key = "estimator" if "glob" in text else "seed"
-        assert count([f"{key}={text}", "training.patience=1,2"]) == len(expand([f"{key}={text}", "training.patience=1,2"])) > 0
+        assert (
+            count([f"{key}={text}", "training.patience=1,2"])
+            == len(expand([f"{key}={text}", "training.patience=1,2"]))
+            > 0
+        )
     assert place("sweep", "split=mine", "seed=range(6)", "limits.jobs=6", "--dry-run")[0] == 0
     assert limits_of(["limits.jobs=12345", "seed=3"]).jobs == 12345
-    place.refused("run", "small", "limits.jobs=3", "--dry-run", code=2, says="small.yaml' stand for at least 4 jobs")
+    place.refused(
+        "run",
+        "small",
+        "limits.jobs=3",
+        "--dry-run",
+        code=2,
+        says="small.yaml' stand for at least 4 jobs",
+    )
     assert place("run", "small", "limits.jobs=4", "--dry-run")[0] == 0
-    with use_limits(Limits(jobs=3)), pytest.raises(ConfigurationError, match="stand for at least 4 jobs"):
+    with (
+        use_limits(Limits(jobs=3)),
+        pytest.raises(ConfigurationError, match="stand for at least 4 jobs"),
+    ):
         expand(["seed=range(4)"])
 
 
@@ -198,7 +285,13 @@ def _small_disk(size):
 
 
 def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
-    trained = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    trained = (
+        "estimator=luenberger",
+        "split=mine",
+        "training.grid=1",
+        "training.max_evaluations=5",
+        "tracking=none",
+    )
     place.change("pipelines/small.yaml", sweeps=[[trained[0], *trained[2:4]]])
     drive = planar_drive(30.0, 100.0)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
@@ -233,7 +326,9 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     "error",
     [
         *(OSError(code, os.strerror(code)) for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)),
-        SafetensorError('Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No space left on device" })'),
+        SafetensorError(
+            'Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No space left on device" })'
+        ),
         sqlite3.OperationalError("database or disk is full"),
         RuntimeError("wrapped: No space left on device (os error 28)"),
         ValueError("no space"),
@@ -250,7 +345,11 @@ def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
 
     with pytest.raises(MissingError if full else ValueError, match=said):
         break_off()
-    assert (list(tmp_path.iterdir()), failure_of(error).exit_code == 4, no_room(error) is not None) == ([], full, full)
+    assert (
+        list(tmp_path.iterdir()),
+        failure_of(error).exit_code == 4,
+        no_room(error) is not None,
+    ) == ([], full, full)
 
 
 @pytest.mark.parametrize(
@@ -258,9 +357,17 @@ def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
     [
         (MemoryError(), 4, "out of memory; close other programs, or ask for less at a time"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 4, "out of memory"),
-        (RecursionError("maximum recursion depth exceeded"), 1, "nests too deeply: make it flatter"),
+        (
+            RecursionError("maximum recursion depth exceeded"),
+            1,
+            "nests too deeply: make it flatter",
+        ),
         (OSError(errno.ENOSPC, "No space left on device"), 4, "no room left"),
-        (PermissionError(errno.EACCES, "Permission denied", "/some/file"), 4, "'/some/file' cannot be used: Permission denied"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "/some/file"),
+            4,
+            "'/some/file' cannot be used: Permission denied",
+        ),
         (KeyError("x\x1b[31m"), 1, "this is a defect of vehest (KeyError: 'x"),
         (ValueError("x" * 100_000), 1, "…"),
     ],
@@ -277,9 +384,15 @@ def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, wor
 
 def _shell(place, script, **environment):
     command = f"vehest() {{ '{sys.executable}' -m vehest \"$@\"; }}\n{script}"
-    kept = {name: value for name, value in os.environ.items() if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")
+    }
     options = {"cwd": place.folder, "env": {**kept, **environment}, "stdin": subprocess.DEVNULL}
-    return subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=300, **options)
+    return subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=300, **options
+    )
 
 
 @pytest.mark.parametrize(
@@ -287,7 +400,12 @@ def _shell(place, script, **environment):
     [
         ("vehest data channels >&-", 0, "", ""),
         ("vehest data channels <&- >&- 2>&-", 0, "", ""),
-        ("vehest data channels --json >/dev/full", 4, "", "error: cannot write to standard output (No space left on device)\n"),
+        (
+            "vehest data channels --json >/dev/full",
+            4,
+            "",
+            "error: cannot write to standard output (No space left on device)\n",
+        ),
         ("{ vehest data channels; echo $? >&2; } | true", 0, "", "141\n"),
         ("mkdir gone; cd gone; rmdir ../gone; vehest data channels >/dev/null", 0, "", ""),
         (
@@ -305,9 +423,13 @@ def test_broken_streams_and_odd_folders_end_in_words(place, script, code, out, e
 
 def test_no_home_no_terminal_and_no_utf_8_still_show_everything(place):
     bare = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
-    plain, table = (_shell(place, f"vehest data channels {words}", **bare) for words in ("--json", ""))
+    plain, table = (
+        _shell(place, f"vehest data channels {words}", **bare) for words in ("--json", "")
+    )
     assert [(own.returncode, own.stderr) for own in (plain, table)] == [(0, "")] * 2
     assert plain.stdout.isascii()
     assert json.loads(plain.stdout) == place.told("data", "channels")
     assert "m/s²" in table.stdout
-    place.refused("ingest", "mine", "output=/proc/nothing", code=4, says="cannot write '/proc/nothing")
+    place.refused(
+        "ingest", "mine", "output=/proc/nothing", code=4, says="cannot write '/proc/nothing"
+    )

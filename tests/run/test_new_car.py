@@ -61,17 +61,33 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     ):
         assert words in said
     assert held(0)["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
-    assert [entry["name"] for entry in held(0)["transforms"]] == ["velocity_from_sideslip", "steering_ratio"]
+    assert [entry["name"] for entry in held(0)["transforms"]] == [
+        "velocity_from_sideslip",
+        "steering_ratio",
+    ]
     sweeps = [" ".join(sweep) for sweep in held(2)["parts"]["all"]["sweeps"]]
-    assert sweeps[:2] == ["estimator=zero,static_map,kinematic", "estimator=data_sheet estimator.wheelbase=2.7"]
-    assert any("estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps)
+    assert sweeps[:2] == [
+        "estimator=zero,static_map,kinematic",
+        "estimator=data_sheet estimator.wheelbase=2.7",
+    ]
+    assert any(
+        "estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps
+    )
 
 
 def test_an_answer_that_is_none_is_asked_again(log):
     said = log.typed("lap.csv", answers=["perhaps", "no", "-3", "", "", ""])
-    assert all(words in said for words in ("'perhaps' is neither yes nor no", "wheelbase must be a positive number, not '-3'"))
+    assert all(
+        words in said
+        for words in (
+            "'perhaps' is neither yes nor no",
+            "wheelbase must be a positive number, not '-3'",
+        )
+    )
     signs = {name: entry.get("sign", 1) for name, entry in held(0)["channels"].items()}
-    assert signs == {"vx": 1, "ax": 1} | dict.fromkeys(("yaw_rate", "ay", "handwheel", "sideslip_ref"), -1)
+    assert signs == {"vx": 1, "ax": 1} | dict.fromkeys(
+        ("yaw_rate", "ay", "handwheel", "sideslip_ref"), -1
+    )
 
 
 def test_a_column_can_be_declared_otherwise_or_left_out(log):
@@ -88,25 +104,40 @@ def test_yes_asks_nothing_lists_what_it_left_open_and_overwrites_nothing_without
     assert err == ""
     assert "open, taken as proposed:\n  left_right: yes (in a left turn" in out
     assert all(f"wrote {file}: " in out for file in FILES)
-    assert "Open, not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
+    assert "Open, not decided by the log: in a left turn" in Path(FILES[0]).read_text(
+        encoding="utf-8"
+    )
     for file in FILES:
         Path(file).unlink()
     Path(FILES[1]).write_text("mine")
     _, err = log.new("lap.csv", "--yes", code=2)
-    assert err == f"error: '{FILES[1]}' is there already; take another name, or --force to write it anew\n"
+    assert (
+        err
+        == f"error: '{FILES[1]}' is there already; take another name, or --force to write it anew\n"
+    )
     assert (Path(FILES[1]).read_text(), Path(FILES[0]).exists()) == ("mine", False)
     log.new("lap.csv", "--yes", "--force")
     assert held(1)["dataset"] == "my_car"
     log.write("bare.csv", usual(drive()).drop(columns="Beta"))
     log.new("bare.csv", "--yes", "--force")
-    assert [Path(file).exists() for file in FILES] == [True, False, False], "split and pipeline that the new log does not allow"
+    assert [Path(file).exists() for file in FILES] == [True, False, False], (
+        "split and pipeline that the new log does not allow"
+    )
 
 
 def test_json_says_all_of_it_to_a_script(log):
     said = json.loads(log.new("lap.csv", "--json", "--dry-run")[0])
     assert {one["channel"]: one["column"] for one in said["channels"]}["ay"] == "LatAcc"
-    assert said["time"] == {"column": "Time [s]", "unit": "s", "evidence": "unit in the header, 50 Hz", "asked": False}
-    assert ([question["key"] for question in said["open"]], said["has_reference"]) == (["left_right"], True)
+    assert said["time"] == {
+        "column": "Time [s]",
+        "unit": "s",
+        "evidence": "unit in the header, 50 Hz",
+        "asked": False,
+    }
+    assert ([question["key"] for question in said["open"]], said["has_reference"]) == (
+        ["left_right"],
+        True,
+    )
     assert said["lacking"]["data_sheet"] == "the car's wheelbase"
     assert not any(Path(file).exists() for file in FILES)
     assert json.loads(log.new("lap.csv", "--json", "--answer", "left_right=no")[0])["open"] == []
@@ -122,9 +153,22 @@ def test_run_takes_what_was_written(log):
     log.new("lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500")
     code, _, err = log("run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
-    planned = [line.split()[2].partition("-")[0] for line in err.splitlines() if line.startswith("would   train")]
+    planned = [
+        line.split()[2].partition("-")[0]
+        for line in err.splitlines()
+        if line.startswith("would   train")
+    ]
     assert planned[0] == "zero"
-    assert set(planned) >= {"static_map", "data_sheet", "ksnn", "luenberger", "kalman", "gru", "sideslip_ffnn", "cnn_ukf"}
+    assert set(planned) >= {
+        "static_map",
+        "data_sheet",
+        "ksnn",
+        "luenberger",
+        "kalman",
+        "gru",
+        "sideslip_ffnn",
+        "cnn_ukf",
+    }
     assert log("data", "check", "my_car")[0] == 0
 
 
@@ -158,10 +202,16 @@ def test_files_beside_those_that_are_named_stay_out_of_the_data_set(log):
     assert [one["id"] for one in shown["recordings"]] == ["run_1", "run_2"]
 
 
-def test_without_a_speed_no_pipeline_is_written_that_could_not_run_and_a_yaw_rate_alone_is_written(log):
+def test_without_a_speed_no_pipeline_is_written_that_could_not_run_and_a_yaw_rate_alone_is_written(
+    log,
+):
     log.write("slow.csv", usual(drive()).drop(columns="Speed"))
     out, _ = log.new("slow.csv", "--yes")
-    assert ("vx is missing" in out, "vehest run" in out, Path(FILES[2]).exists()) == (True, False, False)
+    assert ("vx is missing" in out, "vehest run" in out, Path(FILES[2]).exists()) == (
+        True,
+        False,
+        False,
+    )
     assert log("data", "check", "my_car")[0] == 0
     log.write("gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     out, err = log.new("gyro.csv", "--yes", "--force")
@@ -180,7 +230,10 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(lo
     assert "left out: velocity_gru: 15 s in each range for validation (the shortest has 8 s)" in out
     assert sorted(one["recording"] for own in parts for one in own) == names
     out, _ = log.new(*files[:2], "--yes", "--force")
-    assert "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more" in out
+    assert (
+        "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more"
+        in out
+    )
     assert "vehest run" not in out
 
 
@@ -190,8 +243,14 @@ def test_a_slow_log_and_one_whose_clock_is_a_millionth_off_are_written_as_run_ta
     log.new("slow.csv", "--yes", "--steering-ratio", "15")
     assert held(2)["evaluation"]["rate_hz"] == 10
     words = [word for sweep in held(2)["parts"]["all"]["sweeps"] for word in sweep]
-    assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (True, False)
-    log.write("off.csv", usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"))
+    assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (
+        True,
+        False,
+    )
+    log.write(
+        "off.csv",
+        usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"),
+    )
     log.new("off.csv", "--yes", "--force")
     assert held(0)["clock"] == "interpolate"
 
@@ -200,7 +259,10 @@ def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothi
     for name, rows in (("long", 2500), ("short", 400), ("piece", 100)):
         log.write(f"{name}.csv", usual(drive()).iloc[:rows])
     log.new("long.csv", "short.csv", "piece.csv", "--yes")
-    assert held(1)["train"] == [{"recording": "long", "start": "0 %", "stop": "50 %"}, {"recording": "short"}]
+    assert held(1)["train"] == [
+        {"recording": "long", "start": "0 %", "stop": "50 %"},
+        {"recording": "short"},
+    ]
     assert held(1)["tests"] == {"test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]}
     assert log("run", "my_car", "--dry-run")[0] == 0
 
@@ -208,7 +270,10 @@ def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothi
 def test_an_estimator_of_ones_own_is_compared_too(log, monkeypatch):
     own = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
     _, err = log.new(*own, code=2)
-    assert '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip' in err
+    assert (
+        '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip'
+        in err
+    )
     install_examples(log.folder / "installed", monkeypatch)
     try:
         log.new(*own)

@@ -19,9 +19,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-WATCHED = {"exec", "compile", "import", "code.__new__", "marshal.loads", "pickle.find_class", "ctypes.dlopen"}
-WATCHED |= {"os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "subprocess.Popen", "pty.spawn"}
-WATCHED |= {"socket.connect", "urllib.Request", "sqlite3.enable_load_extension", "sqlite3.load_extension"}
+WATCHED = {
+    "exec",
+    "compile",
+    "import",
+    "code.__new__",
+    "marshal.loads",
+    "pickle.find_class",
+    "ctypes.dlopen",
+}
+WATCHED |= {
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.fork",
+    "os.forkpty",
+    "subprocess.Popen",
+    "pty.spawn",
+}
+WATCHED |= {
+    "socket.connect",
+    "urllib.Request",
+    "sqlite3.enable_load_extension",
+    "sqlite3.load_extension",
+}
 MARK = "MARK"  # what every hostile file would leave behind if it were run
 PAYLOAD = f"__import__('os').system('touch {MARK}')"
 PICKLE = b"cos\nsystem\n(S'touch MARK'\ntR."
@@ -34,7 +56,15 @@ def by_source(**dataset):
     def read(file):
         from vehest.sources.base import open_source
 
-        (recording,) = open_source({"name": "mine", "path": str(file.parent), "files": file.name, "vehicle": "car", **dataset}).recordings()
+        (recording,) = open_source(
+            {
+                "name": "mine",
+                "path": str(file.parent),
+                "files": file.name,
+                "vehicle": "car",
+                **dataset,
+            }
+        ).recordings()
         return recording
 
     return read
@@ -46,7 +76,11 @@ def mdf(honest, hostile):
 
     def write(file, version, conversion):
         raw = np.arange(len(FAST)) % 40
-        write_mdf(file, {"Only": [asammdf.Signal(raw, FAST, name="v", unit="m/s", conversion=conversion)]}, version)
+        write_mdf(
+            file,
+            {"Only": [asammdf.Signal(raw, FAST, name="v", unit="m/s", conversion=conversion)]},
+            version,
+        )
 
     for version in ("4.10", "3.30"):
         write(honest / f"a{version}.mf4", version, {"a": 2.0, "b": 1.0})
@@ -58,7 +92,9 @@ def mdf(honest, hostile):
     with asammdf.MDF(version="4.10") as measurement:
         measurement.append([asammdf.Signal(FAST, FAST, name="v", unit="m/s")], comment="Only")
         measurement.attach(data=bomb, file_name=f"../../{MARK}.arxml", embedded=True)
-        Path(measurement.save(hostile / "attached.mf4", overwrite=True)).rename(hostile / "attached.mf4")
+        Path(measurement.save(hostile / "attached.mf4", overwrite=True)).rename(
+            hostile / "attached.mf4"
+        )
     return by_source(source="mdf", rate_hz=100, channels=ONE)
 
 
@@ -66,42 +102,75 @@ def rosbag(honest, hostile):
     from test_sources_rosbag import Topic, write_bag
 
     values = {"/v": Topic("std_msgs/msg/Float64", FAST, {"data": np.sin(FAST)})}
-    good, _ = (write_bag(honest, values, storage, {}, name=storage) for storage in ("sqlite3", "mcap"))
-    view = "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, {} AS data"
-    endless = (
-        "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+    good, _ = (
+        write_bag(honest, values, storage, {}, name=storage) for storage in ("sqlite3", "mcap")
     )
+    view = "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, {} AS data"
+    endless = "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
     layout = f"float64 data\n{PAYLOAD}\nfloat64 x={PAYLOAD}\n".replace("'", "''")
     for name, *statements in (
         ("view_load", "DROP TABLE messages", view.format(f"load_extension('./{MARK}.so')")),
         ("view_zeros", "DROP TABLE messages", view.format("zeroblob(1000000000)")),
-        ("trigger", f"CREATE TRIGGER evil AFTER INSERT ON messages BEGIN SELECT load_extension('./{MARK}.so'); END"),
+        (
+            "trigger",
+            f"CREATE TRIGGER evil AFTER INSERT ON messages BEGIN SELECT load_extension('./{MARK}.so'); END",
+        ),
         ("endless", "DROP TABLE messages", f"CREATE VIEW messages AS {endless}"),
         ("layout", f"UPDATE message_definitions SET encoded_message_definition = '{layout}'"),
-        ("quality", f"UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [touch {MARK}]'"),
+        (
+            "quality",
+            f"UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [touch {MARK}]'",
+        ),
     ):
         shutil.copytree(good, hostile / name)
-        with contextlib.closing(sqlite3.connect(hostile / name / "sqlite3.db3")) as database, database:
+        with (
+            contextlib.closing(sqlite3.connect(hostile / name / "sqlite3.db3")) as database,
+            database,
+        ):
             for statement in statements:
                 database.execute(statement)
-    for name, tag in (("object", "!!python/object/apply:os.system"), ("module", "!!python/module:antigravity")):
+    for name, tag in (
+        ("object", "!!python/object/apply:os.system"),
+        ("module", "!!python/module:antigravity"),
+    ):
         shutil.copytree(good, hostile / f"yaml_{name}")
-        (hostile / f"yaml_{name}" / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {tag} [touch {MARK}]\n")
+        (hostile / f"yaml_{name}" / "metadata.yaml").write_text(
+            f"rosbag2_bagfile_information: {tag} [touch {MARK}]\n"
+        )
     topics = {"v": {"topic": "/v", "type": "std_msgs/msg/Float64", "stamps": "received"}}
-    return by_source(source="rosbag", rate_hz=50, topics=topics, channels={"vx": {"topic": "v", "field": "data", "unit": "m/s"}})
+    return by_source(
+        source="rosbag",
+        rate_hz=50,
+        topics=topics,
+        channels={"vx": {"topic": "v", "field": "data", "unit": "m/s"}},
+    )
 
 
 def table(honest, hostile):
     def write(file, header, first):
         with open(file, "w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream).writerows([header, *([f"{t:.2f}", first if k == 3 else f"{t / 2:.3f}"] for k, t in enumerate(FAST))])
+            csv.writer(stream).writerows(
+                [
+                    header,
+                    *(
+                        [f"{t:.2f}", first if k == 3 else f"{t / 2:.3f}"]
+                        for k, t in enumerate(FAST)
+                    ),
+                ]
+            )
 
     write(honest / "a.csv", ["time", "v"], "0.015")
-    for number, cell in enumerate([PAYLOAD, f'=cmd|" /C touch {MARK}"!A0', "1j", "nan(0x1)", "$(touch MARK)"]):
+    for number, cell in enumerate(
+        [PAYLOAD, f'=cmd|" /C touch {MARK}"!A0', "1j", "nan(0x1)", "$(touch MARK)"]
+    ):
         write(hostile / f"cell{number}.csv", ["time", "v"], cell)
         write(hostile / f"header{number}.csv", ["time", "v", cell], "0.015")
     (hostile / "pickle.csv").write_bytes(PICKLE)
-    return by_source(source="tabular", time={"column": "time", "unit": "s"}, channels={"vx": {"column": "v", "unit": "m/s"}})
+    return by_source(
+        source="tabular",
+        time={"column": "time", "unit": "s"},
+        channels={"vx": {"column": "v", "unit": "m/s"}},
+    )
 
 
 def vbo(honest, hostile):
@@ -118,9 +187,13 @@ def vbo(honest, hostile):
             (" +2.000000E-02 ", f" {PAYLOAD} "),
         ]
         for name, (old, new) in zip(("comment", "cell", "column", "number"), spoilt, strict=True):
-            (hostile / f"{name}{number}.vbo").write_text(content.replace(old, new, 1), encoding="latin-1")
+            (hostile / f"{name}{number}.vbo").write_text(
+                content.replace(old, new, 1), encoding="latin-1"
+            )
     (hostile / "pickle.vbo").write_bytes(b"[column names]\ntime\n[data]\n" + PICKLE)
-    return by_source(**{key: value for key, value in dataset(honest).items() if key not in ("name", "path")})
+    return by_source(
+        **{key: value for key, value in dataset(honest).items() if key not in ("name", "path")}
+    )
 
 
 def model(honest, hostile):
@@ -132,7 +205,11 @@ def model(honest, hostile):
     shutil.copytree(good, honest / "model")
     described = (good / "model.yaml").read_text(encoding="utf-8")
     lines = [line for line in described.splitlines() if not line.startswith("estimator:")]
-    tags = ("!!python/object/apply:os.system", "!!python/object/new:os.system", "!!python/module:antigravity")
+    tags = (
+        "!!python/object/apply:os.system",
+        "!!python/object/new:os.system",
+        "!!python/module:antigravity",
+    )
     names = ("os.system", "antigravity", "../../evil", "vehest.cli", PAYLOAD)
     texts = [f"{described}\nmore: {tag} [touch {MARK}]\n" for tag in tags]
     texts += ["\n".join([f"estimator: {json.dumps(name)}", *lines]) for name in names]
@@ -170,12 +247,16 @@ def test_hostile_files_execute_nothing(tmp_path, name):
         "PYTHONPATH": os.pathsep.join(sys.path),
     }
     command = [sys.executable, __file__, name, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=environment)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=environment
+    )
     assert done.returncode == 0, done.stderr
     outcome = json.loads(done.stdout.splitlines()[-1])
     assert len(outcome) >= 5
     assert {file: events for file, (_, events) in outcome.items() if events} == {}
-    assert {file: ended for file, (ended, _) in outcome.items() if ended not in ("read", "refused")} == {}
+    assert {
+        file: ended for file, (ended, _) in outcome.items() if ended not in ("read", "refused")
+    } == {}
     assert {file for file in refused if outcome[file][0] != "refused"} == set()
     assert list(tmp_path.rglob(f"*{MARK}*")) == []
 
@@ -225,7 +306,9 @@ def watch(name, folder):
 
 def _writes(path, mode, flags):
     by_flags = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
-    return not isinstance(path, int) and bool((isinstance(mode, str) and set(mode) & set("wax+")) or by_flags)
+    return not isinstance(path, int) and bool(
+        (isinstance(mode, str) and set(mode) & set("wax+")) or by_flags
+    )
 
 
 if __name__ == "__main__":

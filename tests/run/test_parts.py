@@ -29,19 +29,45 @@ def parts_place(place):
     """A place whose data set serves two schemes, and a part whose raw files are elsewhere."""
     write_drives(place.folder, 80.0)
     split = place.change("conf/split/mine.yaml")
-    tests = {"c2": [{"recording": "three", "stop": 40}], "f2": [{"recording": "three", "start": 40}]}
+    tests = {
+        "c2": [{"recording": "three", "stop": 40}],
+        "f2": [{"recording": "three", "start": 40}],
+    }
     for name, train, validation in (("forth", "one", "two"), ("back", "two", "one")):
-        own = {"name": name, "train": [{"recording": train}], "validation": [{"recording": validation}], "tests": tests}
+        own = {
+            "name": name,
+            "train": [{"recording": train}],
+            "validation": [{"recording": validation}],
+            "tests": tests,
+        }
         place.change(f"conf/split/{name}.yaml", **split | own)
     place.change("conf/dataset/other.yaml", **DATASET | {"name": "other", "path": "${root}/other"})
     place.change("conf/split/other.yaml", **split | {"name": "other", "dataset": "other"})
     parts = {
         "scheme_1": {"title": "There", "split": "forth", "sweeps": CANDIDATES},
         "scheme_2": {"title": "Back", "split": "back", "sweeps": CANDIDATES},
-        "ferrari_drive": {"title": "Elsewhere", "split": "other", "sweeps": CANDIDATES, "optional": True},
+        "ferrari_drive": {
+            "title": "Elsewhere",
+            "split": "other",
+            "sweeps": CANDIDATES,
+            "optional": True,
+        },
     }
-    place.change("pipelines/both.yaml", study="both", title="Both ways", report="ksnn", publish=True, parts=parts)
-    place.change("pipelines/turned.yaml", based_on="both", study="turned", publish=False, parts={"scheme_1": {"split": "back"}})
+    place.change(
+        "pipelines/both.yaml",
+        study="both",
+        title="Both ways",
+        report="ksnn",
+        publish=True,
+        parts=parts,
+    )
+    place.change(
+        "pipelines/turned.yaml",
+        based_on="both",
+        study="turned",
+        publish=False,
+        parts={"scheme_1": {"split": "back"}},
+    )
     return place
 
 
@@ -56,10 +82,15 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     out, err = place.done("run", "both", "--json", "tracking=none")
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
     overview = pd.DataFrame(json.loads(out)["overview"])
-    assert list(overview["model"]) == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
+    assert (
+        list(overview["model"]) == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
+    )
     results = place.folder / "results" / "both"
     metrics = pd.read_csv(results / "metrics.csv")
-    assert (set(metrics["trained_on"]), list(metrics.columns)) == ({"mine/scheme_1", "mine/scheme_2"}, list(METRIC_COLUMNS))
+    assert (set(metrics["trained_on"]), list(metrics.columns)) == (
+        {"mine/scheme_1", "mine/scheme_2"},
+        list(METRIC_COLUMNS),
+    )
     about = json.loads((results / "provenance.json").read_text())
     assert (about["parts"], about["absent"]) == (["scheme_1", "scheme_2"], ["ferrari_drive"])
     report = (results / "report.md").read_text(encoding="utf-8")
@@ -72,23 +103,42 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     made = place.files()
     again, err = place.done("run", "both", "--json", "tracking=none")
     assert json.loads(again)["overview"] == json.loads(out)["overview"]
-    assert {line.split()[0] for line in err.splitlines() if line.split()[1] in {"train", "evaluate", "report"}} == {"skipped"}
+    assert {
+        line.split()[0]
+        for line in err.splitlines()
+        if line.split()[1] in {"train", "evaluate", "report"}
+    } == {"skipped"}
     assert place.files() == made
 
-    assert not any("seconds" in path.read_text(encoding="utf-8") for path in results.rglob("*.csv") if path.name == "metrics.csv")
-    timings = pd.read_csv(next((place.folder / "outputs" / "report").glob("both-*")) / "timings.csv")
+    assert not any(
+        "seconds" in path.read_text(encoding="utf-8")
+        for path in results.rglob("*.csv")
+        if path.name == "metrics.csv"
+    )
+    timings = pd.read_csv(
+        next((place.folder / "outputs" / "report").glob("both-*")) / "timings.csv"
+    )
     assert set(timings["trained_on"]) == {"mine/scheme_1", "mine/scheme_2"}
     assert place("report", "--check")[:2] == (0, "both: up to date\n")
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
-    assert place("report", "--check")[:2] == (3, "both: stale: data (ferrari_drive, which was not here)\n")
+    assert place("report", "--check")[:2] == (
+        3,
+        "both: stale: data (ferrari_drive, which was not here)\n",
+    )
     shutil.rmtree(place.folder / "raw" / "other")
     sweeps = [*CANDIDATES[:2], ["estimator=lstm", "estimator.n_states=3", "training.max_epochs=2"]]
     change_parts(place, lambda parts: parts["scheme_2"].update(sweeps=sweeps))
-    assert place("report", "--check")[:2] == (3, "both: stale: configuration (scheme_2: train lstm)\n")
+    assert place("report", "--check")[:2] == (
+        3,
+        "both: stale: configuration (scheme_2: train lstm)\n",
+    )
 
 
 def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
-    monkeypatch.setattr("vehest_papers.ksnn.documents", lambda artefacts: {"report": Document(artefacts.title, ["no tables"])})
+    monkeypatch.setattr(
+        "vehest_papers.ksnn.documents",
+        lambda artefacts: {"report": Document(artefacts.title, ["no tables"])},
+    )
     parts_place.change(BOTH, parts={"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}})
     code, _, err = parts_place("run", "both", "tracking=none")
     assert (code, "gives no table 'overview'" in " ".join(err.split())) == (2, True)
@@ -97,7 +147,10 @@ def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch)
 
 def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(parts_place):
     place = parts_place
-    change_parts(place, lambda parts: [part.update(sweeps=CANDIDATES[::2]) for part in parts.values()] and None)
+    change_parts(
+        place,
+        lambda parts: [part.update(sweeps=CANDIDATES[::2]) for part in parts.values()] and None,
+    )
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
     place.done("run", "both", "tracking=none")
     published = (place.folder / "results" / "both" / "report.md").read_bytes()
@@ -106,7 +159,10 @@ def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(p
     assert "not published: 'results/both' shows part 'ferrari_drive'" in " ".join(err.split())
     assert json.loads(out)["published"] is None
     assert (place.folder / "results" / "both" / "report.md").read_bytes() == published
-    assert place("report", "--check")[:2] == (0, "both: up to date: raw files not here, not compared: other\n")
+    assert place("report", "--check")[:2] == (
+        0,
+        "both: up to date: raw files not here, not compared: other\n",
+    )
     change_parts(place, lambda parts: parts["ferrari_drive"].pop("optional") and None)
     place.refused("run", "both", "tracking=none", code=4, says="other")
 
@@ -115,11 +171,19 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
     for name in ("mine", "other"):
         parts_place.change(f"conf/dataset/{name}.yaml", kind="real")
     quick = [CANDIDATES[0], [*CANDIDATES[1][:2], "training.max_epochs=1"], CANDIDATES[2]]
-    further = {name: {"split": "back", "sweeps": CANDIDATES[::2]} for name in ("devbot_ferrari", "minutes_5_a")}
-    change_parts(parts_place, lambda parts: {name: part | {"sweeps": quick} for name, part in parts.items()} | further)
+    further = {
+        name: {"split": "back", "sweeps": CANDIDATES[::2]}
+        for name in ("devbot_ferrari", "minutes_5_a")
+    }
+    change_parts(
+        parts_place,
+        lambda parts: {name: part | {"sweeps": quick} for name, part in parts.items()} | further,
+    )
     parts_place.done("run", "both", "tracking=none")
     report = (parts_place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
-    made_here = report.replace("a simulated DevBot", "").replace("samples, simulated, σ", "")  # a heading, and noise put into a made turn
+    made_here = report.replace("a simulated DevBot", "").replace(
+        "samples, simulated, σ", ""
+    )  # a heading, and noise put into a made turn
     assert "simulated" not in made_here.lower()
 
 
@@ -127,7 +191,9 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
     both, turned = read_study("both"), read_study("turned")
     assert [part.split for part in both.parts.values()] == ["forth", "back", "other"]
     assert [part.split for part in turned.parts.values()] == ["back", "back", "other"]
-    assert [part.sweeps for part in turned.parts.values()] == [part.sweeps for part in both.parts.values()]
+    assert [part.sweeps for part in turned.parts.values()] == [
+        part.sweeps for part in both.parts.values()
+    ]
     assert (turned.study, turned.title, turned.publish) == ("turned", "Both ways", False)
 
 
@@ -136,25 +202,47 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
     shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]
     pairs = list(zip(shared, official.parts.values(), strict=True))
     changed = {part.split: other.split for part, other in pairs if part != other}
-    assert changed == {"cross_vehicle_1_sim": "cross_vehicle_1", "cross_vehicle_2_sim": "cross_vehicle_2", "one_vehicle_sim": "one_vehicle"}
-    assert all(dataclasses.replace(part, split="") == dataclasses.replace(other, split="") for part, other in pairs)
+    assert changed == {
+        "cross_vehicle_1_sim": "cross_vehicle_1",
+        "cross_vehicle_2_sim": "cross_vehicle_2",
+        "one_vehicle_sim": "one_vehicle",
+    }
+    assert all(
+        dataclasses.replace(part, split="") == dataclasses.replace(other, split="")
+        for part, other in pairs
+    )
     for name, part in simulated.parts.items():
-        estimators = {own for sweep in part.sweeps for own in sweep[0].removeprefix("estimator=").split(",")}
+        estimators = {
+            own for sweep in part.sweeps for own in sweep[0].removeprefix("estimator=").split(",")
+        }
         assert {"zero", "static_map"} <= estimators or name == "ferrari_whole", name
 
 
 def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
     study, schemes = read_study("ksnn"), ("scheme_1", "scheme_2")
-    jobs = jobs_of(dataclasses.replace(study, parts={name: study.parts[name] for name in schemes}), [])
+    jobs = jobs_of(
+        dataclasses.replace(study, parts={name: study.parts[name] for name in schemes}), []
+    )
     configs = {part: [job.config for job in own] for part, own in jobs.items()}
     baselines = ("zero", "static_map", "kinematic")
     for scheme in schemes:
-        names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
+        names = [
+            (new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant)
+            for config in configs[scheme]
+        ]
         candidates = [name for name in dict.fromkeys(names) if name[0] not in baselines]
-        assert ({name[0] for name in names} - {name[0] for name in candidates}, len(candidates)) == (set(baselines), 39)
+        assert (
+            {name[0] for name in names} - {name[0] for name in candidates},
+            len(candidates),
+        ) == (set(baselines), 39)
         categories = [category_of(*name) for name in candidates]
-        assert {name: categories.count(name) for name in categories} == {name: row.variants for name, row in paper.TABLE_III.items()}
-        assert all(names.count(name) in ((1,) if name[0] == "luenberger" else (5, 10)) for name in candidates)
+        assert {name: categories.count(name) for name in categories} == {
+            name: row.variants for name, row in paper.TABLE_III.items()
+        }
+        assert all(
+            names.count(name) in ((1,) if name[0] == "luenberger" else (5, 10))
+            for name in candidates
+        )
 
 
 @pytest.mark.parametrize(
@@ -164,11 +252,31 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
         (BOTH, {"parts": {}}, "it needs study, report and one of"),
         (BOTH, {"parts": {"one": {"split": "forth"}}}, "part 'one' needs split and sweeps"),
         (BOTH, {"parts": {"../one": {"split": "forth", "sweeps": CANDIDATES}}}, "part"),
-        (BOTH, {"report": "drive"}, "the study module 'drive' draws its report from split and sweeps"),
-        (BOTH, {"parts": {"scheme_1": {"split": "forth", "sweeps": CANDIDATES}}}, "needs part 'scheme_2'"),
-        ("pipelines/x.yaml", {"based_on": "turned", "study": "x"}, "is based on another pipeline itself"),
-        ("pipelines/x.yaml", {"based_on": "no_such", "study": "x"}, "there is no pipeline 'no_such'"),
-        ("pipelines/x.yaml", {"based_on": "mine", "study": "x"}, "'mine', only a data set: 'vehest data usable mine' says"),
+        (
+            BOTH,
+            {"report": "drive"},
+            "the study module 'drive' draws its report from split and sweeps",
+        ),
+        (
+            BOTH,
+            {"parts": {"scheme_1": {"split": "forth", "sweeps": CANDIDATES}}},
+            "needs part 'scheme_2'",
+        ),
+        (
+            "pipelines/x.yaml",
+            {"based_on": "turned", "study": "x"},
+            "is based on another pipeline itself",
+        ),
+        (
+            "pipelines/x.yaml",
+            {"based_on": "no_such", "study": "x"},
+            "there is no pipeline 'no_such'",
+        ),
+        (
+            "pipelines/x.yaml",
+            {"based_on": "mine", "study": "x"},
+            "'mine', only a data set: 'vehest data usable mine' says",
+        ),
         (
             "pipelines/x.yaml",
             {"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}},

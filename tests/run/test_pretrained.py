@@ -29,7 +29,9 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
     assert said["model"] == said["estimator"] == "self_calibrating"
     for what in ("simulated cars and not on this one", "results/unseen_car", "PCT/IT2023/050058"):
         assert what in said["note"]
-    assert place("estimate", "self_calibrating", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
+    assert (
+        place("estimate", "self_calibrating", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
+    )
     assert Path("default.csv").read_bytes() == Path("named.csv").read_bytes()
     bands = pd.read_csv("default.csv")["band_sideslip"].dropna()
     assert len(bands) > 50
@@ -43,28 +45,46 @@ def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_
         command = [sys.executable, "-c", program, "estimate", "lap.csv", "dataset=mine", "-o", out]
         result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
         assert "numba" in result.stderr.split()
-        assert not {"torch", "pandas", "scipy.signal", "scipy.stats", "matplotlib"} & set(result.stderr.split())
+        assert not {"torch", "pandas", "scipy.signal", "scipy.stats", "matplotlib"} & set(
+            result.stderr.split()
+        )
 
 
-def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equals_sign_is_no_override(place):
+def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equals_sign_is_no_override(
+    place,
+):
     write_csv(place.folder / "speed=30.csv", 9)
     observer = estimator_class("luenberger").from_config({"rate_hz": 20})
     observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
     (place.folder / "own").mkdir()
     save_model(observer, place.folder / "own")
     outcome = place.told("estimate", "own", "speed=30.csv", "dataset=mine")
-    assert (outcome["estimator"], outcome["recording"], "note" in outcome) == ("luenberger", "speed=30", False)
+    assert (outcome["estimator"], outcome["recording"], "note" in outcome) == (
+        "luenberger",
+        "speed=30",
+        False,
+    )
     place.refused("estimate", "own", says="comes after the model")
 
 
 def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
     folder = pretrained_folder()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
-    row, about = make_pretrained.chosen_step(), yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
+    row, about = (
+        make_pretrained.chosen_step(),
+        yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"],
+    )
     assert about["note"] == make_pretrained.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
-    trust = read_trust(folder)  # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real ones
-    assert (trust.about.note, trust.guard, trust.bands is None, trust.health is None) == ("", None, False, False)
+    trust = read_trust(
+        folder
+    )  # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real ones
+    assert (trust.about.note, trust.guard, trust.bands is None, trust.health is None) == (
+        "",
+        None,
+        False,
+        False,
+    )
     for name in (*about["datasets"], *trust.bands.datasets):
         assert kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated"
     assert trust.bands.n_blocks >= 34
@@ -73,7 +93,9 @@ def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
 
 def bands_on(name, data_root):
     """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
-    source = open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
+    source = open_source(
+        compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]
+    )
     recording = next(iter(source.recordings()))
     estimate = vehest.estimate(vehest.load_model(), recording)
     reference = np.interp(estimate.time, recording.time, recording["sideslip_ref"])
@@ -85,8 +107,15 @@ def bands_on(name, data_root):
 
 def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
-    told = re.search(r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid", text)
+    told = re.search(
+        r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid",
+        text,
+    )
     inside, median, valid = bands_on("ferrari_250lm", data_root)
-    assert [told[1], told[2], told[3]] == [f"{100 * inside:.0f}", f"{median:.1f}", f"{100 * valid:.0f}"]
+    assert [told[1], told[2], told[3]] == [
+        f"{100 * inside:.0f}",
+        f"{median:.1f}",
+        f"{100 * valid:.0f}",
+    ]
     assert "hardly a sample is valid" in text
     assert bands_on("roboracer", data_root)[2] < 0.01

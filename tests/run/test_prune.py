@@ -23,10 +23,20 @@ class Root:
     def __init__(self, output):
         self.output = output
         dataset = {"source": "tabular"}
-        self.ingested = self.add("ingest", "drives", dataset, {"lap.csv": "raw"}, code_of("ingest", "tabular"))
-        self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), code_of("downsample"))
+        self.ingested = self.add(
+            "ingest", "drives", dataset, {"lap.csv": "raw"}, code_of("ingest", "tabular")
+        )
+        self.rated = self.add(
+            "downsample", "drives-20hz", {}, dict(self.ingested.outputs), code_of("downsample")
+        )
         name = "luenberger"
-        self.model = self.add("train", "one", {"estimator": {"name": name}}, {"drives/lap": "gone"}, code_of("train", name))
+        self.model = self.add(
+            "train",
+            "one",
+            {"estimator": {"name": name}},
+            {"drives/lap": "gone"},
+            code_of("train", name),
+        )
         of_model = {"model": self.model.digest}
         self.trusted = self.add("calibrate", "one-trust", {}, of_model, code_of("calibrate", name))
         of_both = of_model | {"calibration": self.trusted.digest}
@@ -39,7 +49,10 @@ class Root:
 
     def found(self):
         """Path in the root."""
-        return {Path(found["path"]).relative_to(self.output).as_posix(): found["reason"] for found in unused_artefacts(self.output)}
+        return {
+            Path(found["path"]).relative_to(self.output).as_posix(): found["reason"]
+            for found in unused_artefacts(self.output)
+        }
 
 
 @pytest.fixture
@@ -53,23 +66,38 @@ def name_of(artefact):
 
 def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_installed(root):
     assert root.found() == {}
-    inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
+    inputs = {
+        artefact.folder.name: artefact.digest
+        for artefact in (root.model, root.trusted, root.scored)
+    }
     root.add("report", "mine", {"module": "drive"}, inputs, code_of("report", "drive"))
     root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=2")
-    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
+    root.add(
+        "train",
+        "theirs",
+        {"estimator": {"name": "somebody_elses"}},
+        {},
+        "train=1 somebody_elses=1 training=1",
+    )
     assert root.found() == {}
 
 
 def test_what_other_code_has_made_is_found(root):
-    old = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16)
+    old = root.add(
+        "train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16
+    )
     older = root.add("ingest", "drives", {"source": "tabular"}, {}, "ingest=0 tabular=1")
     assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
 
 
-def test_what_was_made_of_a_model_or_a_calibration_that_is_gone_is_found_but_not_a_model_without_its_recordings(root):
+def test_what_was_made_of_a_model_or_a_calibration_that_is_gone_is_found_but_not_a_model_without_its_recordings(
+    root,
+):
     shutil.rmtree(root.trusted.folder)
     assert root.found() == {name_of(root.scored): ORPHANED}
-    root.trusted = root.add("calibrate", "one-trust", {}, {"model": root.model.digest}, root.trusted.code)
+    root.trusted = root.add(
+        "calibrate", "one-trust", {}, {"model": root.model.digest}, root.trusted.code
+    )
     shutil.rmtree(root.model.folder)
     assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
 
@@ -112,11 +140,16 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
     mine.mkdir()
     (mine / "manifest.json").write_text("mine")
     renamed = root.output / "train" / "my_favourite-0123456789ab"
-    os.rename(root.add("train", "renamed", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder, renamed)
+    os.rename(
+        root.add("train", "renamed", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder,
+        renamed,
+    )
     assert root.found() == {}
 
 
-def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(elsewhere, root, capsys):
+def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(
+    elsewhere, root, capsys
+):
     outdated = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
     assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err

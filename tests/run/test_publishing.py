@@ -52,7 +52,11 @@ def checked(published, place):
 
 
 def contents(folder):
-    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+    return {
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
 
 
 def verdict(place, *words):
@@ -65,12 +69,25 @@ def verdict(place, *words):
 
 def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path, published):
     file = tmp_path / "table.csv"
-    cells = ["0.7459900813211685", "-1.2345678e-07", "1234567.0", "7", "0.10", "", '"0.0123456789, 2"', "nan", "1e-05"]
+    cells = [
+        "0.7459900813211685",
+        "-1.2345678e-07",
+        "1234567.0",
+        "7",
+        "0.10",
+        "",
+        '"0.0123456789, 2"',
+        "nan",
+        "1e-05",
+    ]
     file.write_text("a,b,c,d,e,f,g,h,i\n" + ",".join(cells) + "\n", encoding="utf-8")
     expected = ["0.74599", "-1.23457e-07", *cells[2:]]
     assert published_content(file).decode() == "a,b,c,d,e,f,g,h,i\n" + ",".join(expected) + "\n"
     (report,) = (published / "outputs" / "report").iterdir()
-    own, there = (pd.read_csv(folder / "metrics.csv")["value"] for folder in (report, published / "results" / "small"))
+    own, there = (
+        pd.read_csv(folder / "metrics.csv")["value"]
+        for folder in (report, published / "results" / "small")
+    )
     np.testing.assert_allclose(there, own, rtol=5e-6)
     assert (there != own).any()
 
@@ -82,7 +99,9 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published)
     assert set(timings["metric"]) >= {"train_seconds", "step_seconds"}
     assert (timings["value"] > 0).all()
     assert list(timings.columns) == list(metrics.columns)
-    assert len(timings[(timings["estimator"] == "gru") & (timings["metric"] == "train_seconds")]) == 2
+    assert (
+        len(timings[(timings["estimator"] == "gru") & (timings["metric"] == "train_seconds")]) == 2
+    )
     page = (report / "report.html").read_text(encoding="utf-8")
     assert all(words in page for words in ("<h2>Times</h2>", "online step [ms]"))
     texts = {
@@ -93,7 +112,9 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published)
     assert TIMINGS not in texts
     for name, text in texts.items():
         words = [word for word in TIME_NAMES if word in text]
-        assert not words or (name, words) == ("tables/ranges.csv", ["seconds"]), name  # how long the ranges of the drive are
+        assert not words or (name, words) == ("tables/ranges.csv", ["seconds"]), (
+            name
+        )  # how long the ranges of the drive are
 
 
 def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
@@ -102,8 +123,17 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
     before = contents(published / "results")
-    assert {"small/report.md", "small/metrics.csv", f"small/{PROVENANCE}", "small/figures/learning.svg"} <= set(before)
-    for command in (["init", "--quiet"], ["add", "results"], ["-c", "user.name=a", "-c", "user.email=a", "commit", "--quiet", "-m", "a"]):
+    assert {
+        "small/report.md",
+        "small/metrics.csv",
+        f"small/{PROVENANCE}",
+        "small/figures/learning.svg",
+    } <= set(before)
+    for command in (
+        ["init", "--quiet"],
+        ["add", "results"],
+        ["-c", "user.name=a", "-c", "user.email=a", "commit", "--quiet", "-m", "a"],
+    ):
         subprocess.run(["git", *command], check=True)
     (report,) = (published / "outputs" / "report").iterdir()
     timings = (report / TIMINGS).read_bytes()
@@ -111,12 +141,16 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     assert code == 0, err
     assert (report / TIMINGS).read_bytes() != timings, "it was trained again"
     assert contents(published / "results") == before
-    status = subprocess.run(["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True)
+    status = subprocess.run(
+        ["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True
+    )
     assert (status.stdout, run_vehest(capsys, *CHECK)[:2]) == ("", (0, "small: up to date\n"))
 
 
 def other_code_of(changed):
-    return lambda stage, name="", **options: "other" if stage == changed else code_of(stage, name, **options)
+    return lambda stage, name="", **options: (
+        "other" if stage == changed else code_of(stage, name, **options)
+    )
 
 
 def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
@@ -132,10 +166,20 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, 
     assert place(*CHECK)[:2] == (0, "small: up to date\n")
 
 
-def test_published_results_are_up_to_date_by_study_and_by_file_and_after_what_trains_nothing_new(checked):
-    for words in ([], ["small"], ["pipelines/small.yaml"], ["small", f"root={checked.folder / 'raw'}"]):
+def test_published_results_are_up_to_date_by_study_and_by_file_and_after_what_trains_nothing_new(
+    checked,
+):
+    for words in (
+        [],
+        ["small"],
+        ["pipelines/small.yaml"],
+        ["small", f"root={checked.folder / 'raw'}"],
+    ):
         assert verdict(checked, *words) == (0, "small: up to date")
-    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.checkpoint_seconds=1"]])
+    checked.change(
+        "pipelines/small.yaml",
+        sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.checkpoint_seconds=1"]],
+    )
     checked.change("conf/dataset/mine.yaml", citation="somebody else")
     assert verdict(checked) == (0, "small: up to date")
     checked.change("conf/split/mine.yaml", tests={"test": [{"recording": "three", "stop": 20}]})
@@ -145,11 +189,17 @@ def test_published_results_are_up_to_date_by_study_and_by_file_and_after_what_tr
 
 
 def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked):
-    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]])
+    checked.change(
+        "pipelines/small.yaml",
+        sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]],
+    )
     assert verdict(checked) == (3, "small: stale: configuration (train gru, report)")
     code, out = verdict(checked, "--json")
     changes = [{"what": what, "cause": "configuration"} for what in ("train gru", "report")]
-    assert (code, json.loads(out)) == (3, [{"study": "small", "state": "stale", "changes": changes, "note": ""}])
+    assert (code, json.loads(out)) == (
+        3,
+        [{"study": "small", "state": "stale", "changes": changes, "note": ""}],
+    )
 
 
 def test_estimators_that_come_and_go_are_named(checked):
@@ -160,10 +210,14 @@ def test_estimators_that_come_and_go_are_named(checked):
     [study] = json.loads(verdict(checked, "--json")[1])
     named = {change["what"] for change in study["changes"]}
     stages = ("train", "calibrate", "evaluate")
-    assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
+    assert {
+        f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")
+    } <= named
 
 
-def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_are_not_compared(checked, monkeypatch):
+def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_are_not_compared(
+    checked, monkeypatch
+):
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
@@ -173,24 +227,37 @@ def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_a
     shutil.rmtree(checked.folder / "raw")
     assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
     checked.change("conf/dataset/mine.yaml", vehicle="another car")
-    assert verdict(checked) == (3, "small: stale: configuration (ingest mine); raw files not here, not compared: mine")
+    assert verdict(checked) == (
+        3,
+        "small: stale: configuration (ingest mine); raw files not here, not compared: mine",
+    )
 
 
 def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked):
     file = checked.folder / "results" / "small" / PROVENANCE
     about = json.loads(file.read_text())
     file.write_text(json.dumps({name: value for name, value in about.items() if name != "keys"}))
-    assert verdict(checked) == (3, "small: not known: published before keys were recorded; run it again")
+    assert verdict(checked) == (
+        3,
+        "small: not known: published before keys were recorded; run it again",
+    )
     file.write_text(json.dumps(about))
-    (checked.folder / "pipelines" / "small.yaml").rename(checked.folder / "pipelines" / "renamed.yaml")
+    (checked.folder / "pipelines" / "small.yaml").rename(
+        checked.folder / "pipelines" / "renamed.yaml"
+    )
     code, line = verdict(checked)
     assert (code, line) == (3, "small: stale: configuration (report)"), "the command is another"
     (checked.folder / "pipelines" / "renamed.yaml").unlink()
     assert verdict(checked) == (3, "small: not known: there is no pipeline that publishes 'small'")
-    assert verdict(checked, "quickstart")[1] == "quickstart: not known: there is nothing in 'results/quickstart' that vehest published"
+    assert (
+        verdict(checked, "quickstart")[1]
+        == "quickstart: not known: there is nothing in 'results/quickstart' that vehest published"
+    )
 
 
-def test_what_cannot_be_checked_is_one_line_and_a_pipeline_that_cannot_be_run_any_more_is_stale(checked):
+def test_what_cannot_be_checked_is_one_line_and_a_pipeline_that_cannot_be_run_any_more_is_stale(
+    checked,
+):
     for words, code, says in (
         (("report",), 2, "no pipeline is named; there are:"),
         ((*CHECK, "smal"), 4, "there is no pipeline 'smal'; did you mean pipelines/small.yaml?"),
@@ -207,11 +274,20 @@ def test_what_cannot_be_checked_is_one_line_and_a_pipeline_that_cannot_be_run_an
 
 def models(folder):
     """Files of every model in an output root, but those with times."""
-    found = {model.name: contents(model) for model in (folder / "outputs" / "train").iterdir() if not model.name.startswith(".")}
-    return {name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")} for name, files in found.items()}
+    found = {
+        model.name: contents(model)
+        for model in (folder / "outputs" / "train").iterdir()
+        if not model.name.startswith(".")
+    }
+    return {
+        name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")}
+        for name, files in found.items()
+    }
 
 
-def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published, checked):
+def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(
+    published, checked
+):
     before = contents(checked.folder / "results")
     _, said = checked.done(*RUN)
     assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(said.split())
@@ -219,9 +295,14 @@ def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_resul
     assert contents(checked.folder / "results") == before
 
 
-def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_and_damaged_weights_refused(checked):
+def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_and_damaged_weights_refused(
+    checked,
+):
     pipeline = checked.change("pipelines/small.yaml")
-    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
+    checked.change(
+        "pipelines/small.yaml",
+        sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]],
+    )
     _, said = checked.done(*RUN)
     assert ("1 of 3 taken from" in " ".join(said.split()), said.count("1 epochs")) == (True, 2)
     checked.change("pipelines/small.yaml", **pipeline)
@@ -230,4 +311,8 @@ def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_a
     file = checked.folder / "results" / "small" / "weights.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     code, _, err = checked(*RUN, "output=damaged")
-    assert (code, "weights.safetensors' is damaged" in " ".join(err.split()), "--retrain" in err) == (3, True, True)
+    assert (
+        code,
+        "weights.safetensors' is damaged" in " ".join(err.split()),
+        "--retrain" in err,
+    ) == (3, True, True)

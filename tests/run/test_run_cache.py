@@ -10,13 +10,22 @@ from vehest.run.run_cache import RunCache, stamp_of
 
 HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
 WORDS = ("small", "tracking=none")
-SWEEP = ("estimator=luenberger", "training.grid=1", "training.max_evaluations=5,6", "split=mine", "tracking=none")
+SWEEP = (
+    "estimator=luenberger",
+    "training.grid=1",
+    "training.max_evaluations=5,6",
+    "split=mine",
+    "tracking=none",
+)
 
 
 @pytest.fixture
 def study(place):
     """A place with a small study that has just been run."""
-    place.change("pipelines/small.yaml", sweeps=[["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]])
+    place.change(
+        "pipelines/small.yaml",
+        sweeps=[["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]],
+    )
     place.once("run", *WORDS)
     assert place("run", *WORDS)[0] == 0  # a copy of the files has times of its own
     return place
@@ -32,13 +41,18 @@ def forget(place):
 
 
 def test_a_finished_study_prints_what_a_run_in_full_prints(study):
-    for words in (*(("run", *WORDS, *options) for options in ((), ("--json",), ("--dry-run",), ("--quiet",))), ("report", *WORDS)):
+    for words in (
+        *(("run", *WORDS, *options) for options in ((), ("--json",), ("--dry-run",), ("--quiet",))),
+        ("report", *WORDS),
+    ):
         assert cached()
         recognised = study(*words)
         forget(study)
         assert study(*words) == recognised, words
         assert recognised[0] == 0
-        assert words[0] == "report" or ("skipped report" in recognised[2]) == (words[-1] != "--quiet")
+        assert words[0] == "report" or ("skipped report" in recognised[2]) == (
+            words[-1] != "--quiet"
+        )
         study.done("run", *WORDS)  # dry runs and reports leave no record
 
 
@@ -66,7 +80,11 @@ def test_a_published_copy_that_is_gone_is_published_again(study):
     published.unlink()
     assert cached()
     out, err = study.done("run", *WORDS)
-    assert (published.is_file(), "published: results/small" in out, "publish" in err) == (True, True, True)
+    assert (published.is_file(), "published: results/small" in out, "publish" in err) == (
+        True,
+        True,
+        True,
+    )
 
 
 def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
@@ -78,7 +96,10 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
         file.write_bytes(former)
 
     assert cached()
-    for file in [study.folder / "conf" / "split" / "mine.yaml", study.folder / "pipelines" / "small.yaml"]:
+    for file in [
+        study.folder / "conf" / "split" / "mine.yaml",
+        study.folder / "pipelines" / "small.yaml",
+    ]:
         changed(file, file.read_bytes() + b"\n# a comment\n")
     manifest = next((study.folder / "outputs" / "evaluate").glob("*/manifest.json"))
     changed(manifest, manifest.read_bytes().replace(b'"sha256": "', b'"sha256": "0', 1))
@@ -101,7 +122,9 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
     assert cached()
 
 
-def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_overrides_are_another(study):
+def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_overrides_are_another(
+    study,
+):
     assert "skipped" not in study.done("run", *WORDS, "--force")[1]
     assert cached()
     raw = study.folder / "raw" / "three.csv"

@@ -22,7 +22,13 @@ from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.schema import check_format, settings_from_config, validated
-from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
+from vehest.data.store import (
+    is_stored_recording,
+    read_estimate,
+    read_recording,
+    write_estimate,
+    write_recording,
+)
 from vehest.data.text_files import read_rows
 from vehest.data.transforms import Preparation
 from vehest.estimators.model_files import Description, load_model, read_description, save_model
@@ -40,7 +46,19 @@ from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.studies.artefacts import read_frame
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, resume_epoch, save_checkpoint
 
-HOSTILE = ["../../../evil", "/tmp/evil", "..", "a/b", "a\\b", "a\0b", "", ".hidden", "x" * 300, "ä" * 200, "a\nb"]
+HOSTILE = [
+    "../../../evil",
+    "/tmp/evil",
+    "..",
+    "a/b",
+    "a\\b",
+    "a\0b",
+    "",
+    ".hidden",
+    "x" * 300,
+    "ä" * 200,
+    "a\nb",
+]
 
 
 def changed(content, /, **changes):
@@ -52,16 +70,36 @@ def model(tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     estimator = estimator_class("ksnn").from_config({})
-    estimator.load_weights({name: np.full_like(values, 0.5) for name, values in estimator.weights().items()})
-    save_model(estimator, folder, {"seed": 3, "datasets": ["d"], "downsample": {"method": "decimate", "transforms": []}, "step": "any"})
+    estimator.load_weights(
+        {name: np.full_like(values, 0.5) for name, values in estimator.weights().items()}
+    )
+    save_model(
+        estimator,
+        folder,
+        {
+            "seed": 3,
+            "datasets": ["d"],
+            "downsample": {"method": "decimate", "transforms": []},
+            "step": "any",
+        },
+    )
     return folder
 
 
-def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_counted_by_tensor(model, tmp_path):
+def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_counted_by_tensor(
+    model, tmp_path
+):
     described = read_description(model)
     assert isinstance(described, Description)
-    assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
-    assert (preparation_of(model), load_model(model).name) == ({"method": "decimate", "transforms": []}, "ksnn")
+    assert (described.estimator, described.about.seed, described.about.datasets) == (
+        "ksnn",
+        3,
+        ("d",),
+    )
+    assert (preparation_of(model), load_model(model).name) == (
+        {"method": "decimate", "transforms": []},
+        "ksnn",
+    )
     weights = load_file(model / "model.safetensors")
     name = max(weights, key=lambda own: weights[own].size)
     weights[name].flat[:2] = [np.nan, np.inf]
@@ -71,7 +109,9 @@ def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_coun
     estimator = estimator_class("kalman").from_config({})
     save_model(estimator, tmp_path)
     load_model(tmp_path)
-    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
+    save_file(
+        {name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors"
+    )
     assert "1 of the 1 numbers of tensor" in refusal(lambda: load_model(tmp_path))
 
 
@@ -84,19 +124,35 @@ def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_coun
         ({"estimator": "vehest.estimators.ksnn"}, "is not one of"),
         ({"settings": {"window": "30"}}, "settings.window must be a whole number, not '30'"),
         ({"settings": {"rate_hz": float("nan")}}, "settings.rate_hz must be a number, not nan"),
-        ({"settings": {"n_local": 10**9}}, "settings.n_local is 1e+09, and model.safetensors holds"),
+        (
+            {"settings": {"n_local": 10**9}},
+            "settings.n_local is 1e+09, and model.safetensors holds",
+        ),
         ({"settings": {"n_local": 4000}}, "which do not fit its settings"),
-        ({"about": {"downsample": {"method": "magic"}}}, "about.downsample.method 'magic' is not one of: polyphase, decimate"),
-        ({"about": {"downsample": {"transforms": [{"name": "low_pass"}]}}}, "transform 'low_pass': cutoff_hz is missing"),
+        (
+            {"about": {"downsample": {"method": "magic"}}},
+            "about.downsample.method 'magic' is not one of: polyphase, decimate",
+        ),
+        (
+            {"about": {"downsample": {"transforms": [{"name": "low_pass"}]}}},
+            "transform 'low_pass': cutoff_hz is missing",
+        ),
         ({"evil": 1}, "unknown key 'evil'"),
-        *((text, "model.yaml") for text in (b"[]", b"3", b"null", b"2026-01-01", b"a: &a [*a]", b"{" * 100, b"\xff")),
+        *(
+            (text, "model.yaml")
+            for text in (b"[]", b"3", b"null", b"2026-01-01", b"a: &a [*a]", b"{" * 100, b"\xff")
+        ),
         (b"a: !!python/object:os {}", "model.yaml"),
     ],
     ids=str,
 )
 def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model, changes, says):
     path = model / "model.yaml"
-    text = changes if isinstance(changes, bytes) else yaml.safe_dump(changed(yaml.safe_load(path.read_text()), **changes)).encode()
+    text = (
+        changes
+        if isinstance(changes, bytes)
+        else yaml.safe_dump(changed(yaml.safe_load(path.read_text()), **changes)).encode()
+    )
     path.write_bytes(text)
     message = refusal(lambda: load_model(model), VehestError)
     assert says in message
@@ -149,26 +205,35 @@ def made(output, label="mine"):
         ({"key": ...}, "key is missing"),
         ({"status": "done"}, "status 'done' is not one of: complete, interrupted"),
         ({"outputs": {"a.txt": {"sha256": "0" * 64}}}, "outputs.a.txt.bytes is missing"),
-        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "outputs.a.txt.sha256: string should match pattern"),
+        (
+            {"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}},
+            "outputs.a.txt.sha256: string should match pattern",
+        ),
         ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": 2}}}, "is gone or truncated"),
         *[({"outputs": {name: {"sha256": "0" * 64, "bytes": 1}}}, "") for name in HOSTILE],
         *((text, "") for text in ("", "[]", "[" * 100_000, '{"format": 1', "NaN")),
         ("link", "or is a link"),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(tmp_path, changes, says):
+def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
+    tmp_path, changes, says
+):
     artefact = made(tmp_path)
     path = artefact.folder / "manifest.json"
     content = json.loads(path.read_text())
     assert (content["format"], artefact.config) == (1, {"a": 1.0})
     path.write_text(json.dumps(changed(content, format=...)))
-    assert read_artefact(artefact.folder).outputs == artefact.outputs, "one without a format is read too"
+    assert read_artefact(artefact.folder).outputs == artefact.outputs, (
+        "one without a format is read too"
+    )
     if changes == "link":
         path.write_text(json.dumps(content))
         (artefact.folder / "a.txt").rename(tmp_path / "elsewhere")
         (artefact.folder / "a.txt").symlink_to(tmp_path / "elsewhere")
     else:
-        path.write_text(changes if isinstance(changes, str) else json.dumps(changed(content, **changes)))
+        path.write_text(
+            changes if isinstance(changes, str) else json.dumps(changed(content, **changes))
+        )
     assert says in refusal(lambda: read_artefact(artefact.folder))
     assert find(plan(tmp_path)) is None
 
@@ -176,10 +241,14 @@ def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
 def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path):
     artefact = made(tmp_path)
     entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
-    told = replace(artefact, config={"estimator": {"rate_hz": 20}, "train": [entry], "validation": []})
+    told = replace(
+        artefact, config={"estimator": {"rate_hz": 20}, "train": [entry], "validation": []}
+    )
     assert trained_rate(told) == 20.0
     for own in (artefact, told):
-        assert "manifest.json': config describes no training" in refusal(lambda own=own: learnt_spans(own))
+        assert "manifest.json': config describes no training" in refusal(
+            lambda own=own: learnt_spans(own)
+        )
     own = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
     assert own.folder == tmp_path / "stage" / f"{own.label}-{own.key[:12]}"
     assert own.checkpoint_folder == tmp_path / "checkpoints" / f"{own.label}-{own.key[:12]}"
@@ -187,7 +256,9 @@ def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path):
 
 def recording(name="lap", n=20):
     provenance = {"mass": 1000.0}
-    return Recording(name, "car", 10.0, 0.0, {"vx": np.ones(n), "vy_ref": np.zeros(n)}, provenance=provenance)
+    return Recording(
+        name, "car", 10.0, 0.0, {"vx": np.ones(n), "vy_ref": np.zeros(n)}, provenance=provenance
+    )
 
 
 def redescribed(path, change):
@@ -224,11 +295,19 @@ def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     for read in (read_recording, is_stored_recording)[: 1 + isinstance(changes, bytes)]:
-        assert says in said_of(path, lambda content: changes if isinstance(changes, bytes) else changed(content, **changes), read)
+        assert says in said_of(
+            path,
+            lambda content: changes if isinstance(changes, bytes) else changed(content, **changes),
+            read,
+        )
         write_recording(recording(), path)
     table = pq.read_table(path)
-    pq.write_table(table.set_column(0, "vx", [["1"] * 20]).replace_schema_metadata(table.schema.metadata), path)
-    assert "column 'vx' is there twice, or of type string, not double" in refusal(lambda: read_recording(path))
+    pq.write_table(
+        table.set_column(0, "vx", [["1"] * 20]).replace_schema_metadata(table.schema.metadata), path
+    )
+    assert "column 'vx' is there twice, or of type string, not double" in refusal(
+        lambda: read_recording(path)
+    )
 
 
 @pytest.mark.parametrize(
@@ -237,7 +316,10 @@ def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
         ({"n_states": 10**9}, "n_states is 1000000000, and there are 4 columns"),
         ({"n_states": -2}, "n_states is -2"),
         ({"n_states": 3}, "n_states is 3"),
-        *(({"covariance_of": own}, "covariance_of name n quantities, not (5, 2, 2) and (vy") for own in (["vy"], ["vy", "luck"])),
+        *(
+            ({"covariance_of": own}, "covariance_of name n quantities, not (5, 2, 2) and (vy")
+            for own in (["vy"], ["vy", "luck"])
+        ),
         ({"mode": "psychic"}, "mode 'psychic' is not one of"),
     ],
 )
@@ -245,18 +327,32 @@ def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, sa
     path = tmp_path / "estimate.parquet"
     channels = {"vy": np.zeros(5), "sideslip": np.zeros(5)}
     covariance = np.tile(np.eye(2), (5, 1, 1))
-    write_estimate(Estimate("lap", "kalman", 10.0, 0.0, channels, "causal", covariance, ("vy", "yaw_rate")), path)
+    write_estimate(
+        Estimate("lap", "kalman", 10.0, 0.0, channels, "causal", covariance, ("vy", "yaw_rate")),
+        path,
+    )
     assert read_estimate(path).covariance is not None
     assert says in said_of(path, lambda content: changed(content, **changes), read_estimate)
 
 
 def test_tables_that_are_damaged_are_one_line(tmp_path):
     path = tmp_path / "fit.csv"
-    for text in (b"metric\n1\n", b"metric,value\nepochs,many\n", b'metric,value\n"open,1\n', b"metric,value\n\xff,1\n"):
+    for text in (
+        b"metric\n1\n",
+        b"metric,value\nepochs,many\n",
+        b'metric,value\n"open,1\n',
+        b"metric,value\n\xff,1\n",
+    ):
         path.write_bytes(text)
-        assert ("UTF-8" if b"\xff" in text else "fit.csv") in refusal(lambda: read_fit_metrics(tmp_path))
+        assert ("UTF-8" if b"\xff" in text else "fit.csv") in refusal(
+            lambda: read_fit_metrics(tmp_path)
+        )
     refusal(lambda: read_fit_metrics(tmp_path / "none"), MissingError)
-    for text, says in (("", "cannot be read as CSV"), ("a\n1\n", "no column 'value'"), ("value\nmany\n", "holds text")):
+    for text, says in (
+        ("", "cannot be read as CSV"),
+        ("a\n1\n", "no column 'value'"),
+        ("value\nmany\n", "holds text"),
+    ):
         path.write_text(text)
         assert says in refusal(lambda: read_frame(path, ("value",), numbers=("value",)))
     path.write_text("metric,value\nepochs,7\n")
@@ -269,7 +365,10 @@ def test_a_checkpoint_or_a_published_study_that_is_damaged_counts_as_none(tmp_pa
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)
-    save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}))
+    save_checkpoint(
+        tmp_path,
+        Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}),
+    )
     assert resume_epoch(tmp_path) == 3
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
@@ -289,8 +388,18 @@ def test_nothing_is_published_through_a_link(elsewhere, link):
     assert not list(Path("target").iterdir())
 
 
-PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
-BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
+PIPELINE = {
+    "study": "mine",
+    "report": "drive",
+    "split": "quickstart",
+    "sweeps": [["estimator=luenberger"]],
+}
+BOMB = "\n".join(
+    [
+        "a0: &a0 [x, x, x, x, x, x, x, x, x]",
+        *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)),
+    ]
+)
 
 
 @pytest.mark.parametrize(
@@ -299,7 +408,10 @@ BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.
         ({"study": 3}, "study must be text, not 3"),
         ({"study": "../evil"}, "must be made of letters"),
         *(({"report": name}, "there is no study module") for name in ("../../evil", "drive.os")),
-        ({"sweeps": "estimator=gru"}, "sweeps must be a list of lists of overrides, not 'estimator=gru'"),
+        (
+            {"sweeps": "estimator=gru"},
+            "sweeps must be a list of lists of overrides, not 'estimator=gru'",
+        ),
         ({"sweeps": ["estimator=gru"]}, "sweeps.0 must be a list of overrides, not 'est"),
         ({"sweeps": []}, "sweeps must be a list of lists"),
         ({"evaluation": {"rate_hz": [1]}}, "evaluation.rate_hz"),
@@ -307,13 +419,28 @@ BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.
         ({"unknown": 1}, "unknown key 'unknown'"),
         ({"split": ...}, "it needs split and sweeps"),
         ({"report": ...}, "it needs study, report and one of: split and sweeps"),
-        *((text, "") for text in (BOMB.encode(), b"[" * 200, b"[1, 2", b"\xff", b"3", b"- a", b"a: &a {b: *a}")),
+        *(
+            (text, "")
+            for text in (
+                BOMB.encode(),
+                b"[" * 200,
+                b"[1, 2",
+                b"\xff",
+                b"3",
+                b"- a",
+                b"a: &a {b: *a}",
+            )
+        ),
     ],
     ids=lambda own: str(own)[:40],
 )
 def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path, changes, says):
     path = tmp_path / "mine.yaml"
-    path.write_bytes(changes if isinstance(changes, bytes) else yaml.safe_dump(changed(PIPELINE, **changes)).encode())
+    path.write_bytes(
+        changes
+        if isinstance(changes, bytes)
+        else yaml.safe_dump(changed(PIPELINE, **changes)).encode()
+    )
     message = refusal(lambda: read_study(str(path)), ConfigurationError)
     assert says in message
     assert "mine.yaml" in message
@@ -325,7 +452,13 @@ def conf(elsewhere):
     return elsewhere / "conf"
 
 
-@pytest.mark.parametrize("text", ["hydra:\n  searchpath: [pkg://antigravity]", "a: &a {hydra: {searchpath: [pkg://antigravity]}}\n<<: *a"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "hydra:\n  searchpath: [pkg://antigravity]",
+        "a: &a {hydra: {searchpath: [pkg://antigravity]}}\n<<: *a",
+    ],
+)
 def test_no_root_file_in_conf_reaches_hydras_search_path(conf, text):
     (conf / "ingest.yaml").write_text(f"{text}\ndefaults: [dataset: tabular, common, _self_]")
     assert compose_config("ingest", ["dataset=sim_small"])["dataset"]["name"] == "sim_small"
@@ -339,8 +472,14 @@ def test_no_root_file_in_conf_reaches_hydras_search_path(conf, text):
         (b"a: " + b"[" * 2000 + b"]" * 2000, "it nests too deep"),
         (b"a: \xff", "can't decode byte 0xff"),
         (b"a: ${b}", "dataset.a: Interpolation key 'b' not found"),
-        (b"# @package hydra\nsearchpath: [pkg://antigravity]", "only supported from the primary config"),
-        (b"defaults:\n  - /hydra/launcher@_global_: antigravity", "Could not find 'hydra/launcher/antigravity'"),
+        (
+            b"# @package hydra\nsearchpath: [pkg://antigravity]",
+            "only supported from the primary config",
+        ),
+        (
+            b"defaults:\n  - /hydra/launcher@_global_: antigravity",
+            "Could not find 'hydra/launcher/antigravity'",
+        ),
         (b"defaults:\n  - ../../elsewhere", "Could not load 'dataset/../../elsewhere'"),
     ],
 )
@@ -349,7 +488,13 @@ def test_a_file_in_conf_that_is_none_is_one_line(conf, text, says):
     assert says in refusal(lambda: compose_config("ingest", ["dataset=mine"]), ConfigurationError)
 
 
-ROOT = {"output": "o", "limits": {}, "downsample": {"method": "decimate"}, "tracking": {"name": "none"}, "seed": 0}
+ROOT = {
+    "output": "o",
+    "limits": {},
+    "downsample": {"method": "decimate"},
+    "tracking": {"name": "none"},
+    "seed": 0,
+}
 
 
 def test_shared_groups_are_read_with_their_types():
@@ -359,7 +504,10 @@ def test_shared_groups_are_read_with_their_types():
     read(ROOT)
     for changes, says in (
         ({"output": ""}, "output must name a folder"),
-        ({"downsample": {"method": "magic"}}, "downsample.method 'magic' is not one of: polyphase, decimate"),
+        (
+            {"downsample": {"method": "magic"}},
+            "downsample.method 'magic' is not one of: polyphase, decimate",
+        ),
         ({"tracking": {"name": "mlflow", "uri": 3}}, "tracking.uri must be text"),
         ({"estimator": {}}, "estimator.name is missing"),
     ):
@@ -370,7 +518,10 @@ def test_shared_groups_are_read_with_their_types():
         ({"initial_state": 1}, "initial_state must be true or false"),
         ({"rate": 20}, "rate is not an option"),
     ):
-        said = refusal(lambda changes=changes: protocol_from_config({"rate_hz": 20} | changes), ConfigurationError)
+        said = refusal(
+            lambda changes=changes: protocol_from_config({"rate_hz": 20} | changes),
+            ConfigurationError,
+        )
         assert said.startswith(f"evaluation.{says}")
 
 
@@ -378,19 +529,30 @@ def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
     assert protocol_from_config({"rate_hz": 20}).rate_hz == 20.0
     low_pass = {"name": "low_pass", "cutoff_hz": 5.0}
     assert Preparation(transforms=(low_pass,)).as_plain()["transforms"] == [low_pass]
-    described = validated(Description, {"format": 1, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'")
+    described = validated(
+        Description, {"format": 1, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'"
+    )
     assert (type(described.settings["x"]), type(described.settings["y"][0])) == (float, float)
-    assert "format must be a whole number, not 1.0" in refusal(lambda: validated(Description, {"format": 1.0, "estimator": "a"}, "'f'"))
+    assert "format must be a whole number, not 1.0" in refusal(
+        lambda: validated(Description, {"format": 1.0, "estimator": "a"}, "'f'")
+    )
     assert check_format(1, 2, "'f'") == 1
     for wrong in (0, 3, True, 1.5, None, "1"):
         assert "'f'" in refusal(lambda wrong=wrong: check_format(wrong, 2, "'f'"))
 
 
 @pytest.mark.parametrize(
-    "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
+    "override",
+    [
+        "hydra.searchpath=[pkg://antigravity]",
+        "++hydra.searchpath=[pkg://antigravity]",
+        "+hydra/launcher=evil",
+    ],
 )
 def test_no_override_reaches_hydra_itself(override):
-    assert "is an option of Hydra itself" in refusal(lambda: compose_config("train", [override]), ConfigurationError)
+    assert "is an option of Hydra itself" in refusal(
+        lambda: compose_config("train", [override]), ConfigurationError
+    )
     assert "antigravity" not in sys.modules
 
 
@@ -398,7 +560,9 @@ def tree(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
-names = st.one_of(st.sampled_from(HOSTILE), st.text(max_size=40), st.text(alphabet="./\\~ \0ab", max_size=12))
+names = st.one_of(
+    st.sampled_from(HOSTILE), st.text(max_size=40), st.text(alphabet="./\\~ \0ab", max_size=12)
+)
 
 
 @settings(max_examples=25, deadline=None)
@@ -411,7 +575,9 @@ def test_no_name_inside_a_file_leads_out_of_the_output_root(label, stage, output
         before = tree(root)
         attempts = [
             lambda: make(StagePlan(stage, label, {}, {}, "", inside), lambda folder: None),
-            lambda: save_checkpoint(plan(inside, label).checkpoint_folder, Checkpoint({}, {"epoch": 1})),
+            lambda: save_checkpoint(
+                plan(inside, label).checkpoint_folder, Checkpoint({}, {"epoch": 1})
+            ),
             lambda: write_recording(recording(recording_id), inside / recording_file(recording_id)),
             lambda: _downsampled_from(inside, output),
         ]
@@ -425,13 +591,22 @@ def test_no_name_inside_a_file_leads_out_of_the_output_root(label, stage, output
 
 def _downsampled_from(inside, output):
     """Downsample what a manifest names that somebody else has written."""
-    ingested = make(plan(inside, "ingested"), lambda folder: write_recording(recording(), folder / "lap.parquet"))
+    ingested = make(
+        plan(inside, "ingested"),
+        lambda folder: write_recording(recording(), folder / "lap.parquet"),
+    )
     path = ingested.folder / "manifest.json"
     content = json.loads(path.read_text())
-    path.write_text(json.dumps(changed(content, outputs={output: content["outputs"]["lap.parquet"]})))
+    path.write_text(
+        json.dumps(changed(content, outputs={output: content["outputs"]["lap.parquet"]}))
+    )
     target = plan(inside, "target").folder
     target.mkdir(parents=True, exist_ok=True)
-    write_downsample(read_artefact(ingested.folder), {"rate_hz": 10.0, "method": "decimate", "transforms": []}, target)
+    write_downsample(
+        read_artefact(ingested.folder),
+        {"rate_hz": 10.0, "method": "decimate", "transforms": []},
+        target,
+    )
 
 
 @pytest.mark.parametrize("name", ["cnn_ukf", "ensemble_ukf"])

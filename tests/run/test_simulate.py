@@ -12,22 +12,43 @@ from vehest.simulation.plant import compiled
 from vehest.sources.simulated import SimulatedSource
 
 LAP = {"name": "laps", "course": "handling", "duration": 3.0}
-MANY_TURNS = {"name": "j_turn", "speed": 30.0, "severity": 1.4, "steer_time": 0.15, "turn_time": 5.0}
+MANY_TURNS = {
+    "name": "j_turn",
+    "speed": 30.0,
+    "severity": 1.4,
+    "steer_time": 0.15,
+    "turn_time": 5.0,
+}
 
 
 def simulated(place, drives, **more):
     """Write conf/dataset/sim.yaml."""
-    content = {"defaults": [{"/vehicle@vehicle": "bmw_320i_low"}, "_self_"], "name": "sim", "title": "A few drives"}
-    content |= {"licence": "none", "citation": "none", "source": "simulated", "seed": 0, "rate_hz": 50, "drives": drives}
+    content = {
+        "defaults": [{"/vehicle@vehicle": "bmw_320i_low"}, "_self_"],
+        "name": "sim",
+        "title": "A few drives",
+    }
+    content |= {
+        "licence": "none",
+        "citation": "none",
+        "source": "simulated",
+        "seed": 0,
+        "rate_hz": 50,
+        "drives": drives,
+    }
     place.change("conf/dataset/sim.yaml", **content | more)
 
 
 def samples(folder):
-    return {file.stem: read_recording(file)["ay"] for file in sorted(Path(folder).glob("*.parquet"))}
+    return {
+        file.stem: read_recording(file)["ay"] for file in sorted(Path(folder).glob("*.parquet"))
+    }
 
 
 def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, monkeypatch):
-    monkeypatch.setattr(local, "get_context", lambda _: get_context("fork"))  # which need not import vehest again
+    monkeypatch.setattr(
+        local, "get_context", lambda _: get_context("fork")
+    )  # which need not import vehest again
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
     alone = samples(place.told("simulate", "sim", "seed=1")["folder"])
     together = samples(place.told("simulate", "sim", "seed=1", "--jobs", "2", "--force")["folder"])
@@ -38,11 +59,17 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, m
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
-def test_the_ordinary_ingest_makes_the_same_which_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(place, monkeypatch):
+def test_the_ordinary_ingest_makes_the_same_which_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(
+    place, monkeypatch
+):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     folder = place.told("simulate", "sim", "seed=1")["folder"]
     again = place.told("simulate", "sim", "dataset.seed=1")
-    assert (again["folder"], again["skipped"], place.told("ingest", "sim", "dataset.seed=1")["folder"]) == (folder, True, folder)
+    assert (
+        again["folder"],
+        again["skipped"],
+        place.told("ingest", "sim", "dataset.seed=1")["folder"],
+    ) == (folder, True, folder)
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     (file,) = Path(place.told("simulate", "sim")["folder"]).glob("*.parquet")
     recording = read_recording(file)
@@ -83,38 +110,76 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
     recording = read_recording(Path(outcome["folder"]) / "wild.parquet")
     assert np.isfinite(recording["vy_ref"]).all()
     assert np.abs(recording["sideslip_ref"]).max() > 1.0, "it did spin"
-    assert np.hypot(recording["vx_ref"], recording["vy_ref"])[-1] == pytest.approx(0.0, abs=1e-6), "and stands at the end"
+    assert np.hypot(recording["vx_ref"], recording["vy_ref"])[-1] == pytest.approx(0.0, abs=1e-6), (
+        "and stands at the end"
+    )
     _, out, _ = place("simulate", "sim")
     assert "spun: 1 (wild)" in out
 
 
 def test_a_spin_at_high_speed_is_no_impossible_recording(place):
     wild = {"name": "random_steer", "speed": [45.0, 60.0], "severity": [1.4, 1.8], "duration": 8.0}
-    simulated(place, [{"id": "fast", "count": 4, "manoeuvre": wild}], defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"])
+    simulated(
+        place,
+        [{"id": "fast", "count": 4, "manoeuvre": wild}],
+        defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"],
+    )
     outcome = place.told("simulate", "sim")
     assert outcome["drives"] == 4
     assert len(outcome["spun"]) >= 1
-    sideways = [np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max() for name in outcome["spun"]]
+    sideways = [
+        np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max()
+        for name in outcome["spun"]
+    ]
     assert max(sideways) > 40.0, "beyond what the check of other recordings lets pass"
     out, _ = place.done("data", "check", "sim")
     assert "the simulated car spun here" in out
 
 
 def test_a_report_of_simulated_drives_never_says_real(place):
-    simulated(place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100)
+    simulated(
+        place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100
+    )
     train, validation, test = ([{"recording": name}] for name in "abc")
-    place.change("conf/split/sim.yaml", name="sim", dataset="sim", train=train, validation=validation, tests={"test": test})
+    place.change(
+        "conf/split/sim.yaml",
+        name="sim",
+        dataset="sim",
+        train=train,
+        validation=validation,
+        tests={"test": test},
+    )
     sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
-    place.change("pipelines/sim.yaml", study="s", title="t", report="drive", split="sim", sweeps=sweeps)
-    report = Path(place.told("run", "sim", "tracking=none")["report"]).with_name("report.md").read_text()
+    place.change(
+        "pipelines/sim.yaml", study="s", title="t", report="drive", split="sim", sweeps=sweeps
+    )
+    report = (
+        Path(place.told("run", "sim", "tracking=none")["report"]).with_name("report.md").read_text()
+    )
     assert "**Simulated data:** every number here comes from simulated recordings" in report
     assert "real data" not in report.lower()
     assert "| real |" not in report
 
 
 def test_what_cannot_be_simulated_is_one_line(place):
-    place.refused("simulate", "mine", code=2, says="data set 'mine' is not simulated but read from files; run 'vehest ingest mine'")
+    place.refused(
+        "simulate",
+        "mine",
+        code=2,
+        says="data set 'mine' is not simulated but read from files; run 'vehest ingest mine'",
+    )
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    place.refused("simulate", "sim", "seed=one", code=2, says="dataset.seed must be a whole number, zero or positive, not 'one'")
+    place.refused(
+        "simulate",
+        "sim",
+        "seed=one",
+        code=2,
+        says="dataset.seed must be a whole number, zero or positive, not 'one'",
+    )
     simulated(place, [{"id": "lap", "manoeuvre": {"name": "slalon"}}])
-    place.refused("simulate", "sim", code=2, says="there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change")
+    place.refused(
+        "simulate",
+        "sim",
+        code=2,
+        says="there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change",
+    )

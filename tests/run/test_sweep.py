@@ -21,7 +21,13 @@ from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.sweep import SweepArtefacts, build, heat_map, heat_maps, interval, table_of
 
-QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
+QUICK = (
+    "split=mine",
+    "estimator=ksnn",
+    "training.max_epochs=1",
+    "training.batch_size=256",
+    "tracking=none",
+)
 GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")
 
 
@@ -32,7 +38,16 @@ def jobs_of(scores, keys):
         for seed in range(len(next(iter(sets.values())))):
             figures = {f"rmse_sideslip.{name}": own[seed] for name, own in sets.items()}
             settings = dict(zip(keys, values, strict=True))
-            rows.append({"combination": number, "title": f"combination {number}", **settings, "seed": seed, "status": "done", **figures})
+            rows.append(
+                {
+                    "combination": number,
+                    "title": f"combination {number}",
+                    **settings,
+                    "seed": seed,
+                    "status": "done",
+                    **figures,
+                }
+            )
     return pd.DataFrame(rows).assign(error="", n_parameters=12, epochs=5.0)
 
 
@@ -40,7 +55,20 @@ def artefacts_of(jobs, keys, kind="simulated"):
     spans = {name: Span("mine", name, -math.inf, math.inf) for name in ("one", "two", "three")}
     split = Split("mine", (spans["one"],), (spans["two"],), {"test": (spans["three"],)})
     protocol, titles, none = Protocol(20.0, 10.0, 1.5), {"mine": "My car"}, pd.DataFrame()
-    part = PartArtefacts("s", "s", "", "vehest sweep", split, protocol, {"mine": kind}, titles, none, [], {}, ["facts"])
+    part = PartArtefacts(
+        "s",
+        "s",
+        "",
+        "vehest sweep",
+        split,
+        protocol,
+        {"mine": kind},
+        titles,
+        none,
+        [],
+        {},
+        ["facts"],
+    )
     return SweepArtefacts(part, keys, jobs)
 
 
@@ -51,28 +79,53 @@ def test_interval_is_that_of_students_t_and_a_lost_seed_is_not_dropped():
         low, high = stats.t.interval(0.95, n - 1, loc=values.mean(), scale=stats.sem(values))
         assert (mean - half, mean + half) == pytest.approx((low, high), rel=1e-12)
     assert interval(np.array([0.3])) == pytest.approx((0.3, math.nan), nan_ok=True)
-    assert all(map(math.isnan, (*interval(np.array([0.3, math.inf, 0.2])), *interval(np.array([])))))
+    assert all(
+        map(math.isnan, (*interval(np.array([0.3, math.inf, 0.2])), *interval(np.array([]))))
+    )
 
 
 KEYS = ("estimator.n_local",)
 
 
 def test_best_is_chosen_on_validation_though_another_is_better_on_the_test_and_never_with_a_failed_seed():
-    scores = {(2,): ([0.4, 0.5], [0.1, 0.1]), (3,): ([0.3, 0.4], [0.8, 0.9]), (4,): ([math.nan, 0.1], [0.1, 0.1])}
-    jobs = jobs_of({values: {"validation": own, "test": test} for values, (own, test) in scores.items()}, KEYS)
+    scores = {
+        (2,): ([0.4, 0.5], [0.1, 0.1]),
+        (3,): ([0.3, 0.4], [0.8, 0.9]),
+        (4,): ([math.nan, 0.1], [0.1, 0.1]),
+    }
+    jobs = jobs_of(
+        {values: {"validation": own, "test": test} for values, (own, test) in scores.items()}, KEYS
+    )
     table = artefacts_of(jobs, KEYS).table
     assert table["chosen"].tolist() == [False, True, False]
     assert table["rmse_sideslip.test"].tolist() == pytest.approx([0.1, 0.85, 0.1])
     header, rows = table_of(artefacts_of(jobs, KEYS))
     assert header == ["", "n_local", "parameters", "seeds", "validation", "test"]
     assert ([row[0] for row in rows], rows[1][4]) == (["", "*", ""], "0.350 ± 0.635")
-    swapped = jobs.rename(columns={"rmse_sideslip.validation": "rmse_sideslip.test", "rmse_sideslip.test": "rmse_sideslip.validation"})
+    swapped = jobs.rename(
+        columns={
+            "rmse_sideslip.validation": "rmse_sideslip.test",
+            "rmse_sideslip.test": "rmse_sideslip.validation",
+        }
+    )
     unvalidated = artefacts_of(swapped, KEYS)
-    unvalidated = replace(unvalidated, part=replace(unvalidated.part, split=replace(unvalidated.part.split, train=(), validation=())))
+    unvalidated = replace(
+        unvalidated,
+        part=replace(
+            unvalidated.part, split=replace(unvalidated.part.split, train=(), validation=())
+        ),
+    )
     assert not unvalidated.table["chosen"].any(), "nothing is chosen without a validation range"
-    jobs.loc[3, ["status", "rmse_sideslip.validation", "rmse_sideslip.test"]] = ["failed", math.nan, math.nan]
+    jobs.loc[3, ["status", "rmse_sideslip.validation", "rmse_sideslip.test"]] = [
+        "failed",
+        math.nan,
+        math.nan,
+    ]
     table = artefacts_of(jobs, KEYS).table
-    assert (table["chosen"].tolist(), table["n_seeds"].tolist()[:2]) == ([True, False, False], [2, 1])
+    assert (table["chosen"].tolist(), table["n_seeds"].tolist()[:2]) == (
+        [True, False, False],
+        [2, 1],
+    )
     assert table_of(artefacts_of(jobs, KEYS))[1][1][3] == "1 (1 failed)"
 
 
@@ -81,13 +134,20 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
         return {"validation": [value, value + 0.1], "test": [2 * value, 2 * value]}
 
     keys = (*KEYS, "estimator.n_hidden", "estimator.bias")
-    grid = {(p, q, bias): score(0.1 * p + 0.01 * q + bias) for p in (3, 2) for q in (0, 1, 2) for bias in (True, False)}
+    grid = {
+        (p, q, bias): score(0.1 * p + 0.01 * q + bias)
+        for p in (3, 2)
+        for q in (0, 1, 2)
+        for bias in (True, False)
+    }
     jobs = jobs_of(grid, keys)
     made = heat_maps(artefacts_of(jobs, keys))
     assert [figure.name for figure in made] == ["heat_map_validation", "heat_map_test"]
     axes = [axes for axes in made[0].static.axes if axes.get_xlabel() == "n_local"]
     assert [axes.get_title(loc="left") for axes in axes] == ["bias = true", "bias = false"]
-    assert [tick.get_text() for tick in axes[0].get_xticklabels()] == ["2", "3"], "sorted, though typed otherwise"
+    assert [tick.get_text() for tick in axes[0].get_xticklabels()] == ["2", "3"], (
+        "sorted, though typed otherwise"
+    )
     texts = {text.get_position(): text.get_text() for text in axes[1].texts}
     half = stats.t.ppf(0.975, 1) * 0.05
     assert texts[1, 2] == f"0.370\n±{half:.3f}"
@@ -117,10 +177,21 @@ def test_darker_is_larger_and_a_missing_cell_is_grey():
 
 
 def test_report_names_command_budget_split_kind_and_how_many_others_the_interval_of_the_chosen_one_covers():
-    scores = {(2,): [0.4, 0.5], (3,): [0.9, 0.9], (4,): [2.0, 2.1], (5,): [1.0, 1.1]}  # half interval of the first: 12.7 times 0.05
-    jobs = jobs_of({values: {"validation": own, "test": own} for values, own in scores.items()}, KEYS)
+    scores = {
+        (2,): [0.4, 0.5],
+        (3,): [0.9, 0.9],
+        (4,): [2.0, 2.1],
+        (5,): [1.0, 1.1],
+    }  # half interval of the first: 12.7 times 0.05
+    jobs = jobs_of(
+        {values: {"validation": own, "test": own} for values, own in scores.items()}, KEYS
+    )
     for kind, shown in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
-        text = "\n".join(block for block in build(artefacts_of(jobs, KEYS, kind)).blocks if isinstance(block, str))
+        text = "\n".join(
+            block
+            for block in build(artefacts_of(jobs, KEYS, kind)).blocks
+            if isinstance(block, str)
+        )
         assert text.startswith(shown)
         for words in (
             "Command: `vehest sweep`",
@@ -138,10 +209,14 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     assert folder.name.startswith("ksnn-mine-")
     jobs, table = pd.read_csv(folder / "sweep.csv"), pd.read_csv(folder / "summary.csv")
     assert (len(jobs), len(table), set(jobs["status"])) == (8, 4, {"done"})
-    own = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)]["rmse_sideslip.test"]
+    own = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)][
+        "rmse_sideslip.test"
+    ]
     row = table[(table["estimator.n_local"] == 3) & (table["estimator.n_hidden"] == 1)].iloc[0]
     assert row["rmse_sideslip.test"] == pytest.approx(own.mean(), rel=1e-12)
-    assert row["rmse_sideslip_half.test"] == pytest.approx(stats.t.ppf(0.975, 1) * own.std() / math.sqrt(2), rel=1e-12)
+    assert row["rmse_sideslip_half.test"] == pytest.approx(
+        stats.t.ppf(0.975, 1) * own.std() / math.sqrt(2), rel=1e-12
+    )
     assert outcome["chosen"]["combination"] == int(table["rmse_sideslip.validation"].idxmin())
     for name in ("validation", "test"):
         with Image.open(folder / "figures" / f"heat_map_{name}.png") as image:
@@ -158,18 +233,32 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     assert {line.split()[0] for line in err.splitlines()} == {"skipped"}
 
     out, err = place.done("sweep", *GRID[:-1], "seed=range(3)", "--name", "more")
-    assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 4, "only the third seeds were missing"
+    assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 4, (
+        "only the third seeds were missing"
+    )
     assert all(words in out for words in ("± ", "outputs/sweep/more-"))
 
 
 def test_failing_combinations_are_named_and_the_others_go_on(place):
-    arguments = (*QUICK, "estimator.n_hidden=-1,0,0.5", "training.learning_rate=0.001,1e6", "training.max_epochs=2", "seed=range(2)")
+    arguments = (
+        *QUICK,
+        "estimator.n_hidden=-1,0,0.5",
+        "training.learning_rate=0.001,1e6",
+        "training.max_epochs=2",
+        "seed=range(2)",
+    )
     arguments = tuple(word for word in arguments if word != "training.max_epochs=1")
     code, out, err = place("sweep", *arguments, "--json")
     assert code == 5
     last = err.splitlines()[-1]
     assert last.startswith("error: 10 of 12 jobs failed, the others are kept; ")
-    assert all(words in last for words in ("n_hidden=-1, learning_rate=0.001", "estimator.n_hidden must be at least 0, not -1"))
+    assert all(
+        words in last
+        for words in (
+            "n_hidden=-1, learning_rate=0.001",
+            "estimator.n_hidden must be at least 0, not -1",
+        )
+    )
     assert "Traceback" not in err
     outcome = json.loads(out)
     named = {entry["jobs"]: entry["message"] for entry in outcome["failed"]}
@@ -192,9 +281,14 @@ def test_a_single_combination_over_one_seed_has_no_interval_and_no_heat_map(plac
 
 def test_dry_run_tells_and_makes_nothing_and_the_same_training_twice_is_refused(place):
     out, err = place.done("sweep", *GRID, "--dry-run")
-    assert all(words in err for words in ("n_local=3, n_hidden=1 seeds 0, 1", "would   sweep      ksnn-mine"))
+    assert all(
+        words in err
+        for words in ("n_local=3, n_hidden=1 seeds 0, 1", "would   sweep      ksnn-mine")
+    )
     assert (out, place.files()) == ("", set())
-    code, _, err = place("sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0")
+    code, _, err = place(
+        "sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0"
+    )
     said = "checkpoint_seconds=20 seed 0: it is the same training as checkpoint_seconds=10"
     assert (code, said in err.splitlines()[-1]) == (5, True)
 
@@ -210,14 +304,23 @@ def test_dry_run_tells_and_makes_nothing_and_the_same_training_twice_is_refused(
 )
 def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
     with pytest.raises(ConfigurationError, match=message):
-        sweep_of(["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides])
+        sweep_of(
+            ["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides]
+        )
 
 
 def test_jobs_group_by_training_settings_that_come_in_groups():
     def job(rate):
         split = Split("any", (), (), {"test": (Span("any", "one", -math.inf, math.inf),)})
         plan = StagePlan("train", "any", {}, {}, "", Path())
-        return TrainJob(plan, {"name": "ksnn"}, {"name": "sequences", "phase": {"learning_rate": rate}}, split, 0, {})
+        return TrainJob(
+            plan,
+            {"name": "ksnn"},
+            {"name": "sequences", "phase": {"learning_rate": rate}},
+            split,
+            0,
+            {},
+        )
 
     assert hash(job(1e-3).group) == hash(job(1e-3).group)
     assert job(1e-3).group == job(1e-3).group != job(2e-3).group

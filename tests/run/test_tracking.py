@@ -20,7 +20,9 @@ from vehest.run.tracking import Tracker
 pytestmark = pytest.mark.apart
 
 
-def test_runs_are_tracked_with_parameters_metrics_and_model_and_then_recognised_without_mlflow(place):
+def test_runs_are_tracked_with_parameters_metrics_and_model_and_then_recognised_without_mlflow(
+    place,
+):
     place.done("run", "small")
     client = _client(place)
     runs = {run.info.run_name: run for run in _runs(client)}
@@ -29,12 +31,17 @@ def test_runs_are_tracked_with_parameters_metrics_and_model_and_then_recognised_
     assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
     trained = runs["ksnn-linear_no_bias_p2-seed0"]
     assert trained.data.tags["mlflow.source.name"].startswith("vehest run small")
-    assert (trained.data.params["estimator.n_local"], trained.data.params["training.learning_rate"]) == ("2", "0.001")
+    assert (
+        trained.data.params["estimator.n_local"],
+        trained.data.params["training.learning_rate"],
+    ) == ("2", "0.001")
     assert _is_whole(client, trained)
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     done = _in_process(
-        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
+        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()",
+        "run",
+        "small",
     )
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "False"), done.stderr
 
@@ -63,7 +70,11 @@ def _is_whole(client, run):
     """Whether a training's run has its losses and its files."""
     kept = {entry.path for entry in client.list_artifacts(run.info.run_id)}
     losses = [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")]
-    return run.info.status == "FINISHED" and losses == [1, 2] and {"model.safetensors", "model.yaml", "manifest.json"} <= kept
+    return (
+        run.info.status == "FINISHED"
+        and losses == [1, 2]
+        and {"model.safetensors", "model.yaml", "manifest.json"} <= kept
+    )
 
 
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
@@ -84,7 +95,10 @@ def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
     with monkeypatch.context() as killed:
         killed.setattr(MlflowClient, step, _raising(KeyboardInterrupt()))
         assert place(*TRAIN)[0] == 130
-    assert ([run.info.status for run in _local(place, "train")], place(*TRAIN)[0]) == (["RUNNING"], 0)
+    assert ([run.info.status for run in _local(place, "train")], place(*TRAIN)[0]) == (
+        ["RUNNING"],
+        0,
+    )
     [run] = _local(place, "train")
     assert _is_whole(_client(place), run)
 
@@ -135,7 +149,9 @@ def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place):
 def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place):
     assert place(*TRAIN)[0] == 0
     store = place.folder / "outputs" / "mlflow.db"
-    with sqlite3.connect(store) as padded:  # larger than any other file, so that it alone reaches the limit
+    with sqlite3.connect(
+        store
+    ) as padded:  # larger than any other file, so that it alone reaches the limit
         padded.execute("create table padding as select zeroblob(20000000) as zeros")
     padded.close()
     size = store.stat().st_size
@@ -155,7 +171,12 @@ def _raising(error):
 
 def _in_process(code, *arguments):
     """A command in a process of its own, run by ``code``."""
-    own = [sys.executable, "-c", f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}", *arguments]
+    own = [
+        sys.executable,
+        "-c",
+        f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}",
+        *arguments,
+    ]
     return subprocess.run(own, capture_output=True, text=True, check=False)
 
 
@@ -165,8 +186,24 @@ def mlflow_server(folder):
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}"
     folder.mkdir()
-    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--workers", "1"]
-    command += ["--backend-store-uri", f"sqlite:///{folder / 'server.db'}", "--artifacts-destination", folder / "artifacts"]
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "server",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        address.rpartition(":")[2],
+        "--workers",
+        "1",
+    ]
+    command += [
+        "--backend-store-uri",
+        f"sqlite:///{folder / 'server.db'}",
+        "--artifacts-destination",
+        folder / "artifacts",
+    ]
     with open(folder / "log", "wb") as log:
         process = start(command, stdout=log, stderr=log, cwd=folder)
 
@@ -198,7 +235,14 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
 
     watcher = threading.Thread(target=fell_over)
     watcher.start()
-    out, err = place.done("run", "small", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
+    out, err = place.done(
+        "run",
+        "small",
+        "--force",
+        "output=again",
+        f"tracking.uri={address}",
+        "tracking.experiment=second",
+    )
     watcher.join()
     assert (err.count("logging to MLflow"), "going on without tracking" in err) == (1, True)
     assert "KS-NN linear no bias, P = 2" in out
@@ -206,7 +250,9 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
 
 
 def test_training_goes_on_when_the_tracking_server_is_away(place):
-    _, err = place.done("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
+    _, err = place.done(
+        "train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9"
+    )
     assert (err.count("logging to MLflow"), "going on without tracking" in err) == (1, True)
 
 
@@ -232,4 +278,6 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact)
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}"))
-    assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}
+    assert {key: int(value) for key, value in run.data.params.items()} == {
+        f"group.{key}": v for key, v in config["group"].items()
+    }

@@ -15,7 +15,12 @@ from vehest.data.derivable_channels import MAKES, derivation_of
 from vehest.data.derived import WHEELS
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.data.recording_summary import RecordingSummary, common_channels, stored_summary, summary_of
+from vehest.data.recording_summary import (
+    RecordingSummary,
+    common_channels,
+    stored_summary,
+    summary_of,
+)
 from vehest.data.schema import settings_from_config
 from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
@@ -32,8 +37,17 @@ VALUES = {"wheel_radius": RADIUS, "ratio": RATIO}
 """What only the user knows of the car below."""
 
 FULL = {"vx", "yaw_rate", "ay", "ax", "steer", "vy_ref"}
-UNITS = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "ax": "m/s²", "steer": "rad", "handwheel": "rad"}
-UNITS |= {"vx_ref": "m/s", "vy_ref": "m/s", "sideslip_ref": "rad"} | {f"wheel_speed_{wheel}": "rad/s" for wheel in WHEELS}
+UNITS = {
+    "vx": "m/s",
+    "yaw_rate": "rad/s",
+    "ay": "m/s²",
+    "ax": "m/s²",
+    "steer": "rad",
+    "handwheel": "rad",
+}
+UNITS |= {"vx_ref": "m/s", "vy_ref": "m/s", "sideslip_ref": "rad"} | {
+    f"wheel_speed_{wheel}": "rad/s" for wheel in WHEELS
+}
 
 
 def log(channels, rate_hz=50.0, seed=1, seconds=30.0, name="lap"):
@@ -50,7 +64,10 @@ def rows(recording):
 
 
 def with_values(entries):
-    return [{key: VALUES[key] if value is None else value for key, value in entry.items()} for entry in entries]
+    return [
+        {key: VALUES[key] if value is None else value for key, value in entry.items()}
+        for entry in entries
+    ]
 
 
 def add_logged(place, channels, rate_hz=50.0, **options):
@@ -58,23 +75,49 @@ def add_logged(place, channels, rate_hz=50.0, **options):
     (place.folder / "raw" / "logged").mkdir()
     for seed in (1, 2, 3):
         lap = log(channels, rate_hz, seed)
-        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(place.folder / "raw" / "logged" / f"lap{seed}.csv", index=False)
+        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(
+            place.folder / "raw" / "logged" / f"lap{seed}.csv", index=False
+        )
     declared = {name: {"column": name, "unit": UNITS[name]} for name in sorted(channels)}
-    own = {"name": "logged", "path": "${root}/logged", "time": {"column": "t", "unit": "s"}, "channels": declared}
+    own = {
+        "name": "logged",
+        "path": "${root}/logged",
+        "time": {"column": "t", "unit": "s"},
+        "channels": declared,
+    }
     place.change("conf/dataset/logged.yaml", **DATASET | own | options)
     train, validation, test = ([{"recording": f"lap{number}"}] for number in (1, 2, 3))
-    place.change("conf/split/logged.yaml", name="logged", dataset="logged", train=train, validation=validation, tests={"test": test})
+    place.change(
+        "conf/split/logged.yaml",
+        name="logged",
+        dataset="logged",
+        train=train,
+        validation=validation,
+        tests={"test": test},
+    )
 
 
 def add_study(place, *sweeps, **options):
-    place.change("pipelines/logged.yaml", study="logged", report="drive", split="logged", sweeps=list(sweeps), **options)
+    place.change(
+        "pipelines/logged.yaml",
+        study="logged",
+        report="drive",
+        split="logged",
+        sweeps=list(sweeps),
+        **options,
+    )
 
 
 def models(place):
-    return {folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")}
+    return {
+        folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")
+    }
 
 
-IDENTIFIED = [f"training.identification.{setting}" for setting in ("method=data", "restarts=1", "generations=1")]
+IDENTIFIED = [
+    f"training.identification.{setting}"
+    for setting in ("method=data", "restarts=1", "generations=1")
+]
 QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
 
 
@@ -84,28 +127,52 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
     estimator = new_estimator(config["estimator"])
     training = settings_from_config(estimator.training_type, config["training"], "training")
     needed = lacking_to_train(estimator, training, ())
-    unread = {"vx"} if name in ("learned_ukf", "learned_ukf_variant", "kalman") else set()  # their estimates read it, their fits do not
+    unread = (
+        {"vx"} if name in ("learned_ukf", "learned_ukf_variant", "kalman") else set()
+    )  # their estimates read it, their fits do not
     assert bool(needed) == estimator.learns
     generator = np.random.default_rng(0)
     channels = {channel: 10.0 + generator.normal(size=400) for channel in needed}
-    stops = name not in QUICK  # at once where a fit would go on; of these the filter is identified whole before the network is trained
+    stops = (
+        name not in QUICK
+    )  # at once where a fit would go on; of these the filter is identified whole before the network is trained
     for channel in set(needed) - unread:
         held = {other: samples for other, samples in channels.items() if other != channel}
         lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, held, "simulated")
         with pytest.raises(DataError, match=f"'{channel}'|no {channel} "):
-            new_estimator(config["estimator"]).fit(FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops))
+            new_estimator(config["estimator"]).fit(
+                FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops)
+            )
 
 
 def test_channels_of_a_settings_choice_and_references_of_outputs_count():
     def needed(*overrides):
         config = compose_config("train", list(overrides))
         estimator = new_estimator(config["estimator"])
-        return set(lacking_to_train(estimator, settings_from_config(estimator.training_type, config["training"], "training"), ()))
+        return set(
+            lacking_to_train(
+                estimator,
+                settings_from_config(estimator.training_type, config["training"], "training"),
+                (),
+            )
+        )
 
     assert needed("estimator=sideslip_ffnn", "estimator.inputs=imu") == FULL
-    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]", "estimator.outputs=[vy]") == {"vx", "ay", "vy_ref"}
-    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]") == {"vx", "ay", "vx_ref", "vy_ref", "yaw_rate_ref"}
-    assert needed("estimator=kalman") == {"vx", "yaw_rate", "ay", "steer"}, "noise levels are read off measured channels"
+    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]", "estimator.outputs=[vy]") == {
+        "vx",
+        "ay",
+        "vy_ref",
+    }
+    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]") == {
+        "vx",
+        "ay",
+        "vx_ref",
+        "vy_ref",
+        "yaw_rate_ref",
+    }
+    assert needed("estimator=kalman") == {"vx", "yaw_rate", "ay", "steer"}, (
+        "noise levels are read off measured channels"
+    )
     assert needed("estimator=zero") == set()
 
 
@@ -113,7 +180,9 @@ def test_estimators_of_another_package_or_without_a_file_in_conf_say_themselves_
     kind = estimator_class("static_map")
     other = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
     assert set(lacking_to_train(other, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
-    found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))])
+    found = usability(
+        "luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))]
+    )
     assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
 
 
@@ -130,7 +199,11 @@ LOGS = {
 @pytest.mark.parametrize("channels", LOGS.values(), ids=list(LOGS))
 def test_every_transform_that_is_promised_makes_its_channel(channels, rate_hz):
     recording = log(channels, rate_hz)
-    promised = {channel: entries for row in rows(recording).values() for channel, entries in row["supplies"].items()}
+    promised = {
+        channel: entries
+        for row in rows(recording).values()
+        for channel, entries in row["supplies"].items()
+    }
     assert promised
     for channel, entries in promised.items():
         derived = recording
@@ -144,18 +217,36 @@ def test_every_transform_that_is_promised_makes_its_channel(channels, rate_hz):
 def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels):
     recording = log(channels)
     before = rows(recording)
-    entries = {json.dumps(entry): entry for row in before.values() for made in row["supplies"].values() for entry in with_values(made)}
-    for entry in sorted(entries.values(), key=lambda entry: entry["name"] != "speed_from_wheels"):  # others may need vx
+    entries = {
+        json.dumps(entry): entry
+        for row in before.values()
+        for made in row["supplies"].values()
+        for entry in with_values(made)
+    }
+    for entry in sorted(
+        entries.values(), key=lambda entry: entry["name"] != "speed_from_wheels"
+    ):  # others may need vx
         recording = transform_from_config(entry)(recording)
     after = rows(recording)
     for name in ("ksnn", "gru", "lstm", "luenberger", "static_map", "kinematic", "zero"):
         assert after[name]["usable"] == "yes", name
     for name in before:
-        unsupplied = {*before[name]["missing_to_estimate"], *before[name]["missing_to_train"]} - set(before[name]["supplies"])
+        unsupplied = {
+            *before[name]["missing_to_estimate"],
+            *before[name]["missing_to_train"],
+        } - set(before[name]["supplies"])
         assert {*after[name]["missing_to_estimate"], *after[name]["missing_to_train"]} == unsupplied
 
 
-NAMES = ("dugoff_ukf", "sideslip_ffnn", "cnn_ukf", "ensemble_ukf", "velocity_gru", "velocity_lstm", "data_sheet")
+NAMES = (
+    "dugoff_ukf",
+    "sideslip_ffnn",
+    "cnn_ukf",
+    "ensemble_ukf",
+    "velocity_gru",
+    "velocity_lstm",
+    "data_sheet",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -164,20 +255,32 @@ def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
     plain = usability(name, compose_config("train", [f"estimator={name}"]), contents)
     assert (plain.usable, "estimator.wheelbase=" in plain.to_give) == ("no", name == "data_sheet")
     given = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
-    assert usability(name, compose_config("train", [f"estimator={name}", *given]), contents).usable == "yes"
+    assert (
+        usability(name, compose_config("train", [f"estimator={name}", *given]), contents).usable
+        == "yes"
+    )
 
 
 def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to_those_whom_they_concern():
     found = rows(log(FULL - {"vy_ref"}))
-    assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == ("not to train", ["vy_ref"])
-    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), "they learn nothing of a reference"
+    assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == (
+        "not to train",
+        ["vy_ref"],
+    )
+    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), (
+        "they learn nothing of a reference"
+    )
     drive = log(FULL)
     ay = np.where(np.arange(len(drive)) == 10, np.nan, drive["ay"])
     found = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
-    assert (found["ksnn"]["gaps"], found["kalman"]["gaps"]) == (["ay"], []), "the filter skips a sample of ay"
+    assert (found["ksnn"]["gaps"], found["kalman"]["gaps"]) == (["ay"], []), (
+        "the filter skips a sample of ay"
+    )
     one, other = summary_of(drive), summary_of(log(FULL - {"ax"}, name="other"))
     assert common_channels([one, other]) == FULL - {"ax"}
-    assert usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
+    assert (
+        usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
+    )
     for channel, held, gappy in (
         ("ax", {"vx"}, {"vx"}),
         ("steer", {"vx", "yaw_rate"}, ()),
@@ -191,11 +294,16 @@ def test_every_transform_that_makes_a_channel_is_known_and_the_store_tells_gaps_
     assert set(MAKES) <= set(TRANSFORMS)
     recording = log(set(UNITS))
     for name, channel in MAKES.items():
-        options = {"speed_from_wheels": {"wheel_radius": RADIUS}, "steering_ratio": {"ratio": RATIO}}.get(name, {})
+        options = {
+            "speed_from_wheels": {"wheel_radius": RADIUS},
+            "steering_ratio": {"ratio": RATIO},
+        }.get(name, {})
         lacking = recording.select([own for own in recording.channels if own != channel])
         assert channel in transform_from_config({"name": name, **options})(lacking)
     vx = np.where(np.arange(40) == 3, np.nan, 1.0)
-    recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
+    recording = Recording(
+        "gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"})
+    )
     write_recording(recording, tmp_path / "gap.parquet")
     told = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
     assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == told
@@ -205,15 +313,27 @@ def test_table_names_all_estimators_and_json_says_the_same(place):
     add_logged(place, LOGS["wheels"])
     place("ingest", "logged")
     told = place.told("data", "usable", "logged")
-    assert ({row["estimator"] for row in told["estimators"]}, told["rate_hz"]) == (set(estimator_names()), 50.0)
+    assert ({row["estimator"] for row in told["estimators"]}, told["rate_hz"]) == (
+        set(estimator_names()),
+        50.0,
+    )
     assert told["missing_to_score"] == ["vx", "vy_ref"]
     ksnn = next(row for row in told["estimators"] if row["estimator"] == "ksnn")
-    assert (ksnn["missing_to_estimate"], ksnn["missing_to_train"]) == (["vx", "ax"], ["vx", "ax", "vy_ref"])
-    assert ksnn["supplies"]["ax"] == [{"name": "speed_from_wheels", "wheel_radius": None}, {"name": "acceleration_from_speed"}]
+    assert (ksnn["missing_to_estimate"], ksnn["missing_to_train"]) == (
+        ["vx", "ax"],
+        ["vx", "ax", "vy_ref"],
+    )
+    assert ksnn["supplies"]["ax"] == [
+        {"name": "speed_from_wheels", "wheel_radius": None},
+        {"name": "acceleration_from_speed"},
+    ]
     out, _ = place.done("data", "usable", "logged")
     words = " ".join(out.split())
     assert "luenberger no 50 Hz, not 100" in words
-    assert "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]" in words
+    assert (
+        "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]"
+        in words
+    )
 
 
 def test_bare_file_is_told_by_its_columns(place):
@@ -239,27 +359,45 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
             "'vehest data usable logged'",
         ),
     )
-    assert not list((place.folder / "outputs").glob("downsample/*")), "it is said before recordings are resampled"
-    place.change("conf/dataset/logged.yaml", transforms=[{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}])
+    assert not list((place.folder / "outputs").glob("downsample/*")), (
+        "it is said before recordings are resampled"
+    )
+    place.change(
+        "conf/dataset/logged.yaml",
+        transforms=[{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}],
+    )
     few = ("training.grid=1", "training.max_evaluations=10")
     place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
 
 
 def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
     add_logged(place, FULL - {"ax", "steer"})
-    add_study(place, ["estimator=zero"], ["estimator=static_map"], ["estimator=ksnn", "seed=0,1"], ["estimator=kalman"])
+    add_study(
+        place,
+        ["estimator=zero"],
+        ["estimator=static_map"],
+        ["estimator=ksnn", "seed=0,1"],
+        ["estimator=kalman"],
+    )
     code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
     told = json.loads(out)
     assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "static_map"}
     reasons = {name.split("-")[0]: reason for name, reason in told["failed"].items()}
     assert set(reasons) == {"ksnn", "kalman"}
-    assert "lack what estimator 'ksnn' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)" in reasons["ksnn"]
+    assert (
+        "lack what estimator 'ksnn' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)"
+        in reasons["ksnn"]
+    )
     assert "steer (not in the log)" in reasons["kalman"]
     assert models(place) == {"zero", "static_map"}
     lines = [line.split() for line in err.splitlines()]
     said = [position for position, line in enumerate(lines) if line[0] == "failed"]
-    made = [position for position, line in enumerate(lines) if line[:2] in (["done", "train"], ["done", "downsample"])]
+    made = [
+        position
+        for position, line in enumerate(lines)
+        if line[:2] in (["done", "train"], ["done", "downsample"])
+    ]
     assert len(said) == 2
     assert max(said) < min(made)
     assert "seeds 0, 1" in " ".join(lines[said[0]])
@@ -270,11 +408,17 @@ def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_show
 @pytest.mark.parametrize(
     ("channels", "sweeps", "says"),
     [
-        ({"vx", "yaw_rate", "vy_ref"}, ("ksnn", "kalman"), "none of these estimators can be used with the recordings of split 'logged'"),
+        (
+            {"vx", "yaw_rate", "vy_ref"},
+            ("ksnn", "kalman"),
+            "none of these estimators can be used with the recordings of split 'logged'",
+        ),
         (FULL - {"vy_ref"}, ("zero", "kalman"), "vy_ref (not in the log)"),
     ],
 )
-def test_study_none_of_whose_candidates_will_do_or_can_be_scored_trains_nothing(place, channels, sweeps, says):
+def test_study_none_of_whose_candidates_will_do_or_can_be_scored_trains_nothing(
+    place, channels, sweeps, says
+):
     add_logged(place, channels)
     add_study(place, *([f"estimator={name}"] for name in sweeps))
     code, _, err = place("run", "logged", "tracking=none")
@@ -283,13 +427,20 @@ def test_study_none_of_whose_candidates_will_do_or_can_be_scored_trains_nothing(
 
 def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(place):
     add_logged(place, (FULL - {"steer"}) | {"handwheel"})
-    code, out, err = place("sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none")
+    code, out, err = place(
+        "sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none"
+    )
     told = json.loads(out)
     assert (code, models(place)) == (5, {"static_map"})
-    assert [row["estimator"] for row in told["summary"] if row["rmse_sideslip.test"] is not None] == ["static_map"]
+    assert [
+        row["estimator"] for row in told["summary"] if row["rmse_sideslip.test"] is not None
+    ] == ["static_map"]
     assert "steer (transforms: [{name: steering_ratio" in told["failed"][0]["message"]
     assert err.index("steer (") < err.index("static_map")
-    add_study(place, ["estimator=kalman", f"downsample.transforms=[{{name: steering_ratio, ratio: {RATIO}}}]"])
+    add_study(
+        place,
+        ["estimator=kalman", f"downsample.transforms=[{{name: steering_ratio, ratio: {RATIO}}}]"],
+    )
     first, second = (place.done("run", "logged", "tracking=none") for _ in range(2))
     assert first[0] == second[0], "what the downsampling makes is not missing"
     assert list((place.folder / "outputs" / "finished").iterdir())
@@ -298,24 +449,49 @@ def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(pl
 
 def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     add_logged(place, FULL)
-    few = ("estimator=luenberger", "split=logged", "tracking=none", "training.grid=1", "training.max_evaluations=10")
+    few = (
+        "estimator=luenberger",
+        "split=logged",
+        "tracking=none",
+        "training.grid=1",
+        "training.max_evaluations=10",
+    )
     out, err = place.done("train", *few, "--json")
-    said = "luenberger runs at 50 Hz instead of its 100 Hz, since recording 'lap1' is sampled at 50 Hz"
+    said = (
+        "luenberger runs at 50 Hz instead of its 100 Hz, since recording 'lap1' is sampled at 50 Hz"
+    )
     assert " ".join(err.split()).count(said) == 1
     folder = Path(json.loads(out)["model"])
     assert yaml.safe_load((folder / "model.yaml").read_text())["settings"]["rate_hz"] == 50.0
-    assert json.loads((folder / "manifest.json").read_text())["config"]["estimator"]["rate_hz"] == 50.0
+    assert (
+        json.loads((folder / "manifest.json").read_text())["config"]["estimator"]["rate_hz"] == 50.0
+    )
     assert place("eval", *few, "--json")[0] == 0, "it finds the model by the same overrides"
     assert place("eval", "--model", str(folder), "split=logged", "tracking=none")[0] == 0
     same = place.told("train", *few, "estimator.rate_hz=50.0")
-    assert (same["model"], same["skipped"]) == (str(folder), True), "the same training as if the rate had been given"
+    assert (same["model"], same["skipped"]) == (str(folder), True), (
+        "the same training as if the rate had been given"
+    )
     said = "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less"
-    place.refused("train", "estimator=luenberger", "estimator.rate_hz=100", "split=logged", "tracking=none", code=3, says=said)
+    place.refused(
+        "train",
+        "estimator=luenberger",
+        "estimator.rate_hz=100",
+        "split=logged",
+        "tracking=none",
+        code=3,
+        says=said,
+    )
 
 
 def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
     add_logged(place, FULL)
-    add_study(place, ["estimator=zero"], ["estimator=kalman"], ["estimator=static_map", "estimator.rate_hz=100"])
+    add_study(
+        place,
+        ["estimator=zero"],
+        ["estimator=kalman"],
+        ["estimator=static_map", "estimator.rate_hz=100"],
+    )
     code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
     told = json.loads(out)
@@ -323,27 +499,43 @@ def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place
     assert [name.split("-")[0] for name in told["failed"]] == ["static_map"]
     assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
     report = (Path(told["report"]).parent / "report.md").read_text(encoding="utf-8")
-    assert all(words in report for words in ("kalman runs at 50 Hz instead of its 100 Hz", "Recordings at 20 and 50 Hz"))
+    assert all(
+        words in report
+        for words in ("kalman runs at 50 Hz instead of its 100 Hz", "Recordings at 20 and 50 Hz")
+    )
 
 
 def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
     add_logged(place, FULL, rate_hz=10.0)
-    add_study(place, ["estimator=static_map"], ["estimator=ksnn", "estimator.window=10", "training.max_epochs=2"])
+    add_study(
+        place,
+        ["estimator=static_map"],
+        ["estimator=ksnn", "estimator.window=10", "training.max_epochs=2"],
+    )
     out, err = place.done("run", "logged", "--json", "tracking=none")
     words = " ".join(err.split())
     assert words.count("evaluation reads estimates at 10 Hz instead of 20 Hz") == 1
     assert "ksnn runs at 10 Hz instead of its 20 Hz" in words
-    assert "estimator.window of 10 samples lasts 1 s instead of 0.5 s (estimator.window=5 keeps that)" in words
+    assert (
+        "estimator.window of 10 samples lasts 1 s instead of 0.5 s (estimator.window=5 keeps that)"
+        in words
+    )
     metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
     assert set(metrics["rate_hz"]) == {10.0}
     code, _, err = place("run", "logged", "evaluation.rate_hz=20", "tracking=none")
     assert code == 3
-    assert "evaluation.rate_hz asks for 20 Hz, and recording 'lap1' is sampled at 10 Hz" in err.splitlines()[-1]
+    assert (
+        "evaluation.rate_hz asks for 20 Hz, and recording 'lap1' is sampled at 10 Hz"
+        in err.splitlines()[-1]
+    )
 
 
 def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     add_logged(place, FULL)
-    tests = {"test": [{"recording": "lap3"}], "other": [{"dataset": "mine", "recording": "three"}]}  # the latter sampled at 100 Hz
+    tests = {
+        "test": [{"recording": "lap3"}],
+        "other": [{"dataset": "mine", "recording": "three"}],
+    }  # the latter sampled at 100 Hz
     place.change("conf/split/logged.yaml", tests=tests)
     add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
     out, err = place.done("run", "logged", "--json", "tracking=none")
@@ -359,7 +551,12 @@ def test_rates_that_recordings_have_are_left_alone_and_what_a_lower_one_means_is
     for group in ("estimator", "evaluation"):
         assert lower_rate(config, group, at(100.0)) == (config, [])
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
-    with pytest.raises(DataError, match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window"):
+    with pytest.raises(
+        DataError,
+        match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window",
+    ):
         lower_rate(config, "estimator", at(20.0))
-    _, ((_, text),) = lower_rate(compose_config("eval", ["estimator=velocity_gru"]), "estimator", at(50.0))
+    _, ((_, text),) = lower_rate(
+        compose_config("eval", ["estimator=velocity_gru"]), "estimator", at(50.0)
+    )
     assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text

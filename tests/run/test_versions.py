@@ -21,7 +21,9 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
     texts = [code_of("downsample"), code_of("sweep"), *trainings().values()]
     texts += [code_of("ingest", name) for name in source_names()]
     texts += [code_of("report", name) for name in study_names()]
-    texts += [code_of(stage, name) for name in estimator_names() for stage in ("calibrate", "evaluate")]
+    texts += [
+        code_of(stage, name) for name in estimator_names() for stage in ("calibrate", "evaluate")
+    ]
     for text in texts:
         assert re.fullmatch(r"\w+=[\w.]+( \w+=[\w.]+)*", text), text
         assert "vehest." not in text
@@ -31,7 +33,9 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
     assert code_of("ingest", "tabular") == "ingest=1 tabular=1"
 
 
-def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_its_own(monkeypatch):
+def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_its_own(
+    monkeypatch,
+):
     before = trainings()
     for name in estimator_names():
         monkeypatch.setattr(estimator_class(name), "__module__", "vehest.elsewhere")
@@ -40,11 +44,19 @@ def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_
     assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn"}
     assert code_of("evaluate", "ksnn") == "evaluate=1 ksnn=2"
     monkeypatch.setattr(SupervisedSettings, "version", "2")
-    assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn", "gru", "lstm"}
-    assert code_of("calibrate", "ksnn") == "calibrate=3 ksnn=2", "weights tell a calibration what changed"
+    assert {name for name, text in trainings().items() if text != before[name]} == {
+        "ksnn",
+        "gru",
+        "lstm",
+    }
+    assert code_of("calibrate", "ksnn") == "calibrate=3 ksnn=2", (
+        "weights tell a calibration what changed"
+    )
 
 
 def test_what_has_no_version_is_of_version_1():
     assert code_of("train", "zero").endswith(" training=1")
     assert code_of("report", "folds").endswith(" folds=2")
-    assert "no study module 'nobody'" in refusal(lambda: code_of("report", "nobody"), ConfigurationError)
+    assert "no study module 'nobody'" in refusal(
+        lambda: code_of("report", "nobody"), ConfigurationError
+    )

@@ -11,12 +11,18 @@ from conftest import planar_drive
 from place import run_vehest, undrawn
 
 
-def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(elsewhere, monkeypatch, capsys):
+def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(
+    elsewhere, monkeypatch, capsys
+):
     """Of four minutes of a simulated car in a logger's dress, in an empty folder."""
     undrawn(monkeypatch)
     log, drive = elsewhere, planar_drive(240.0, 50.0, seed=5, noise=0.02)
     beta = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]))
-    columns = {"Time": drive.time, "Speed": 3.6 * drive["vx"], "GyroZ": np.degrees(drive["yaw_rate"])}
+    columns = {
+        "Time": drive.time,
+        "Speed": 3.6 * drive["vx"],
+        "GyroZ": np.degrees(drive["yaw_rate"]),
+    }
     columns |= {"AccX": drive["ax"] / 9.80665, "AccY": drive["ay"] / 9.80665, "Beta": beta}
     pd.DataFrame(columns).to_csv(elsewhere / "lap.csv", index=False)
     assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
@@ -25,22 +31,39 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert pipeline["report"] == "own_car"
     sweeps = pipeline["parts"]["all"]["sweeps"]
     tuned = next(sweep for sweep in sweeps if "training.start_from=pretrained" in sweep)
-    short = {name: part for name, part in pipeline["parts"].items() if name in ("minutes_1", "minutes_1_tuned")}
+    short = {
+        name: part
+        for name, part in pipeline["parts"].items()
+        if name in ("minutes_1", "minutes_1_tuned")
+    }
     assert set(short) == {"minutes_1", "minutes_1_tuned"}
-    pipeline["parts"] = {"all": {**pipeline["parts"]["all"], "sweeps": [sweeps[0], tuned]}, **short}  # for the sake of time
+    pipeline["parts"] = {
+        "all": {**pipeline["parts"]["all"], "sweeps": [sweeps[0], tuned]},
+        **short,
+    }  # for the sake of time
     file.write_text(yaml.safe_dump(pipeline), encoding="utf-8")
 
-    code, out, err = run_vehest(capsys, "run", "my_car", "--minutes", "60", "tracking=none", "training.max_epochs=3")
+    code, out, err = run_vehest(
+        capsys, "run", "my_car", "--minutes", "60", "tracking=none", "training.max_epochs=3"
+    )
     assert code == 0, err
     said = out[out.index("FVU") :]
     assert re.search(r"Use |can be called best|Nothing beats|cannot rank estimators", said)
-    report = (next((log / "outputs" / "report").iterdir()) / "report.md").read_text(encoding="utf-8")
-    assert report.index("## Verdict") < report.index("## How much reference is needed") < report.index("## Test set `test`")
+    report = (next((log / "outputs" / "report").iterdir()) / "report.md").read_text(
+        encoding="utf-8"
+    )
+    assert (
+        report.index("## Verdict")
+        < report.index("## How much reference is needed")
+        < report.index("## Test set `test`")
+    )
     assert "lacks" in report, "families that were not compared are named"
 
     estimate = re.search(r"vehest estimate (\S+) YOUR_LOG dataset=my_car -o beta.csv", said)
     assert estimate is not None, said
-    code, out, err = run_vehest(capsys, "estimate", estimate[1], "lap.csv", "dataset=my_car", "-o", "out.csv", "--json")
+    code, out, err = run_vehest(
+        capsys, "estimate", estimate[1], "lap.csv", "dataset=my_car", "-o", "out.csv", "--json"
+    )
     assert code == 0, err
     assert json.loads(out)["estimated"] > 4000
     assert np.isfinite(pd.read_csv(log / "out.csv")["sideslip"].iloc[60:]).all()
@@ -53,5 +76,11 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     online, batch = pd.read_csv(log / export[2] / "expected.csv"), pd.read_csv(log / "out.csv")
     assert np.isfinite(online["sideslip"]).sum() > 4000
     steps = len(online) - len(batch) + round(20 * (batch["time"][0] - 0.0))
-    assert np.allclose(online["sideslip"].iloc[100:4000], batch["sideslip"].iloc[100 - steps : 4000 - steps], atol=1e-4)
-    assert {"main.c", "vehest_estimator.c", "vehest_method.c", "README.md"} <= {path.name for path in (log / export[2]).iterdir()}
+    assert np.allclose(
+        online["sideslip"].iloc[100:4000],
+        batch["sideslip"].iloc[100 - steps : 4000 - steps],
+        atol=1e-4,
+    )
+    assert {"main.c", "vehest_estimator.c", "vehest_method.c", "README.md"} <= {
+        path.name for path in (log / export[2]).iterdir()
+    }

@@ -10,13 +10,17 @@ from vehest.simulation.plant.parameters import vehicle_from_configuration
 
 FOLDER = Path(__file__).parents[2] / "conf" / "vehicle"
 OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")
-ALL = sorted(path.stem for path in FOLDER.glob("*.yaml") if "plant:" not in path.read_text(encoding="utf-8"))
+ALL = sorted(
+    path.stem for path in FOLDER.glob("*.yaml") if "plant:" not in path.read_text(encoding="utf-8")
+)
 """Multi-body cars."""
 
 
 @cache
 def shipped(name):
-    return vehicle_from_configuration(yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8")))
+    return vehicle_from_configuration(
+        yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    )
 
 
 @cache

@@ -42,7 +42,8 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     _, forces = plain.evaluate(states, inputs)
     steer = np.array([state.steer for state in states])
     asked = (
-        forces[:, 1] * np.cos(steer[:, None] * np.array([1, 1, 0, 0])) - forces[:, 0] * np.sin(steer[:, None] * np.array([1, 1, 0, 0]))
+        forces[:, 1] * np.cos(steer[:, None] * np.array([1, 1, 0, 0]))
+        - forces[:, 0] * np.sin(steer[:, None] * np.array([1, 1, 0, 0]))
     ) / forces[:, 2]
     asked = asked[:, [1, 0, 3, 2]]  # motion.WHEELS in the library's order
     times = np.arange(len(states)) / 1000.0
@@ -53,7 +54,9 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
         def rate(t, q, wheel=wheel, length=length):
             return np.interp(t, times, speed) / length * (np.interp(t, times, asked[:, wheel]) - q)
 
-        held = solve_ivp(rate, (0.0, times[-1]), [0.0], t_eval=times, max_step=2e-3, rtol=1e-8, atol=1e-10).y[0]
+        held = solve_ivp(
+            rate, (0.0, times[-1]), [0.0], t_eval=times, max_step=2e-3, rtol=1e-8, atol=1e-10
+        ).y[0]
         ours = np.array([state.held[wheel] for state in states])
         assert np.abs(held).max() > 0.2
         np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
@@ -63,7 +66,9 @@ def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_r
     def off(step):
         ends = []
         for length in (1e-4, 0.0):
-            plant = MultiBodyPlant(replace(plant_of("ferrari_250_lm").vehicle, relaxation=(length, length)), step)
+            plant = MultiBodyPlant(
+                replace(plant_of("ferrari_250_lm").vehicle, relaxation=(length, length)), step
+            )
             state, per_ms = plant.initial_state(0.0, 0.0, 0.0, 25.0), round(1e-3 / step)
             for k in range(800):
                 steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
@@ -73,7 +78,9 @@ def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_r
 
     assert off(1e-3) < 5e-3
     assert off(2.5e-4) < 0.4 * off(1e-3)  # first order in the step
-    with pytest.raises(ConfigurationError, match=r"relaxation rear must be zero or positive, not -0\.1 m"):
+    with pytest.raises(
+        ConfigurationError, match=r"relaxation rear must be zero or positive, not -0\.1 m"
+    ):
         _lagging((0.1, -0.1))
 
 
@@ -88,7 +95,9 @@ def test_a_payload_moves_the_static_loads_as_levers_say_and_stays_on_the_axles()
     a, b = empty.parameters.a, empty.parameters.b
     assert more.sum() == pytest.approx(80.0 * GRAVITY, rel=2e-3)
     assert more[:2].sum() == pytest.approx(80.0 * GRAVITY * (b - 0.6) / (a + b), rel=0.02)
-    assert full.parameters.I_z - empty.parameters.I_z == pytest.approx(80.0 * 0.6**2 * empty.parameters.m / full.parameters.m)
+    assert full.parameters.I_z - empty.parameters.I_z == pytest.approx(
+        80.0 * 0.6**2 * empty.parameters.m / full.parameters.m
+    )
     with pytest.raises(ConfigurationError, match="puts the centre of gravity off the axles"):
         loaded(plant_of("corvette_grand_sport").vehicle, 5000.0, forward=-3.0, up=0.0)
 
@@ -124,7 +133,9 @@ def test_installations_have_a_gain_a_bias_and_a_speed_of_wheels():
     steer = np.concatenate([np.zeros(80), np.full(20, 0.1)])
     wheels = np.full((100, 4), 30.0 / 0.32)
     wheels[90:] *= 0.8  # locking
-    shown = measure(motion_of(100, vx=30.0, steer=steer, wheel_speed=wheels), only(speed_of_wheels=True), 0)["vx"]
+    shown = measure(
+        motion_of(100, vx=30.0, steer=steer, wheel_speed=wheels), only(speed_of_wheels=True), 0
+    )["vx"]
     np.testing.assert_allclose(shown[:80], 30.0)
     np.testing.assert_allclose(shown[90:], 24.0)
 
@@ -152,7 +163,9 @@ def test_what_a_drive_says_of_its_own_is_checked_before_anything_is_simulated(ch
 
 
 def test_variations_of_parameters_and_sensors_are_drawn_over_their_ranges():
-    variation = variations_from_config([{"parameters": ["m"], "factor": [0.5, 2.0], "log": True}])[0]
+    variation = variations_from_config([{"parameters": ["m"], "factor": [0.5, 2.0], "log": True}])[
+        0
+    ]
     drawn = [variation.drawn(np.random.default_rng(seed)) for seed in range(2000)]
     assert np.mean(np.array(drawn) < 1.0) == pytest.approx(0.5, abs=0.04)
     assert 0.5 <= min(drawn) < 0.52

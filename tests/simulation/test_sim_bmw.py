@@ -17,7 +17,13 @@ CONFIGURATIONS = Path(__file__).parents[2] / "conf"
 
 # Section IV-A: "23 manoeuvres: two braking in the turn, two skidpad, five J-turn, four slalom, four lane change, two random steers, three
 # spiral and one lap track".
-TEST_MANOEUVRES = {"braking_in_turn": 2, "skidpad": 2, "j_turn": 5, "slalom": 4, "double_lane_change": 4}
+TEST_MANOEUVRES = {
+    "braking_in_turn": 2,
+    "skidpad": 2,
+    "j_turn": 5,
+    "slalom": 4,
+    "double_lane_change": 4,
+}
 TEST_MANOEUVRES |= {"random_steer": 2, "spiral": 3, "laps": 1}
 
 
@@ -29,7 +35,9 @@ def configuration(group, name):
 
 @cache
 def source(dataset="sim_bmw"):
-    return SimulatedSource({**configuration("dataset", dataset), "vehicle": configuration("vehicle", "bmw_545i")})
+    return SimulatedSource(
+        {**configuration("dataset", dataset), "vehicle": configuration("vehicle", "bmw_545i")}
+    )
 
 
 @cache
@@ -42,7 +50,11 @@ def role_of(drive_id):
 
 
 def mix(role, dataset="sim_bmw"):
-    return Counter(drive.manoeuvre["name"] for name, drive in source(dataset).drives.items() if role_of(name) == role)
+    return Counter(
+        drive.manoeuvre["name"]
+        for name, drive in source(dataset).drives.items()
+        if role_of(name) == role
+    )
 
 
 def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_the_papers():
@@ -50,7 +62,9 @@ def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_t
     assert sum(roles.values()) == 216
     assert set(roles) == {"train", "validation", "test"}
     for role, share in {"train": 0.75, "validation": 0.15, "test": 0.10}.items():
-        assert abs(roles[role] - 216 * share) <= 2, role  # 23 test manoeuvres are 10.6 % in the paper itself
+        assert abs(roles[role] - 216 * share) <= 2, (
+            role
+        )  # 23 test manoeuvres are 10.6 % in the paper itself
     assert mix("test") == TEST_MANOEUVRES
     for role in ("train", "validation"):
         drives = mix(role)
@@ -62,27 +76,44 @@ def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_t
 
 def test_drives_of_all_roles_share_ranges_and_stability_control_and_no_seed():
     for name in TEST_MANOEUVRES:
-        switched = [drive.stability_control for drive in source().drives.values() if drive.manoeuvre["name"] == name]
+        switched = [
+            drive.stability_control
+            for drive in source().drives.values()
+            if drive.manoeuvre["name"] == name
+        ]
         assert 0.3 < np.mean(switched) < 0.6, name
-    assert {drive.surface or source().options.surface for drive in source().drives.values()} == {"dry"}
+    assert {drive.surface or source().options.surface for drive in source().drives.values()} == {
+        "dry"
+    }
 
     def ranges(role):
-        drives = [drive.manoeuvre for name, drive in source().drives.items() if role_of(name) == role]
-        return {str({key: value for key, value in drive.items() if key != "laps"}) for drive in drives}
+        drives = [
+            drive.manoeuvre for name, drive in source().drives.items() if role_of(name) == role
+        ]
+        return {
+            str({key: value for key, value in drive.items() if key != "laps"}) for drive in drives
+        }
 
     assert ranges("train") == ranges("validation") == ranges("test")
     assert len({source().seed_of(name) for name in source().drives}) == 216
 
 
 def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_chose():
-    assert mix("unseen", "sim_bmw_unseen") == {name: 2 * count for name, count in TEST_MANOEUVRES.items()}
+    assert mix("unseen", "sim_bmw_unseen") == {
+        name: 2 * count for name, count in TEST_MANOEUVRES.items()
+    }
     new, old = source("sim_bmw_unseen").drives, source().drives
     seeds = {source("sim_bmw_unseen").seed_of(name) for name in new}
     assert not seeds & {source().seed_of(name) for name in old}
     assert len(seeds) == len(new) == 94
-    known = {str({key: value for key, value in drive.manoeuvre.items() if key != "laps"}) for drive in old.values()}
+    known = {
+        str({key: value for key, value in drive.manoeuvre.items() if key != "laps"})
+        for drive in old.values()
+    }
     tested = {
-        str({key: value for key, value in drive.manoeuvre.items() if key != "laps"}) for name, drive in new.items() if "unseen" in name
+        str({key: value for key, value in drive.manoeuvre.items() if key != "laps"})
+        for name, drive in new.items()
+        if "unseen" in name
     }
     assert tested == known
     full, limited = split("sim_bmw_unseen"), split("sim_bmw_unseen_limited")
@@ -106,19 +137,28 @@ def five_seconds(name, channels):
 @cache
 def split(name):
     return split_from_config(
-        configuration("split", name), lambda dataset: {own: partial(five_seconds, own) for own in source(dataset).ids()}
+        configuration("split", name),
+        lambda dataset: {own: partial(five_seconds, own) for own in source(dataset).ids()},
     )
 
 
 def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_7():
     for name in ("sim_bmw", "sim_bmw_limited"):
-        parts = {"train": split(name).train, "validation": split(name).validation, "test": split(name).tests["test"]}
+        parts = {
+            "train": split(name).train,
+            "validation": split(name).validation,
+            "test": split(name).tests["test"],
+        }
         for role, spans in parts.items():
-            assert {span.recording for span in spans} == {drive for drive in source().ids() if role_of(drive) == role}
+            assert {span.recording for span in spans} == {
+                drive for drive in source().ids() if role_of(drive) == role
+            }
             assert {span.dataset for span in spans} == {"sim_bmw"}
     full, limited = split("sim_bmw"), split("sim_bmw_limited")
     assert {span.stop for span in full.train + full.validation} == {4.0}  # a spin after that
     assert {span.stop for span in full.tests["test"]} == {4.5}  # below 5 m/s after that
-    assert {span.stop for span in limited.train + limited.validation} == {2.5}  # beyond 7 m/s² after that
+    assert {span.stop for span in limited.train + limited.validation} == {
+        2.5
+    }  # beyond 7 m/s² after that
     assert limited.tests == full.tests
     assert len(limited.train) == 161

@@ -37,18 +37,28 @@ def gap(course):
 
 def drive(seed, duration=12.0, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": "handling", "duration": duration})
-    return simulate_drive(id=f"drive{seed}", vehicle=LOWERED, manoeuvre=manoeuvre, seed=seed, **options)
+    return simulate_drive(
+        id=f"drive{seed}", vehicle=LOWERED, manoeuvre=manoeuvre, seed=seed, **options
+    )
 
 
 def trip(seed, course="handling", surface="dry", step=0.001, rate_hz=100.0, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": course, **options})
-    return drive_plant(MultiBodyPlant(LOWERED, step), manoeuvre, seed, surface=surface_from_config(surface), rate_hz=rate_hz)
+    return drive_plant(
+        MultiBodyPlant(LOWERED, step),
+        manoeuvre,
+        seed,
+        surface=surface_from_config(surface),
+        rate_hz=rate_hz,
+    )
 
 
 def places_on(course, x, y):
     """Nearest arc lengths, and distances from the centre line [m]."""
     fine = np.linspace(0.0, course.length, 40_000)
-    centre = np.stack([np.interp(fine, course.arc_length, values) for values in (course.x, course.y)], axis=1)
+    centre = np.stack(
+        [np.interp(fine, course.arc_length, values) for values in (course.x, course.y)], axis=1
+    )
     distance, nearest = cKDTree(centre).query(np.stack([x, y], axis=1))
     return fine[nearest], distance
 
@@ -60,7 +70,9 @@ def laps():
 
 @pytest.fixture(scope="module")
 def circuit():
-    return trip(1, course="palm_beach_like", duration=80.0)  # 2 km of 3.3 km, until the banked corner's end
+    return trip(
+        1, course="palm_beach_like", duration=80.0
+    )  # 2 km of 3.3 km, until the banked corner's end
 
 
 @pytest.mark.parametrize(
@@ -89,7 +101,9 @@ def test_courses_do_not_come_near_themselves(name):
     places = np.stack([course.x, course.y], axis=1)[:-1]
     pairs = cKDTree(places).query_pairs(14.0, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
-    assert np.minimum(apart, len(places) - apart).max() < 60  # samples, a metre each: neighbours along the road only
+    assert (
+        np.minimum(apart, len(places) - apart).max() < 60
+    )  # samples, a metre each: neighbours along the road only
 
 
 def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile():
@@ -111,7 +125,9 @@ def test_course_positions_follow_from_their_curvature(name):
     chord = np.hypot(np.diff(course.x), np.diff(course.y))
     np.testing.assert_allclose(chord, course.arc_length[1], rtol=1e-3)
     directions = np.unwrap(np.arctan2(np.diff(course.y), np.diff(course.x)))
-    np.testing.assert_allclose(directions, 0.5 * (course.heading[1:] + course.heading[:-1]), atol=1e-3)
+    np.testing.assert_allclose(
+        directions, 0.5 * (course.heading[1:] + course.heading[:-1]), atol=1e-3
+    )
     slope = 0.5 * (course.curvature[1:] + course.curvature[:-1])
     np.testing.assert_allclose(np.diff(course.heading), slope * course.arc_length[1], atol=5e-4)
 
@@ -128,9 +144,16 @@ def test_square_courses_have_the_length_turning_bank_and_heights_of_their_parts(
     with pytest.raises(ValueError, match="one side"):
         Compound((Corner(40.0, 1.0, 12.0), Corner(80.0, -1.0, 12.0)))
     banked = Corner(radius=50.0, angle=math.pi / 2.0, transition=10.0, banking=0.05)
-    layout = Layout((Straight(100.0), banked) * 4, crossfall=0.01, heights=((0.0, 0.0), (0.5, 4.0)), friction=((0.25, 0.5, 0.6),))
+    layout = Layout(
+        (Straight(100.0), banked) * 4,
+        crossfall=0.01,
+        heights=((0.0, 0.0), (0.5, 4.0)),
+        friction=((0.25, 0.5, 0.6),),
+    )
     course = build_course("banked", layout)
-    assert course.bank[course.curvature > 0.0199].mean() == pytest.approx(0.01 - 0.05, abs=1e-3)  # left turns: the right side is higher
+    assert course.bank[course.curvature > 0.0199].mean() == pytest.approx(
+        0.01 - 0.05, abs=1e-3
+    )  # left turns: the right side is higher
     assert course.bank[0] == pytest.approx(0.01)
     first_half = course.arc_length <= 0.5 * course.length
     climbed = -np.trapezoid(np.tan(course.grade[first_half]), course.arc_length[first_half])
@@ -159,13 +182,24 @@ def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_
     assert 0.85 < scale.max() <= 1.0
     edges = np.flatnonzero(np.diff(scale) != 0.0)
     assert np.diff(edges)[np.diff(edges) > 3].min() >= 15  # patches of 20 m, less their two edges
-    own, places = surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7}), np.arange(1000.0)
+    own, places = (
+        surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7}),
+        np.arange(1000.0),
+    )
     np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
 
 
 def test_surfaces_and_drives_that_make_no_sense_are_refused():
-    patches = {"patches": {"patches": 0.9, "friction": 0.5}, "5 m": {"patches": 0.5, "patch_length": [1.0, 2.0]}}
-    for complaint, configuration in {"icy": "icy", "0.05": {"friction": 0.0}, "mu": {"mu": 0.5}, **patches}.items():
+    patches = {
+        "patches": {"patches": 0.9, "friction": 0.5},
+        "5 m": {"patches": 0.5, "patch_length": [1.0, 2.0]},
+    }
+    for complaint, configuration in {
+        "icy": "icy",
+        "0.05": {"friction": 0.0},
+        "mu": {"mu": 0.5},
+        **patches,
+    }.items():
         with pytest.raises(ConfigurationError, match=complaint):
             surface_from_config(configuration)
     for options in ({"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}):
@@ -190,7 +224,9 @@ def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
     for lap in laps:
         place, distance = places_on(HANDLING, lap.motion.x, lap.motion.y)
         assert distance.max() < 1.5
-        assert len(np.unique(place // 6.0)) >= math.floor(HANDLING.length / 6.0)  # it really goes all the way around
+        assert len(np.unique(place // 6.0)) >= math.floor(
+            HANDLING.length / 6.0
+        )  # it really goes all the way around
         assert lap.motion.x[0] == pytest.approx(0.0, abs=1.0)
         assert lap.motion.x[-1] == pytest.approx(0.0, abs=1.0)
         assert lap.motion.vx[0] == pytest.approx(lap.motion.vx[-1], abs=3.0)  # a flying start
@@ -205,7 +241,11 @@ def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
 
 
 def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippery_road():
-    driver, car, used = Driver(), car_of(MultiBodyPlant(LOWERED)), np.full_like(HANDLING.curvature, 8.0)
+    driver, car, used = (
+        Driver(),
+        car_of(MultiBodyPlant(LOWERED)),
+        np.full_like(HANDLING.curvature, 8.0),
+    )
     speed = speed_profile(HANDLING.curvature, used, HANDLING.arc_length[1], car, driver)
     lateral = speed**2 * HANDLING.curvature
     longitudinal = np.diff(speed**2) / (2.0 * HANDLING.arc_length[1])
@@ -218,7 +258,9 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert np.isclose(np.abs(lateral), 8.0).sum() > 5  # and uses all of it in the corners
     curvature, used = np.full(200, 0.02), np.full(200, 8.0)
     speed = speed_profile(curvature, used, 1.0, car, driver)[100]
-    helped = speed_profile(curvature, used, 1.0, car, driver, bank=np.full(200, -0.1))[100]  # a left turn, its inner side lower
+    helped = speed_profile(curvature, used, 1.0, car, driver, bank=np.full(200, -0.1))[
+        100
+    ]  # a left turn, its inner side lower
     slippery = speed_profile(curvature, 0.5 * used, 1.0, car, driver)[100]
     # A little of the grip goes into keeping the speed against the air.
     assert speed**2 * 0.02 == pytest.approx(8.0, rel=3e-3)
@@ -230,13 +272,18 @@ def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_wh
     own = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
     car = car_of(MultiBodyPlant(own))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
-    for wrong, complaint in (({"grip": -1.0}, "grip"), ({"top_speed": 0.0}, "top_speed"), ({"gripp": 8.0}, "gripp")):
+    for wrong, complaint in (
+        ({"grip": -1.0}, "grip"),
+        ({"top_speed": 0.0}, "top_speed"),
+        ({"gripp": 8.0}, "gripp"),
+    ):
         with pytest.raises(ConfigurationError, match=complaint):
             car_of(MultiBodyPlant(replace(LOWERED, driver=wrong)))
     tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
     manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
     with pytest.raises(
-        SimulationError, match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: "
+        SimulationError,
+        match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: ",
     ) as raised:
         simulate_drive(id="high", vehicle=tall, manoeuvre=manoeuvre, seed=0)
     assert raised.value.exit_code == 3
@@ -246,8 +293,12 @@ def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
     course, motion = course_by_name("palm_beach_like"), circuit.motion
     place, _ = places_on(course, motion.x, motion.y)
     # The car is turned against the road by its sideslip and by the line's angle, a few degrees.
-    np.testing.assert_allclose(motion.bank, np.interp(place, course.arc_length, course.bank), atol=2.5e-3)
-    np.testing.assert_allclose(motion.grade, np.interp(place, course.arc_length, course.grade), atol=1.2e-2)
+    np.testing.assert_allclose(
+        motion.bank, np.interp(place, course.arc_length, course.bank), atol=2.5e-3
+    )
+    np.testing.assert_allclose(
+        motion.grade, np.interp(place, course.arc_length, course.grade), atol=1.2e-2
+    )
     assert motion.bank.min() < -0.09  # the left turn with six degrees
     assert motion.bank.max() > 0.03  # right turns lean the other way
 
@@ -256,21 +307,30 @@ def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit):
     motion, plant = circuit.motion, MultiBodyPlant(LOWERED)
     mass, drag = plant.parameters.m, car_of(plant).drag
     speed = np.hypot(motion.vx, motion.vy)
-    along = motion.tyre_fx.sum(axis=1) / mass + 9.81 * np.sin(motion.grade) - drag * speed * motion.vx
+    along = (
+        motion.tyre_fx.sum(axis=1) / mass + 9.81 * np.sin(motion.grade) - drag * speed * motion.vx
+    )
     np.testing.assert_allclose(along, motion.ax, atol=1e-6)
-    across = motion.tyre_fy.sum(axis=1) / mass - 9.81 * np.sin(motion.bank) - drag * speed * motion.vy
+    across = (
+        motion.tyre_fy.sum(axis=1) / mass - 9.81 * np.sin(motion.bank) - drag * speed * motion.vy
+    )
     # Sideways the body moves against its axles, whose forces the tyres give.
     banked = np.abs(motion.bank) > 0.03
     assert banked.sum() > 300
     assert np.abs(across - motion.ay)[banked].mean() < 0.1
-    assert np.abs(across + 9.81 * np.sin(motion.bank) - motion.ay)[banked].mean() > 0.25  # and does not without gravity
+    assert (
+        np.abs(across + 9.81 * np.sin(motion.bank) - motion.ay)[banked].mean() > 0.25
+    )  # and does not without gravity
 
 
 def test_flat_leaves_bank_and_grade_out_and_the_sampling_rate_does_not_change_the_drive():
     motion = trip(1, course="palm_beach_like", duration=2.0, flat=True).motion
     assert not motion.bank.any()
     assert not motion.grade.any()
-    coarse, fine = (drive(seed=0, duration=8.0, rate_hz=rate, sensors=PRESETS["ideal"]) for rate in (20.0, 100.0))
+    coarse, fine = (
+        drive(seed=0, duration=8.0, rate_hz=rate, sensors=PRESETS["ideal"])
+        for rate in (20.0, 100.0)
+    )
     for name in coarse.channels:
         np.testing.assert_array_equal(coarse[name], fine[name][::5])
 
@@ -295,7 +355,9 @@ def test_recording_says_where_it_comes_from():
     provenance = json.loads(json.dumps(recording.provenance))
     assert provenance == recording.provenance
     assert provenance["manoeuvre"]["name"] == "laps"
-    assert manoeuvre_from_config(provenance["manoeuvre"]) == manoeuvre_from_config({"name": "laps", "course": "handling", "duration": 12.0})
+    assert manoeuvre_from_config(provenance["manoeuvre"]) == manoeuvre_from_config(
+        {"name": "laps", "course": "handling", "duration": 12.0}
+    )
     assert provenance["seed"] == 1
     assert provenance["surface"]["name"] == "dry"
     assert provenance["stability_control"] is False

@@ -26,7 +26,12 @@ MODERATE = {
     "slalom 18 m": {"name": "slalom", "severity": 0.5},
     "slalom 30 m": {"name": "slalom", "spacing": 30.0, "cones": 6, "severity": 0.5},
     "skidpad": {"name": "skidpad", "severity": 0.8, "ay_rate": 0.4},
-    "braking in turn": {"name": "braking_in_turn", "severity": 0.5, "deceleration": 3.0, "turn_time": 3.0},
+    "braking in turn": {
+        "name": "braking_in_turn",
+        "severity": 0.5,
+        "deceleration": 3.0,
+        "turn_time": 3.0,
+    },
     "j-turn": {"name": "j_turn", "severity": 0.6, "turn_time": 5.0},
     "spiral": {"name": "spiral", "severity": 0.8, "ramp_time": 5.0},
     "random steer": {"name": "random_steer", "severity": 0.6, "duration": 10.0},
@@ -46,13 +51,23 @@ def vehicle(name):
 
 @cache
 def moderate(car, which):
-    return drive(MultiBodyPlant(vehicle(car)), manoeuvre_from_config((MODERATE | MODERATE_LAPS)[which]), seed=1)
+    return drive(
+        MultiBodyPlant(vehicle(car)),
+        manoeuvre_from_config((MODERATE | MODERATE_LAPS)[which]),
+        seed=1,
+    )
 
 
 def go(car, seed=1, surface="dry", stability_control=False, **configuration):
     plant = MultiBodyPlant(vehicle(car) if isinstance(car, str) else car)
     manoeuvre = manoeuvre_from_config(configuration)
-    return drive(plant, manoeuvre, seed, surface=surface_from_config(surface), stability_control=stability_control)
+    return drive(
+        plant,
+        manoeuvre,
+        seed,
+        surface=surface_from_config(surface),
+        stability_control=stability_control,
+    )
 
 
 def side_of(trip):
@@ -64,14 +79,23 @@ def times(trip):
 
 
 def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
-    assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(MANOEUVRES)
+    assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(
+        MANOEUVRES
+    )
     car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
-    sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
+    sides = {
+        manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"]
+        for seed in range(12)
+    }
     assert sides == {"left", "right"}
 
 
-@pytest.mark.parametrize("car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)])
-@pytest.mark.parametrize("which", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)])
+@pytest.mark.parametrize(
+    "car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)]
+)
+@pytest.mark.parametrize(
+    "which", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)]
+)
 def test_moderate_severity_is_completed_by_every_car(car, which):
     trip = moderate(car, which)
     flags, motion = trip.flags, trip.motion
@@ -86,7 +110,11 @@ def test_moderate_severity_is_completed_by_every_car(car, which):
     # The circuit's banked corner takes a little more than a level road's grip.
     grip = car_of(MultiBodyPlant(vehicle(car))).grip
     assert 0.25 * grip < flags.largest_ay < 1.1 * grip
-    for values in (getattr(motion, entry.name) for entry in fields(motion) if getattr(motion, entry.name) is not None):
+    for values in (
+        getattr(motion, entry.name)
+        for entry in fields(motion)
+        if getattr(motion, entry.name) is not None
+    ):
         assert np.isfinite(values).all()
 
 
@@ -109,7 +137,9 @@ def test_gates_are_those_of_the_standards():
     first = DoubleLaneChange(layout="iso_3888_1").gates(1.8)
     assert [gate.begin for gate in first] == [0.0, 45.0, 95.0]
     assert first[-1].end == 125.0
-    assert [gate.left - gate.right for gate in first] == pytest.approx([1.1 * 1.8 + 0.25, 1.2 * 1.8 + 0.25, 1.3 * 1.8 + 0.25])
+    assert [gate.left - gate.right for gate in first] == pytest.approx(
+        [1.1 * 1.8 + 0.25, 1.2 * 1.8 + 0.25, 1.3 * 1.8 + 0.25]
+    )
     assert 0.5 * (first[1].left + first[1].right) == pytest.approx(3.5)
     second = DoubleLaneChange(layout="iso_3888_2").gates(1.8)
     assert second[-1].end == 61.0  # ISO 3888-2 states the total length
@@ -148,7 +178,9 @@ def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
     ay = side * motion.ay[turned]
     slope = np.polyfit(times(trip)[turned], ay, 1)[0]
     assert slope == pytest.approx(0.4, rel=0.1)
-    assert ay[-50:].mean() == pytest.approx(0.8 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06)
+    assert ay[-50:].mean() == pytest.approx(
+        0.8 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06
+    )
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -159,14 +191,23 @@ def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand
     assert motion.ax[braking].mean() == pytest.approx(-3.0, abs=0.5)
     assert (side * motion.yaw_rate[braking] > 0.05).all()
     at_brakes = np.searchsorted(times(trip), trip.drawn["brakes_at"])
-    assert side * motion.ay[at_brakes] == pytest.approx(0.5 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06)
+    assert side * motion.ay[at_brakes] == pytest.approx(
+        0.5 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06
+    )
     assert np.ptp(motion.steer[at_brakes + 5 :]) < 1e-9  # the steering is held
     standing = np.flatnonzero(np.hypot(motion.vx, motion.vy) > 0.01)[-1]
     assert (len(motion) - 1 - standing) / 100.0 == pytest.approx(1.0, abs=0.05)
 
 
 def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
-    trip = go("bmw_545i", name="braking_in_turn", severity=0.5, deceleration=3.0, until_speed=5.0, steering="path")
+    trip = go(
+        "bmw_545i",
+        name="braking_in_turn",
+        severity=0.5,
+        deceleration=3.0,
+        until_speed=5.0,
+        steering="path",
+    )
     assert trip.flags.completed
     assert not trip.flags.stood
     assert trip.motion.vx[-1] == pytest.approx(5.0, abs=0.1)
@@ -179,7 +220,9 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     motion, drawn = trip.motion, trip.drawn
     last = slice(-100, None)
     assert np.ptp(motion.yaw_rate[last]) < 0.01 * abs(motion.yaw_rate[-1]) + 2e-3  # steady
-    assert side_of(trip) * motion.ay[last].mean() == pytest.approx(0.6 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.05)
+    assert side_of(trip) * motion.ay[last].mean() == pytest.approx(
+        0.6 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.05
+    )
     assert motion.steer[-1] == pytest.approx(drawn["steer"], abs=1e-4)
     before = times(trip) < drawn["begin"] - 0.05
     assert np.abs(motion.steer[before]).max() < 1e-6
@@ -190,7 +233,9 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
 def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
     trip = moderate("bmw_545i", "spiral")
     motion, side, drawn = trip.motion, side_of(trip), trip.drawn
-    ramp = (times(trip) > drawn["begin"] + 0.5) & (times(trip) < drawn["begin"] + drawn["ramp_time"])
+    ramp = (times(trip) > drawn["begin"] + 0.5) & (
+        times(trip) < drawn["begin"] + drawn["ramp_time"]
+    )
     assert (np.diff(side * motion.yaw_rate[ramp]) > 0.0).all()
     grip = car_of(MultiBodyPlant(vehicle("bmw_545i"))).grip
     assert (side * motion.ay).max() == pytest.approx(0.8 * grip, rel=0.1)
@@ -201,7 +246,9 @@ def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
 
 
 def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
-    trip = go("bmw_545i", name="random_steer", severity=0.6, speed=20.0, band=[0.2, 1.0], duration=60.0)
+    trip = go(
+        "bmw_545i", name="random_steer", severity=0.6, speed=20.0, band=[0.2, 1.0], duration=60.0
+    )
     steer = trip.motion.steer[200:]
     spectrum = np.abs(np.fft.rfft(steer * np.hanning(len(steer)))) ** 2
     frequency = np.fft.rfftfreq(len(steer), 0.01)
@@ -211,7 +258,9 @@ def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
     assert np.abs(trip.motion.vx - 20.0).max() < 1.0
 
 
-@pytest.mark.parametrize(("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)])
+@pytest.mark.parametrize(
+    ("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)]
+)
 def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(car, reached):
     # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6 to 10.8 m/s² for the Ferrari.
     trip = go(car, seed=100, name="laps", course="palm_beach_like", severity=0.95, laps=1)
@@ -225,7 +274,9 @@ def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
     trip = go("heavy_truck", name="speed_laps", speeds=[45.0 / 3.6])
     motion = trip.motion
     x, y = motion.x, motion.y
-    crossing = np.flatnonzero((x[:-1] < 0.0) & (x[1:] >= 0.0) & (np.abs(y[1:]) < 10.0))  # the line, where the road leads along x
+    crossing = np.flatnonzero(
+        (x[:-1] < 0.0) & (x[1:] >= 0.0) & (np.abs(y[1:]) < 10.0)
+    )  # the line, where the road leads along x
     end = crossing[crossing > 1000][0] / 100.0
     assert course_by_name("vairano_like").length / end == pytest.approx(45.0 / 3.6, rel=0.02)
     assert np.abs(motion.vx[: round(100 * end) - 100] - 45.0 / 3.6).max() < 0.5
@@ -254,7 +305,10 @@ SPINNING = {"name": "j_turn", "severity": 1.3, "speed": 30.0, "turn_time": 8.0}
 def oversteering():
     """A Ferrari whose rear tyres have three quarters of the front tyres' friction."""
     base = vehicle("ferrari_250_lm")
-    rear = base.overrides["tire_rear"] | {"p_ky1": -18.0, "p_dy1": 0.75 * base.overrides["tire"]["p_dy1"]}
+    rear = base.overrides["tire_rear"] | {
+        "p_ky1": -18.0,
+        "p_dy1": 0.75 * base.overrides["tire"]["p_dy1"],
+    }
     return replace(base, name="oversteering", overrides={**base.overrides, "tire_rear": rear})
 
 
@@ -269,7 +323,11 @@ def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
     assert speed[0] > 25.0
     standing = np.flatnonzero(speed > 0.01)[-1]
     assert (len(motion) - 1 - standing) / 100.0 == pytest.approx(1.0, abs=0.05)
-    for values in (getattr(motion, entry.name) for entry in fields(motion) if getattr(motion, entry.name) is not None):
+    for values in (
+        getattr(motion, entry.name)
+        for entry in fields(motion)
+        if getattr(motion, entry.name) is not None
+    ):
         assert np.isfinite(values).all()
 
 
@@ -293,7 +351,9 @@ def test_drives_that_are_cut_off_or_leave_the_road_are_flagged():
         trip = drive(MultiBodyPlant(vehicle("bmw_545i")), manoeuvre, seed=0)
         assert len(trip.motion) == 300
         assert (trip.flags.completed, trip.flags.gave_up_at) == (completed, None)
-    manoeuvre = manoeuvre_from_config({"name": "double_lane_change", "layout": "iso_3888_2", "speed": 45.0})
+    manoeuvre = manoeuvre_from_config(
+        {"name": "double_lane_change", "layout": "iso_3888_2", "speed": 45.0}
+    )
     recording = simulate_drive(id="out", vehicle=vehicle("bmw_545i"), manoeuvre=manoeuvre, seed=0)
     flags = recording.provenance["flags"]
     assert (flags["left_road"], flags["completed"], flags["stood"]) == (True, False, True)
@@ -306,7 +366,10 @@ def test_drives_that_are_cut_off_or_leave_the_road_are_flagged():
 @pytest.mark.parametrize("name", sorted(MANOEUVRES))
 def test_description_makes_the_manoeuvre_again(name):
     manoeuvre = manoeuvre_from_config({"name": name, **({"laps": 2} if name == "laps" else {})})
-    as_lists = {key: list(value) if isinstance(value, tuple) else value for key, value in manoeuvre.description().items()}
+    as_lists = {
+        key: list(value) if isinstance(value, tuple) else value
+        for key, value in manoeuvre.description().items()
+    }
     assert manoeuvre_from_config(as_lists) == manoeuvre
 
 

@@ -33,23 +33,95 @@ from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, VX, VY, YAW_RATE,
 
 AS_PUBLISHED = Vehicle("bmw_320i", parameter_set=2)
 LOWERED = shipped("bmw_320i_low")
-FERRARI, CORVETTE, TRUCK = shipped("ferrari_250_lm"), shipped("corvette_grand_sport"), shipped("heavy_truck")
+FERRARI, CORVETTE, TRUCK = (
+    shipped("ferrari_250_lm"),
+    shipped("corvette_grand_sport"),
+    shipped("heavy_truck"),
+)
 
 # CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py): BMW 320i, state, derivatives.
 PUBLISHED_INPUTS = (0.15, 0.63 * GRAVITY)
 PUBLISHED_STATE = [
-    *(10.8808433066274794, 0.5371850187869442, 0.0980442671005920, 18.0711398687457745, 0.1649995631003776, 0.6158755000936103),
-    *(-0.1198403612262477, -0.2762672756169581, 0.0131909920269115, -0.0718483683742141, -0.3428324595054725, 0.0103233373083297),
-    *(-0.0399590564140291, -0.0246468320579360, -0.0551575051990853, 0.5798277643297529, 0.0172059354801703, 0.0067890113155477),
-    *(-0.0184269459410162, -0.0408207136116175, -1.0064484829203018, 0.0166808347900582, -0.0049188492004049, 53.6551710641082451),
-    *(50.7045242506744316, 56.7917911784219598, 200.7079633169796296, -0.0939969123691911, -0.0881514621614376),
+    *(
+        10.8808433066274794,
+        0.5371850187869442,
+        0.0980442671005920,
+        18.0711398687457745,
+        0.1649995631003776,
+        0.6158755000936103,
+    ),
+    *(
+        -0.1198403612262477,
+        -0.2762672756169581,
+        0.0131909920269115,
+        -0.0718483683742141,
+        -0.3428324595054725,
+        0.0103233373083297,
+    ),
+    *(
+        -0.0399590564140291,
+        -0.0246468320579360,
+        -0.0551575051990853,
+        0.5798277643297529,
+        0.0172059354801703,
+        0.0067890113155477,
+    ),
+    *(
+        -0.0184269459410162,
+        -0.0408207136116175,
+        -1.0064484829203018,
+        0.0166808347900582,
+        -0.0049188492004049,
+        53.6551710641082451,
+    ),
+    *(
+        50.7045242506744316,
+        56.7917911784219598,
+        200.7079633169796296,
+        -0.0939969123691911,
+        -0.0881514621614376,
+    ),
 ]
 PUBLISHED_DERIVATIVES = [
-    *(17.8820162482414098, 2.6300428035858809, 0.1500000000000000, 2.7009396644636450, 0.6158755000936103, 1.3132879472301846),
-    *(-0.2762672756169581, -0.1360581472638375, -0.0718483683742141, 0.4909514227532223, -2.6454134031927374, -0.0399590564140291),
-    *(0.0486778649724968, -0.0551575051990853, 0.0354501802049087, -1.1130397141873534, 0.0067890113155477, -0.0886810139593130),
-    *(-0.0408207136116175, 0.0427680029698811, -4.3436374104751501, -0.0049188492004049, 0.1142109377736169, 10.0527321757776047),
-    *(0.0436512393438736, -154.12795711273924, 422.12780928288305, -0.2105876149500405, -0.2126005780977984),
+    *(
+        17.8820162482414098,
+        2.6300428035858809,
+        0.1500000000000000,
+        2.7009396644636450,
+        0.6158755000936103,
+        1.3132879472301846,
+    ),
+    *(
+        -0.2762672756169581,
+        -0.1360581472638375,
+        -0.0718483683742141,
+        0.4909514227532223,
+        -2.6454134031927374,
+        -0.0399590564140291,
+    ),
+    *(
+        0.0486778649724968,
+        -0.0551575051990853,
+        0.0354501802049087,
+        -1.1130397141873534,
+        0.0067890113155477,
+        -0.0886810139593130,
+    ),
+    *(
+        -0.0408207136116175,
+        0.0427680029698811,
+        -4.3436374104751501,
+        -0.0049188492004049,
+        0.1142109377736169,
+        10.0527321757776047,
+    ),
+    *(
+        0.0436512393438736,
+        -154.12795711273924,
+        422.12780928288305,
+        -0.2105876149500405,
+        -0.2126005780977984,
+    ),
 ]
 
 
@@ -70,9 +142,17 @@ class TwoTyres:
 def in_python(function):
     """A compiled function as plain Python, with all it calls: Python's sines are those of the library."""
     plain = function.py_func
-    used = {name: plain.__globals__[name] for name in plain.__code__.co_names if name in plain.__globals__}
+    used = {
+        name: plain.__globals__[name]
+        for name in plain.__code__.co_names
+        if name in plain.__globals__
+    }
     return FunctionType(
-        plain.__code__, {name: in_python(value) if isinstance(value, Dispatcher) else value for name, value in used.items()}
+        plain.__code__,
+        {
+            name: in_python(value) if isinstance(value, Dispatcher) else value
+            for name, value in used.items()
+        },
     )
 
 
@@ -82,7 +162,10 @@ def equations_in_python():
 
 
 def derivatives_of(x, inputs, vehicle):
-    derivatives, contact = [math.nan] * 29, (int(Regime.ROLLING), np.zeros(5), 1.0, 1.0, False, np.zeros(8))
+    derivatives, contact = (
+        [math.nan] * 29,
+        (int(Regime.ROLLING), np.zeros(5), 1.0, 1.0, False, np.zeros(8)),
+    )
     equations_in_python()(list(x), *inputs, contact, compiled_parameters(vehicle), derivatives)
     return derivatives
 
@@ -127,20 +210,36 @@ def spin():
 
 def test_published_derivatives_are_reproduced():
     computed = derivatives_of(PUBLISHED_STATE, list(PUBLISHED_INPUTS), AS_PUBLISHED)
-    np.testing.assert_allclose(computed, PUBLISHED_DERIVATIVES, rtol=0.0, atol=5e-8)  # as the library's own test: seven places
+    np.testing.assert_allclose(
+        computed, PUBLISHED_DERIVATIVES, rtol=0.0, atol=5e-8
+    )  # as the library's own test: seven places
     inputs = inputs_of(*PUBLISHED_INPUTS)
     state = PlantState(np.array(PUBLISHED_STATE), Regime.ROLLING)
     derivatives, _ = MultiBodyPlant(AS_PUBLISHED).evaluate([state], inputs[None])
-    same = np.setdiff1d(np.arange(29), [25, 26])  # one driven wheel spins at 200 rad/s: the plant's engine has no such power
-    np.testing.assert_allclose(derivatives[0, same], np.array(PUBLISHED_DERIVATIVES)[same], rtol=0.0, atol=5e-8)
+    same = np.setdiff1d(
+        np.arange(29), [25, 26]
+    )  # one driven wheel spins at 200 rad/s: the plant's engine has no such power
+    np.testing.assert_allclose(
+        derivatives[0, same], np.array(PUBLISHED_DERIVATIVES)[same], rtol=0.0, atol=5e-8
+    )
 
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
 def test_equations_are_the_librarys_bit_by_bit(vehicle):
-    plant, generator, parameters = MultiBodyPlant(vehicle), np.random.default_rng(0), TwoTyres(vehicle)
-    assert plant.initial_state(0.0, 0.0, 0.0, 0.0).values[[16, 21]].tolist() == np.array(init_mb([0.0] * 7, parameters))[[16, 21]].tolist()
+    plant, generator, parameters = (
+        MultiBodyPlant(vehicle),
+        np.random.default_rng(0),
+        TwoTyres(vehicle),
+    )
+    assert (
+        plant.initial_state(0.0, 0.0, 0.0, 0.0).values[[16, 21]].tolist()
+        == np.array(init_mb([0.0] * 7, parameters))[[16, 21]].tolist()
+    )
     for _ in range(200):
-        state, inputs = disturbed(plant, generator, generator.uniform(0.7, 60.0)), generator.uniform([-0.5, -15.0], [0.5, 15.0])
+        state, inputs = (
+            disturbed(plant, generator, generator.uniform(0.7, 60.0)),
+            generator.uniform([-0.5, -15.0], [0.5, 15.0]),
+        )
         state[FIRST_WHEEL] *= generator.uniform(-0.1, 1.0)
         expected = vehicle_dynamics_mb(state.tolist(), inputs.tolist(), parameters)
         assert derivatives_of(state.tolist(), inputs.tolist(), vehicle) == expected
@@ -148,12 +247,20 @@ def test_equations_are_the_librarys_bit_by_bit(vehicle):
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
 def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle):
-    plant, generator, parameters = MultiBodyPlant(vehicle), np.random.default_rng(1), TwoTyres(vehicle)
+    plant, generator, parameters = (
+        MultiBodyPlant(vehicle),
+        np.random.default_rng(1),
+        TwoTyres(vehicle),
+    )
     for _ in range(20):
         state, inputs = disturbed(plant, generator), generator.uniform([-0.3, -8.0], [0.3, 0.5])
         expected = np.array(vehicle_dynamics_mb(state.tolist(), inputs.tolist(), parameters))
-        derivatives, _ = plant.evaluate([PlantState(state, Regime.ROLLING)], inputs_of(*inputs)[None])
-        np.testing.assert_allclose(derivatives[0], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+        derivatives, _ = plant.evaluate(
+            [PlantState(state, Regime.ROLLING)], inputs_of(*inputs)[None]
+        )
+        np.testing.assert_allclose(
+            derivatives[0], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max()
+        )
 
 
 def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_below():
@@ -168,7 +275,9 @@ def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_bel
         state = plant.initial_state(0.0, 0.0, 0.0, speed).values
         state[[FIRST_WHEEL, VY, YAW_RATE]] += 0.01, 0.02, 0.02
         at_limit.append(derivatives_of(state.tolist(), [0.0, 0.0], LOWERED))
-    np.testing.assert_allclose(at_limit[0], at_limit[1], rtol=1e-3, atol=1e-3)  # no step at the limit
+    np.testing.assert_allclose(
+        at_limit[0], at_limit[1], rtol=1e-3, atol=1e-3
+    )  # no step at the limit
     creeping = plant.initial_state(0.0, 0.0, 0.0, 1e-6).values
     assert np.isfinite(derivatives_of(creeping.tolist(), [0.0, 0.0], LOWERED)).all()
 
@@ -180,7 +289,9 @@ def test_fixed_step_agrees_with_solve_ivp():
     def right_hand_side(_, state):
         return vehicle_dynamics_mb(state.tolist(), inputs[:2].tolist(), parameters)
 
-    reference = solve_ivp(right_hand_side, (0.0, 1.0), start.values, method="DOP853", rtol=1e-8, atol=1e-9).y[:, -1]
+    reference = solve_ivp(
+        right_hand_side, (0.0, 1.0), start.values, method="DOP853", rtol=1e-8, atol=1e-9
+    ).y[:, -1]
     state = plant.advance(start, inputs, 1000)
     np.testing.assert_allclose(state.values, reference, rtol=1e-4, atol=1e-4)
     assert abs(state.yaw_rate * state.vx) > 6.0  # the manoeuvre is not a harmless one
@@ -190,7 +301,9 @@ def turn_left(speed, steer, seconds, vehicle=LOWERED):
     plant = MultiBodyPlant(vehicle)
 
     def hold(time, state):
-        return inputs_of(np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * (speed - state.vx) + 0.8)
+        return inputs_of(
+            np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * (speed - state.vx) + 0.8
+        )
 
     return drive(plant, plant.initial_state(0.0, 0.0, 0.0, speed), hold, seconds)[0]
 
@@ -206,20 +319,32 @@ def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     assert (turn.tyre_fz[-1, [1, 3]] > turn.tyre_fz[-1, [0, 2]] + 500.0).all()  # and carry more
     assert (turn.tyre_fy[-1] > 0).all()
     plant = MultiBodyPlant(LOWERED)
-    motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lambda time, state: inputs_of(acceleration=-5.0), 1.0)
+    motion, _ = drive(
+        plant,
+        plant.initial_state(0.0, 0.0, 0.0, 30.0),
+        lambda time, state: inputs_of(acceleration=-5.0),
+        1.0,
+    )
     assert motion.pitch[-1] > 0.005
     assert motion.ax[-1] == pytest.approx(-5.0, abs=0.5)
     assert motion.pitch[0] == 0.0
     assert (motion.tyre_fx[-1] < -500.0).all()
-    np.testing.assert_allclose(np.gradient(motion.pitch, 0.01)[5:-1], motion.pitch_rate[5:-1], atol=2e-3)
+    np.testing.assert_allclose(
+        np.gradient(motion.pitch, 0.01)[5:-1], motion.pitch_rate[5:-1], atol=2e-3
+    )
 
 
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
-    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0)
+    motion, states = drive(
+        plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0
+    )
     assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
     assert motion.vx[-1] == 0.0
-    for velocity, rate in ((motion.vy, motion.ay - motion.vx * motion.yaw_rate), (motion.vx, motion.ax + motion.vy * motion.yaw_rate)):
+    for velocity, rate in (
+        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
+        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
+    ):
         error = np.abs((velocity[2:] - velocity[:-2]) / 2e-3 - rate[1:-1])
         assert np.median(error) < 1e-5
         # Inputs that jump (brakes at 2 s) and the stop itself leave a few samples with half a jump.
@@ -228,7 +353,10 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     motion, states = spin
     sliding = np.array([state.regime == Regime.SLIDING for state in states])
     inside = np.flatnonzero(sliding[:-2] & sliding[2:])
-    for velocity, rate in ((motion.vy, motion.ay - motion.vx * motion.yaw_rate), (motion.vx, motion.ax + motion.vy * motion.yaw_rate)):
+    for velocity, rate in (
+        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
+        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
+    ):
         error = np.abs((velocity[inside + 2] - velocity[inside]) / 0.02 - rate[inside + 1])
         assert np.median(error) < 0.02  # the sampling is ten times coarser here
 
@@ -244,12 +372,19 @@ def test_tyre_forces_account_for_all_accelerations(moment):
 
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), command, 2.0, rate_hz)
     values = np.array([state.values for state in states])
-    change = ((values[2:] - values[:-2]) / (2.0 / rate_hz))[100:]  # brakes and moment come on within the first 100 ms
+    change = ((values[2:] - values[:-2]) / (2.0 / rate_hz))[
+        100:
+    ]  # brakes and moment come on within the first 100 ms
     vx, vy, yaw_rate = (values[101:-1, place] for place in (VX, VY, YAW_RATE))
     forces = [force[101:-1] for force in (motion.tyre_fx, motion.tyre_fy)]
     ax = change[:, VX] - vy * yaw_rate - slope[0]
-    np.testing.assert_allclose(forces[0].sum(axis=1), p.m * ax, atol=0.5)  # of 2,000 N: what differences over 2 ms leave
-    lateral = sum(mass * (change[:, place] + vx * yaw_rate - slope[1]) for mass, place in ((p.m_s, VY), (p.m_uf, 15), (p.m_ur, 20)))
+    np.testing.assert_allclose(
+        forces[0].sum(axis=1), p.m * ax, atol=0.5
+    )  # of 2,000 N: what differences over 2 ms leave
+    lateral = sum(
+        mass * (change[:, place] + vx * yaw_rate - slope[1])
+        for mass, place in ((p.m_s, VY), (p.m_uf, 15), (p.m_ur, 20))
+    )
     joint = 8.0  # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
     np.testing.assert_allclose(forces[1].sum(axis=1), lateral, atol=joint)
     arm_x, arm_y = np.array([p.a, p.a, -p.b, -p.b]), 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])
@@ -265,18 +400,30 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     without, with_moment, too_much = plant.motion([state] * 3, inputs, 100.0).ax
     arm = 0.25 * (p.T_f + p.T_r)
     assert with_moment - without == pytest.approx(-900.0 / arm / p.m, rel=1e-9)
-    assert too_much == pytest.approx(-0.5 * GRAVITY * 1.27, rel=0.03)  # half of the weight times the friction of 1.24 and 1.30
+    assert too_much == pytest.approx(
+        -0.5 * GRAVITY * 1.27, rel=0.03
+    )  # half of the weight times the friction of 1.24 and 1.30
     after = plant.advance(state, inputs_of(moment=900.0), 10)
-    assert after.yaw_rate == pytest.approx(900.0 / p.I_z * 0.01, rel=0.05)  # the tyres already resist
+    assert after.yaw_rate == pytest.approx(
+        900.0 / p.I_z * 0.01, rel=0.05
+    )  # the tyres already resist
 
 
 def test_gravity_on_a_bank_pulls_alike_and_friction_halves_what_is_reached():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
     plant, across = MultiBodyPlant(FERRARI), road_gravity(bank=0.1, grade=0.0)[1]
     assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
-    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(across=across), 1.0, friction=1e-3)
+    motion, states = drive(
+        plant,
+        plant.initial_state(0.0, 0.0, 0.0, 20.0),
+        lambda t, s: inputs_of(across=across),
+        1.0,
+        friction=1e-3,
+    )
     assert motion.vy[-1] == pytest.approx(across * 0.99, rel=0.02)
-    assert np.abs([state.values[27:29] for state in states]).max() < 1e-4  # 1e-2 with the body pulled alone
+    assert (
+        np.abs([state.values[27:29] for state in states]).max() < 1e-4
+    )  # 1e-2 with the body pulled alone
     plant = MultiBodyPlant(CORVETTE)
     dry, wet = (ramp_steer(plant, 25.0, friction=friction).ay.max() for friction in (1.0, 0.5))
     assert wet / dry == pytest.approx(0.5, rel=0.08)  # above: smaller slip angles cost less drag
@@ -290,7 +437,9 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
             after = plant.advance(start, inputs_of(), 2000)
             moved = after.values - start.values
             assert moved[0] == pytest.approx(2.0 * speed, abs=2e-3)
-            if vehicle is not LOWERED or speed == 0.0:  # whose published tyres pull to one side when they roll
+            if (
+                vehicle is not LOWERED or speed == 0.0
+            ):  # whose published tyres pull to one side when they roll
                 assert np.abs(moved[1:]).max() < 1e-9
     plant = MultiBodyPlant(FERRARI)
     along = road_gravity(bank=0.0, grade=0.1)[0]
@@ -305,7 +454,10 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     assert motion.grade[0] == 0.1
     plant = MultiBodyPlant(TRUCK)
     motion, states = drive(
-        plant, plant.initial_state(0.0, 0.0, 0.0, 12.5), lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5), 12.0
+        plant,
+        plant.initial_state(0.0, 0.0, 0.0, 12.5),
+        lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5),
+        12.0,
     )
     stands = np.array([state.stands for state in states])
     assert np.flatnonzero(stands)[0] == pytest.approx(500, abs=15)
@@ -313,7 +465,9 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     assert not motion.ax[520:700].any()
     assert not motion.wheel_speed[600:700].any()
     assert np.abs(motion.pitch[600:700]).max() < 1e-3  # the last nod is over
-    assert motion.vx[-1] == pytest.approx(1.5 * 5.0, rel=0.06)  # wheels take part of the force to turn faster
+    assert motion.vx[-1] == pytest.approx(
+        1.5 * 5.0, rel=0.06
+    )  # wheels take part of the force to turn faster
     assert not states[-1].spun
 
 
@@ -323,14 +477,22 @@ def test_regimes_join_without_jumps_that_matter():
     def stop_and_go(time, state):
         return inputs_of(10.0 * (0.15 * math.sin(time) - state.steer), -2.5 if time < 3.0 else 2.0)
 
-    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 5.0), stop_and_go, 6.0, rate_hz=1000.0)
+    motion, states = drive(
+        plant, plant.initial_state(0.0, 0.0, 0.0, 5.0), stop_and_go, 6.0, rate_hz=1000.0
+    )
     regimes = np.array([state.regime for state in states])
     joins = np.flatnonzero(np.diff(regimes)) + 1
     assert regimes[joins].tolist() == [Regime.SLOW, Regime.ROLLING]
     for k in joins:
         assert abs(motion.ax[k] - motion.ax[k - 1]) < 0.1
         assert abs(motion.ay[k] - motion.ay[k - 1]) < 0.02
-        for name, largest in (("vx", 3e-3), ("vy", 5e-4), ("yaw_rate", 5e-4), ("roll", 1e-4), ("pitch", 1e-4)):  # a step's change
+        for name, largest in (
+            ("vx", 3e-3),
+            ("vy", 5e-4),
+            ("yaw_rate", 5e-4),
+            ("roll", 1e-4),
+            ("pitch", 1e-4),
+        ):  # a step's change
             assert abs(getattr(motion, name)[k] - getattr(motion, name)[k - 1]) < largest, name
         assert np.abs(motion.tyre_fz[k] - motion.tyre_fz[k - 1]).max() < 10.0
     slow = np.flatnonzero((regimes == Regime.SLOW) & (motion.vx > 0.3))
@@ -344,7 +506,11 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     assert not states[0].spun
     assert states[-1].stands
     assert math.degrees(np.abs(motion.sideslip[motion.vx**2 + motion.vy**2 > 1.0]).max()) > 60.0
-    for name in (field.name for field in fields(Motion) if field.name != "rate_hz" and not field.name.startswith("motor_")):
+    for name in (
+        field.name
+        for field in fields(Motion)
+        if field.name != "rate_hz" and not field.name.startswith("motor_")
+    ):
         assert np.isfinite(getattr(motion, name)).all(), name
     p = MultiBodyPlant(CORVETTE).parameters
     energy = 0.5 * p.m * (motion.vx**2 + motion.vy**2) + 0.5 * p.I_z * motion.yaw_rate**2
@@ -374,7 +540,12 @@ def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_r
 def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
     plant = MultiBodyPlant(CORVETTE)
     p = plant.parameters
-    motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(0.3 if t < 0.3 else 0.0, 7.0), 3.0)
+    motion, _ = drive(
+        plant,
+        plant.initial_state(0.0, 0.0, 0.0, 20.0),
+        lambda t, s: inputs_of(0.3 if t < 0.3 else 0.0, 7.0),
+        3.0,
+    )
     assert motion.tyre_fz.min() >= 1.0
     driven = motion.wheel_speed[:, 2:].mean(axis=1) * p.R_w
     assert driven.max() > 1.2 * motion.vx.max()  # they do spin
@@ -391,9 +562,13 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
         for acceleration in (-20.0, 0.0, 5.0):
             for steering, friction in ((0.0, 1.0), (0.3, 0.3)):
                 state = plant.initial_state(0.0, 0.0, 0.0, speed)
-                state = plant.advance(state, inputs_of(steering, acceleration, 500.0), 600, friction)
+                state = plant.advance(
+                    state, inputs_of(steering, acceleration, 500.0), 600, friction
+                )
                 assert np.isfinite(state.values).all()
-                assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
+                assert abs(state.values[ROLL]) < (
+                    0.3 if vehicle.name.startswith("set") else 0.2
+                )  # the published springs are soft
 
 
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
@@ -413,10 +588,15 @@ def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
 
 
 def test_no_kind_of_array_is_compiled_for_twice():
-    plant, state = MultiBodyPlant(FERRARI), MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
+    plant, state = (
+        MultiBodyPlant(FERRARI),
+        MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0),
+    )
     read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
     for inputs in (read_only, columns, columns.tolist()):
         for friction in (1.0, [1, 1, 1], np.broadcast_to(1.0, 3)):
             plant.motion([state] * 3, inputs, 100.0, friction=friction)
         plant.advance(state, inputs[0], 1)
-    assert [len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]
+    assert [
+        len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)
+    ] == [1, 1]

@@ -12,7 +12,12 @@ from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
-from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear_tyre, vehicle_from_configuration
+from vehest.simulation.plant.parameters import (
+    Vehicle,
+    library_parameters,
+    rear_tyre,
+    vehicle_from_configuration,
+)
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
 from vehest.simulation.plant.stability import StabilityControl, StabilityState, stability_control
 from vehest_papers.proving_ground.handling import understeer_angle
@@ -31,7 +36,15 @@ def steady_turn(plant, speed, steer, seconds=8.0):
     for _ in range(round(100 * seconds)):
         error = speed - state.vx
         integral += 0.01 * error
-        inputs = np.array([np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * error + 2.0 * integral, 0.0, 0.0, 0.0])
+        inputs = np.array(
+            [
+                np.clip(10.0 * (steer - state.steer), -0.02, 0.02),
+                3.0 * error + 2.0 * integral,
+                0.0,
+                0.0,
+                0.0,
+            ]
+        )
         state = plant.advance(state, inputs, 10)
     return plant.motion([state], inputs[None], 100.0)
 
@@ -55,14 +68,18 @@ def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_track
     assert turn.yaw_rate[0] == pytest.approx(ay / speed, rel=0.03)
     if name in OURS:  # the published tyre pulls to one side besides
         rear_slip = p.b * turn.yaw_rate[0] / speed - turn.sideslip[0]
-        assert rear_slip == pytest.approx(p.m * p.a / length / rear * ay, rel=0.05)  # camber, left out, takes 2 to 3 %
+        assert rear_slip == pytest.approx(
+            p.m * p.a / length / rear * ay, rel=0.05
+        )  # camber, left out, takes 2 to 3 %
 
 
 @each_vehicle
 def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
     ramp, plant = ramp_of(name), plant_of(name)
     angle, limit = understeer_angle(ramp, plant.wheelbase), int(np.argmax(ramp.ay))
-    share = 0.95 if name == "jaguar_e_type" else 0.99  # its rear bends as early as its front: at the limit it turns neutral
+    share = (
+        0.95 if name == "jaguar_e_type" else 0.99
+    )  # its rear bends as early as its front: at the limit it turns neutral
     wanted = np.arange(0.5, share * ramp.ay[limit], 0.25)
     at_wanted = np.interp(wanted, np.maximum.accumulate(ramp.ay[:limit]), angle[:limit])
     assert at_wanted[0] > 0.0
@@ -80,7 +97,11 @@ def test_grip_is_what_the_car_reaches_in_steady_state(name):
 def test_cars_reach_the_lateral_accelerations_of_the_papers():
     # Table I of Da Lio et al. 2023: 99 % quantiles of the laps; Fig. 4 of Bertipaglia et al. 2024: spread over ±10 m/s²,
     # in transients too, which reach a little more than a steady turn.
-    for name, shown, at_most in (("corvette_grand_sport", 11.6, 12.5), ("ferrari_250_lm", 10.78, 11.7), ("bmw_545i", 9.4, 10.5)):
+    for name, shown, at_most in (
+        ("corvette_grand_sport", 11.6, 12.5),
+        ("ferrari_250_lm", 10.78, 11.7),
+        ("bmw_545i", 9.4, 10.5),
+    ):
         for speed in (25.0, 40.0):
             ramp = ramp_steer(plant_of(name), speed)
             assert shown < ramp.ay.max() < at_most, name
@@ -102,11 +123,15 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
     unsprung = p.m_uf + p.m_ur
     axle_height = p.R_w - deflection
     height = (p.m_s * (p.h_s - deflection) + unsprung * axle_height) / p.m
-    axle_lean = 0.5 * ((load[1] - load[0]) / (p.K_zt * p.T_f) + (load[3] - load[2]) / (p.K_zt * p.T_r))
+    axle_lean = 0.5 * (
+        (load[1] - load[0]) / (p.K_zt * p.T_f) + (load[3] - load[2]) / (p.K_zt * p.T_r)
+    )
     lean = GRAVITY * (p.m_s * turn.roll[0] * (p.h_s - p.R_w) + p.m * axle_lean * p.R_w)
     give = p.K_lt * np.sum(load * turn.tyre_fy[0])
     assert ay > 1.0
-    assert transfer == pytest.approx(p.m * ay * height + lean + give, rel=3e-3)  # angles are taken as small
+    assert transfer == pytest.approx(
+        p.m * ay * height + lean + give, rel=3e-3
+    )  # angles are taken as small
     lean_and_give = 0.09 if name in OURS else 0.15  # the published tyre gives 16 mm/kN
     assert transfer == pytest.approx(p.m * ay * height, rel=lean_and_give)
 
@@ -139,7 +164,10 @@ def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
     # Di Biase et al. 2020, Table 1 and the remark below Eq. 27, with the rational tyre at friction 1.
     plant = plant_of("heavy_truck")
     p = plant.parameters
-    for load_arm, tyre, c1, c2 in ((p.b, p.tire, 0.01286, 486735.0), (p.a, p.tire_rear, 0.00769, 622319.0)):
+    for load_arm, tyre, c1, c2 in (
+        (p.b, p.tire, 0.01286, 486735.0),
+        (p.a, p.tire_rear, 0.00769, 622319.0),
+    ):
         load = p.m * GRAVITY * load_arm / (p.a + p.b)
         assert -tyre.p_ky1 * load == pytest.approx(c2, rel=0.01)
         assert load == pytest.approx(c2 * math.sqrt(2.0 * c1) / 2.0, rel=0.01)
@@ -173,22 +201,35 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
             block = ""
         else:
             assert SOURCE.search(comment or block), line
-    assert "parameter_set: 2  # BMW 320i (Althoff and Würsching" in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    assert "parameter_set: 2  # BMW 320i (Althoff and Würsching" in (
+        FOLDER / f"{name}.yaml"
+    ).read_text(encoding="utf-8")
 
 
 def test_overrides_reach_the_plant_and_cars_without_stated_shifts_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
-        after = plant.advance(plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0]), 2000)
+        after = plant.advance(
+            plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0]), 2000
+        )
         assert abs(after.y) < 1e-12
         assert abs(after.yaw) < 1e-12
-    slippery = Vehicle("slippery", 2, {"h_s": 0.45, "tire": {"p_dy1": 0.5}, "tire_rear": {"p_dx1": 0.6}})
+    slippery = Vehicle(
+        "slippery", 2, {"h_s": 0.45, "tire": {"p_dy1": 0.5}, "tire_rear": {"p_dx1": 0.6}}
+    )
     assert library_parameters(slippery).tire.p_dy1 == 0.5
     assert library_parameters(slippery).h_s == 0.45
     assert library_parameters(Vehicle("bmw", 2)).h_s == pytest.approx(0.61373004)
-    assert (rear_tyre(slippery).p_dy1, rear_tyre(slippery).p_dx1) == (0.5, 0.6)  # the front tyre, but for what is replaced
+    assert (rear_tyre(slippery).p_dy1, rear_tyre(slippery).p_dx1) == (
+        0.5,
+        0.6,
+    )  # the front tyre, but for what is replaced
     compiled = MultiBodyPlant(slippery).parameters
-    assert (compiled.tire.p_dx1, compiled.tire_rear.p_dx1, compiled.tire_rear.p_dy1) == (pytest.approx(1.1739), 0.6, 0.5)
+    assert (compiled.tire.p_dx1, compiled.tire_rear.p_dx1, compiled.tire_rear.p_dy1) == (
+        pytest.approx(1.1739),
+        0.6,
+        0.5,
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,8 +237,14 @@ def test_overrides_reach_the_plant_and_cars_without_stated_shifts_pull_to_neithe
     [
         ({"name": "a", "parameter_set": 9}, "parameter set 9"),
         ({"name": "a", "parameter_set": 2, "overrides": {"height": 0.4}}, "'height'"),
-        ({"name": "a", "parameter_set": 2, "overrides": {"tire": {"p_dy1": float("nan")}}}, "'tire.p_dy1'"),
-        ({"name": "a", "parameter_set": 2, "overrides": {"tire_rear": {"grip": 1.0}}}, r"'tire_rear\.grip'"),
+        (
+            {"name": "a", "parameter_set": 2, "overrides": {"tire": {"p_dy1": float("nan")}}},
+            "'tire.p_dy1'",
+        ),
+        (
+            {"name": "a", "parameter_set": 2, "overrides": {"tire_rear": {"grip": 1.0}}},
+            r"'tire_rear\.grip'",
+        ),
     ],
 )
 def test_vehicle_that_makes_no_sense_names_the_value(configuration, complaint):
@@ -205,7 +252,9 @@ def test_vehicle_that_makes_no_sense_names_the_value(configuration, complaint):
         vehicle_from_configuration(configuration)
 
 
-CONTROL = StabilityControl(wheelbase=2.5, understeer_gradient=0.002, yaw_inertia=2000.0, grip=9.0, largest_moment=3000.0)
+CONTROL = StabilityControl(
+    wheelbase=2.5, understeer_gradient=0.002, yaw_inertia=2000.0, grip=9.0, largest_moment=3000.0
+)
 
 
 def sine_with_dwell(plant, amplitude, control, friction):
@@ -217,9 +266,21 @@ def sine_with_dwell(plant, amplitude, control, friction):
         phase = min(time, max(time - 0.5, 0.75 / 0.7)) * 0.7
         target = amplitude * math.sin(2.0 * math.pi * phase) if phase < 1.0 else 0.0
         if control is not None:
-            doing = control.step(doing, 0.01, steer=state.steer, vx=state.vx, yaw_rate=state.yaw_rate, friction=friction)
+            doing = control.step(
+                doing,
+                0.01,
+                steer=state.steer,
+                vx=state.vx,
+                yaw_rate=state.yaw_rate,
+                friction=friction,
+            )
         moments.append(doing.moment)
-        state = plant.advance(state, np.array([30.0 * (target - state.steer), 0.0, doing.moment, 0.0, 0.0]), 10, friction)
+        state = plant.advance(
+            state,
+            np.array([30.0 * (target - state.steer), 0.0, doing.moment, 0.0, 0.0]),
+            10,
+            friction,
+        )
         largest = max(largest, abs(math.atan2(state.vy, state.vx)))
     return largest, np.array(moments)
 
@@ -239,10 +300,16 @@ def test_sideslip_stays_lower_with_control_than_without(name, friction):
 def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
     plant = plant_of(name)
     rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
-    forces = plant.motion([rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0).tyre_fx
+    forces = plant.motion(
+        [rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0
+    ).tyre_fx
     arm = 0.25 * (plant.parameters.T_f + plant.parameters.T_r)
-    most = min(-forces[0, [0, 2]].sum(), -forces[1, [1, 3]].sum()) * arm  # to turn left, the left wheels are braked
-    assert 0.85 * most < stability_control(plant).largest_moment <= 1.01 * most  # 15 %: front and rear tyres differ
+    most = (
+        min(-forces[0, [0, 2]].sum(), -forces[1, [1, 3]].sum()) * arm
+    )  # to turn left, the left wheels are braked
+    assert (
+        0.85 * most < stability_control(plant).largest_moment <= 1.01 * most
+    )  # 15 %: front and rear tyres differ
 
 
 @pytest.mark.parametrize("name", OURS)
@@ -253,18 +320,41 @@ def test_control_leaves_calm_driving_alone(name):
 
 
 def test_moment_turns_the_car_towards_the_reference_with_hysteresis_and_a_limit():
-    turns_too_much = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.5)
-    turns_too_little = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.0)
+    turns_too_much = CONTROL.step(
+        StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.5
+    )
+    turns_too_little = CONTROL.step(
+        StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.0
+    )
     assert turns_too_much.moment < 0.0 < turns_too_little.moment
-    mirrored = CONTROL.step(StabilityState(reference=-0.2), 0.01, steer=-0.025, vx=20.0, yaw_rate=-0.5)
+    mirrored = CONTROL.step(
+        StabilityState(reference=-0.2), 0.01, steer=-0.025, vx=20.0, yaw_rate=-0.5
+    )
     assert mirrored.moment == -turns_too_much.moment
     between = StabilityState(reference=0.05, active=False)
     assert not CONTROL.step(between, 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
-    assert CONTROL.step(StabilityState(reference=0.05, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
-    assert not CONTROL.step(StabilityState(reference=0.02, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
-    assert CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0).moment == -3000.0
-    assert CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0, friction=0.5).moment == -1500.0
-    assert CONTROL.step(StabilityState(reference=0.0, active=True), 0.01, steer=0.3, vx=3.0, yaw_rate=0.0).moment == 0.0
+    assert CONTROL.step(
+        StabilityState(reference=0.05, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0
+    ).active
+    assert not CONTROL.step(
+        StabilityState(reference=0.02, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0
+    ).active
+    assert (
+        CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0).moment
+        == -3000.0
+    )
+    assert (
+        CONTROL.step(
+            StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0, friction=0.5
+        ).moment
+        == -1500.0
+    )
+    assert (
+        CONTROL.step(
+            StabilityState(reference=0.0, active=True), 0.01, steer=0.3, vx=3.0, yaw_rate=0.0
+        ).moment
+        == 0.0
+    )
 
 
 def test_reference_is_the_linear_single_track_within_friction():

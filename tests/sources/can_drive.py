@@ -62,14 +62,26 @@ def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0,
     first = 0.0 if suffix == ".asc" else ORIGIN
     with can.Logger(log) as writer:
         for k in range(n * repeats):
-            late = {name: rng.uniform(0.0, 2 * jitter) + 0.0004 * number for number, name in enumerate(messages)}
+            late = {
+                name: rng.uniform(0.0, 2 * jitter) + 0.0004 * number
+                for number, name in enumerate(messages)
+            }
             for name in sorted(messages, key=late.__getitem__):
                 if gone[name][k]:
                     continue
                 identifier, extended, frames = messages[name]
                 stamp = first + k / recording.rate_hz + (late[name] if k else 0.0)
-                writer(can.Message(stamp, identifier, extended, data=frames[k % n], channel=0, is_rx=True))
-    return Written(dbc, log, {name: np.flatnonzero(flags) for name, flags in gone.items()}, recording.start_time - first)
+                writer(
+                    can.Message(
+                        stamp, identifier, extended, data=frames[k % n], channel=0, is_rx=True
+                    )
+                )
+    return Written(
+        dbc,
+        log,
+        {name: np.flatnonzero(flags) for name, flags in gone.items()},
+        recording.start_time - first,
+    )
 
 
 def _messages(recording):
@@ -78,7 +90,11 @@ def _messages(recording):
 
     database = cantools.database.load_string(DBC, "dbc")
     values = {
-        "IMU": {"YawRate": np.degrees(recording["yaw_rate"]), "AccLat": -recording["ay"], "AccLong": recording["ax"]},
+        "IMU": {
+            "YawRate": np.degrees(recording["yaw_rate"]),
+            "AccLat": -recording["ay"],
+            "AccLong": recording["ax"],
+        },
         "Speed": {"VehSpd": 3.6 * recording["vx"]},
     }
     if "steer" in recording:
@@ -90,7 +106,9 @@ def _messages(recording):
         frames = []
         for k in range(len(recording)):
             row = {signal: float(values[k]) for signal, values in signals.items()}
-            frames.append(message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False))
+            frames.append(
+                message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False)
+            )
         found[name] = (message.frame_id, message.is_extended_frame, frames)
     return found
 

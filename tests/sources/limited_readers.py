@@ -11,7 +11,9 @@ from vehest.data.limits import current_limits
 def answers(file, factor):
     """Numbers of the file, times a factor."""
     print("what a library prints is no answer")
-    return {"vx": factor * np.fromfile(file), "n": np.arange(3)}, {"limit": current_limits().samples}
+    return {"vx": factor * np.fromfile(file), "n": np.arange(3)}, {
+        "limit": current_limits().samples
+    }
 
 
 def hangs(file):

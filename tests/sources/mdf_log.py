@@ -22,6 +22,13 @@ def write_mdf(file, groups, version="4.10", clock=None, **options):
 
 def read_mdf(file, **options):
     """Read a measurement as a data set of 100 Hz declares it, by default its signal v."""
-    declared = {"name": "mine", "source": "mdf", "path": str(file.parent), "files": file.name, "rate_hz": 100, "channels": ONE}
+    declared = {
+        "name": "mine",
+        "source": "mdf",
+        "path": str(file.parent),
+        "files": file.name,
+        "rate_hz": 100,
+        "channels": ONE,
+    }
     name = file.stem if options.get("run") is None else f"{file.stem}_run_{options['run']}"
     return open_source(declared | options).read(name)

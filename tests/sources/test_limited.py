@@ -28,19 +28,27 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file):
     assert reading.summary == {"limit": 77}
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits neither memory nor processor time")
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="Windows limits neither memory nor processor time"
+)
 @pytest.mark.parametrize(
     ("function", "kind", "said"),
     [
         ("hangs", DataError, "takes more than 1 s to read, too long for its size"),
-        ("takes_memory", DataError, "MB of memory; if that is meant, raise it: limits.memory=NUMBER"),
+        (
+            "takes_memory",
+            DataError,
+            "MB of memory; if that is meant, raise it: limits.memory=NUMBER",
+        ),
         ("crashes", DataError, "is damaged: reading it ends with status -6"),
         ("writes", DataError, "is damaged"),
         ("misses", MissingError, "needs another one"),
         ("fails", DataError, "make it again"),
     ],
 )
-def test_however_reading_ends_it_is_one_line_and_nothing_is_written(file, monkeypatch, function, kind, said):
+def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
+    file, monkeypatch, function, kind, said
+):
     monkeypatch.setattr("vehest.sources.limited.SECONDS", 1.0)
     with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
         read_limited(f"limited_readers:{function}", file)
@@ -50,4 +58,6 @@ def test_however_reading_ends_it_is_one_line_and_nothing_is_written(file, monkey
     assert said in message
     assert message.isprintable()
     assert file.read_bytes() == VALUES.tobytes()
-    assert [path.name for path in file.parent.iterdir() if path.stat().st_size and path != file] == []
+    assert [
+        path.name for path in file.parent.iterdir() if path.stat().st_size and path != file
+    ] == []

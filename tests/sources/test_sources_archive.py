@@ -10,7 +10,11 @@ from refusals import refusal
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.archive import unpacked
 
-CONTENT = {"bag/metadata.yaml": b"a: 1\n", "bag/data.db3": bytes(range(256)) * 40, "bag/deep/er/x": b""}
+CONTENT = {
+    "bag/metadata.yaml": b"a: 1\n",
+    "bag/data.db3": bytes(range(256)) * 40,
+    "bag/deep/er/x": b"",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +46,11 @@ def refused(file, **limits):
 def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path):
     file = packed(tmp_path, *CONTENT.items())
     with unpacked(file) as folder:
-        found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        found = {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.is_file()
+        }
         assert found == CONTENT
     assert not folder.exists()
 
@@ -53,22 +61,35 @@ def special(kind):
     return entry
 
 
-@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "C:\\evil", "a/\x1b[2J", special(stat.S_IFLNK), special(stat.S_IFIFO)])
+@pytest.mark.parametrize(
+    "name",
+    ["../evil", "/etc/evil", "C:\\evil", "a/\x1b[2J", special(stat.S_IFLNK), special(stat.S_IFIFO)],
+)
 def test_names_that_leave_the_folder_links_and_special_files_are_refused(tmp_path, name):
-    assert "is no file inside the folder" in refused(packed(tmp_path, ("bag/metadata.yaml", b""), (name, b"/etc/passwd")))
+    assert "is no file inside the folder" in refused(
+        packed(tmp_path, ("bag/metadata.yaml", b""), (name, b"/etc/passwd"))
+    )
     assert not (tmp_path.parent / "evil").exists()
 
 
-def test_more_bytes_or_entries_than_the_limit_or_than_the_archive_s_own_size_allows_are_refused(tmp_path):
+def test_more_bytes_or_entries_than_the_limit_or_than_the_archive_s_own_size_allows_are_refused(
+    tmp_path,
+):
     file = packed(tmp_path, ("zeros", bytes(10**6)), ("more", bytes(10**6)))
     assert file.stat().st_size < 10**4
-    assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refused(file, most_bytes=1_500_000)
+    assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refused(
+        file, most_bytes=1_500_000
+    )
     with unpacked(file, most_bytes=2_000_000) as folder:
         assert (folder / "more").stat().st_size == 10**6
     zeros = packed(tmp_path, ("zeros", bytes(80 * 2**20)))
-    assert "0.0839 GB unpacked, more than the limit of 10000 entries and 0.0671 GB" in refused(zeros)
+    assert "0.0839 GB unpacked, more than the limit of 10000 entries and 0.0671 GB" in refused(
+        zeros
+    )
     with use_limits(Limits(text_bytes=10_000)):
-        assert "holds a list of entries of" in refused(packed(tmp_path, *((f"{k:0100d}", b"") for k in range(200))))
+        assert "holds a list of entries of" in refused(
+            packed(tmp_path, *((f"{k:0100d}", b"") for k in range(200)))
+        )
 
 
 def test_an_archive_that_understates_its_size_is_refused(tmp_path):

@@ -21,7 +21,13 @@ STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.0
 
 
 def read(folder, **options):
-    told = {"files": "drive.*", "dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": FOUR, **options}
+    told = {
+        "files": "drive.*",
+        "dbc": str(folder / "car.dbc"),
+        "rate_hz": 100,
+        "channels": FOUR,
+        **options,
+    }
     return open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive")
 
 
@@ -52,12 +58,17 @@ def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path, suffi
     k = np.rint((got.time - got.start_time) * 100.0).astype(int)
     assert len(got) >= len(sent) - 2
     assert got.rate_hz == 100.0
-    for name, step in STEPS.items():  # frames of the second message come 0.4 ms late: the slope times that
+    for (
+        name,
+        step,
+    ) in STEPS.items():  # frames of the second message come 0.4 ms late: the slope times that
         slack = 0.0005 * np.abs(np.gradient(sent[name], 0.01)).max()
         np.testing.assert_allclose(got[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
 
 
-def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of_several_is_taken(tmp_path):
+def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of_several_is_taken(
+    tmp_path,
+):
     log(
         tmp_path,
         one('0|16@1+ (0.01,0) [0|0] "m/s" Car'),
@@ -65,7 +76,11 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of
     )
     got = read(tmp_path, channels={"vx": {**SPEED["vx"], "invalid": [65535]}}, gappy=["vx"])
     assert np.flatnonzero(np.isnan(got["vx"])).tolist() == list(range(20, 30))
-    log(tmp_path, one('0|8@1+ (1,0) [0|0] "m/s" Car'), [((k // 2) / 100, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)])
+    log(
+        tmp_path,
+        one('0|8@1+ (1,0) [0|0] "m/s" Car'),
+        [((k // 2) / 100, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)],
+    )
     assert "say which by bus" in refusal(lambda: read(tmp_path, channels=SPEED))
     assert set(read(tmp_path, channels=SPEED, bus=2)["vx"]) == {11.0}
     assert "never occurs on bus 3" in refusal(lambda: read(tmp_path, channels=SPEED, bus=3))
@@ -74,10 +89,22 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of
 def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_path):
     write_log(drive(), tmp_path)
     for options, said in (
-        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, "no signal 'Speed.VehSpeed' (near it: Speed.VehSpd,"),
-        ({"channels": {"vx": {"column": "Counter", "unit": "m/s"}}}, "stands in several messages; write one of IMU.Counter, Speed.Counter"),
-        ({"channels": {"steer": {"column": "SteerAng", "unit": "deg"}}}, "'SteerAng' for channel 'steer' never occurs"),
-        ({"channels": {"vx": {"column": "VehSpd", "unit": "m/s"}}}, "'km/h' by the file and in 'm/s' by conf/dataset"),
+        (
+            {"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}},
+            "no signal 'Speed.VehSpeed' (near it: Speed.VehSpd,",
+        ),
+        (
+            {"channels": {"vx": {"column": "Counter", "unit": "m/s"}}},
+            "stands in several messages; write one of IMU.Counter, Speed.Counter",
+        ),
+        (
+            {"channels": {"steer": {"column": "SteerAng", "unit": "deg"}}},
+            "'SteerAng' for channel 'steer' never occurs",
+        ),
+        (
+            {"channels": {"vx": {"column": "VehSpd", "unit": "m/s"}}},
+            "'km/h' by the file and in 'm/s' by conf/dataset",
+        ),
         ({"rate_hz": 50}, "faster than the raster"),
     ):
         assert said in refusal(lambda options=options: read(tmp_path, **options))
@@ -88,7 +115,10 @@ def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_pat
 @pytest.mark.parametrize(
     ("dbc", "said"),
     [
-        (one('0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000), "impossible length: BO_ 291 Speed: 4000000000"),
+        (
+            one('0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000),
+            "impossible length: BO_ 291 Speed: 4000000000",
+        ),
         (one('60|8@1+ (1,0) [0|0] "" Car'), "cannot be decoded"),
         (one('0|16@1+ (1e999,0) [0|0] "" Car'), "has the scale inf"),
         (one("soon"), "cannot be read as a DBC"),
@@ -103,16 +133,29 @@ def blf_with(content, method=0):
     """A BLF file with one container of whatever is given."""
     head = b"LOGG" + struct.pack("<L", 144) + bytes(136)
     body = content if method == 0 else zlib.compress(content)
-    return head + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(body), 10) + struct.pack("<H6xL4x", method, len(content)) + body
+    return (
+        head
+        + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(body), 10)
+        + struct.pack("<H6xL4x", method, len(content))
+        + body
+    )
 
 
 @pytest.mark.parametrize(
     ("suffix", "change", "said"),
     [
         (".blf", lambda content: content[:-20], "is truncated"),
-        (".blf", lambda _: blf_with(struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 1) + bytes(100)), "holds no frame"),
+        (
+            ".blf",
+            lambda _: blf_with(struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 1) + bytes(100)),
+            "holds no frame",
+        ),
         (".blf", lambda _: blf_with(bytes(100 * 2**20), 2), "Could not find next object"),
-        (".asc", lambda content: content[: content.rindex(b"Rx") + 12], "a frame of message .* holds"),
+        (
+            ".asc",
+            lambda content: content[: content.rindex(b"Rx") + 12],
+            "a frame of message .* holds",
+        ),
         (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "is damaged .*zzz"),
     ],
 )

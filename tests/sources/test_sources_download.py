@@ -73,14 +73,23 @@ class Handler(BaseHTTPRequestHandler):
             self.end_headers()
             return
         whole, start = server.contents[name], 0
-        same = server.careless or self.headers.get("If-Range") in (None, server.etag, server.modified)
+        same = server.careless or self.headers.get("If-Range") in (
+            None,
+            server.etag,
+            server.modified,
+        )
         if asked and server.ranges and same:
             start = int(asked.removeprefix("bytes=").rstrip("-"))
         self.send_response(206 if start else 200)
         if start:
             self.send_header("Content-Range", f"bytes {start}-{len(whole) - 1}/{len(whole)}")
         length = str(len(whole) - start) if server.length else None
-        about = {"ETag": server.etag, "Last-Modified": server.modified, "Content-Length": length, **server.headers}
+        about = {
+            "ETag": server.etag,
+            "Last-Modified": server.modified,
+            "Content-Length": length,
+            **server.headers,
+        }
         for key, value in about.items():
             if value:
                 self.send_header(key, value)
@@ -119,7 +128,11 @@ def refused(what, kind=MissingError):
 
 
 def files(folder):
-    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
 
 
 def assert_only(folder, content=BYTES):
@@ -133,11 +146,15 @@ def test_a_file_arrives_byte_for_byte_and_is_recorded(server, tmp_path):
     assert server.asked == [("/a.csv", None, None)]
 
 
-def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(server, tmp_path):
+def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(
+    server, tmp_path
+):
     server.breaks = [CHUNK + 7] * (ATTEMPTS + 2)
     (outcome,) = download(server, tmp_path).fetch()
     assert_only(tmp_path)
-    assert [asked[1:] for asked in server.asked[1:]] == [(f"bytes={k * CHUNK}-", '"one"') for k in range(1, ATTEMPTS + 3)]
+    assert [asked[1:] for asked in server.asked[1:]] == [
+        (f"bytes={k * CHUNK}-", '"one"') for k in range(1, ATTEMPTS + 3)
+    ]
     assert outcome.resumed_at == (ATTEMPTS + 2) * CHUNK
 
 
@@ -159,11 +176,17 @@ def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
     server.ranges, server.etag, server.modified = False, None, modified
     server.breaks = [200_000]
     (outcome,) = download(server, tmp_path).fetch()
-    assert (outcome.resumed_at, server.sent, server.asked[1][1] is None) == (0, [200_000, SIZE], modified is None)
+    assert (outcome.resumed_at, server.sent, server.asked[1][1] is None) == (
+        0,
+        [200_000, SIZE],
+        modified is None,
+    )
     assert_only(tmp_path)
 
 
-@pytest.mark.parametrize(("size", "careless"), [(SIZE, False), (250_000, True), (100_000, False), (100_000, True)])
+@pytest.mark.parametrize(
+    ("size", "careless"), [(SIZE, False), (250_000, True), (100_000, False), (100_000, True)]
+)
 def test_a_file_that_changes_between_attempts_is_never_mixed(server, tmp_path, size, careless):
     other = BYTES[::-1][:size]
     server.breaks, server.changed, server.careless = [200_000], (other, '"two"'), careless
@@ -183,12 +206,23 @@ def test_two_processes_do_not_fetch_into_one_folder(server, tmp_path):
 
 def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server, tmp_path):
     message = refused(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
-    assert all(part in message for part in (f"{server.url}/a.csv", sha256(b"other"), sha256(BYTES), "known by download.sha256"))
+    assert all(
+        part in message
+        for part in (
+            f"{server.url}/a.csv",
+            sha256(b"other"),
+            sha256(BYTES),
+            "known by download.sha256",
+        )
+    )
     assert files(tmp_path) == {}
     list(download(server, tmp_path, known={"a.csv": sha256(BYTES)}).fetch())
     (tmp_path / "a.csv").write_bytes(b"changed")
     message = refused(download(server, tmp_path), DataError)
-    assert all(part in message for part in (sha256(b"changed"), sha256(BYTES), "remove the file to fetch it again"))
+    assert all(
+        part in message
+        for part in (sha256(b"changed"), sha256(BYTES), "remove the file to fetch it again")
+    )
     assert (tmp_path / "a.csv").read_bytes() == b"changed"
     (tmp_path / "a.csv").unlink()
     server.contents["a.csv"], server.etag = BYTES[:-1] + b"?", '"two"'
@@ -196,14 +230,19 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
 
-def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one_line(server, tmp_path):
+def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one_line(
+    server, tmp_path
+):
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
     assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
     server.headers, server.length = {}, False
     assert "does not state its length" in refused(download(server, tmp_path))
     server.asked, server.statuses = [], [503, 404]  # the first passes
     message = refused(download(server, tmp_path))
-    assert message == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
+    assert (
+        message
+        == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
+    )
     assert (len(server.asked), files(tmp_path)) == (2, {})
     (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
     assert CHECKSUMS in refused(download(server, tmp_path), DataError)
@@ -227,17 +266,32 @@ TABULAR = {"name": "mine", "source": "tabular", "path": "there", "rate_hz": 10, 
 
 
 def test_an_entry_says_address_files_and_checksums_or_is_refused_in_one_line():
-    entry = {"url": "https://example.org/folder/", "files": ["a.csv", "b 1.csv"], "sha256": {"a.csv": "AB" * 32}}
+    entry = {
+        "url": "https://example.org/folder/",
+        "files": ["a.csv", "b 1.csv"],
+        "sha256": {"a.csv": "AB" * 32},
+    }
     what = download_of(open_source({**TABULAR, "download": entry}))
-    assert (what.folder, what.files, what.sha256) == (Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
+    assert (what.folder, what.files, what.sha256) == (
+        Path("there"),
+        ("a.csv", "b 1.csv"),
+        {"a.csv": "ab" * 32},
+    )
     assert what.address("b 1.csv") == "https://example.org/folder/b%201.csv"
     for changes, said in (
         ({"url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
         ({"files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
-        *(({"files": [name]}, "is not the name of a file in one folder") for name in ("../a.csv", CHECKSUMS, "a\n.csv")),
+        *(
+            ({"files": [name]}, "is not the name of a file in one folder")
+            for name in ("../a.csv", CHECKSUMS, "a\n.csv")
+        ),
     ):
-        wrong = TABULAR | {"download": {"url": "https://example.org/folder", "files": ["a.csv"]} | changes}
-        assert said in refusal(lambda wrong=wrong: download_of(open_source(wrong)), ConfigurationError)
+        wrong = TABULAR | {
+            "download": {"url": "https://example.org/folder", "files": ["a.csv"]} | changes
+        }
+        assert said in refusal(
+            lambda wrong=wrong: download_of(open_source(wrong)), ConfigurationError
+        )
 
 
 DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(
@@ -250,14 +304,26 @@ def test_ingest_fetches_what_is_missing_then_ingests(server, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     server.contents = {"one.csv": DRIVE.encode(), "two.csv": DRIVE.replace("20.", "21.").encode()}
     entry = {"url": f"{server.url}/files", "files": ["one.csv", "two.csv"]}
-    dataset = {"name": "mine", "source": "tabular", "path": "${root}/mine", "time": {"column": "time", "unit": "s"}, "download": entry}
+    dataset = {
+        "name": "mine",
+        "source": "tabular",
+        "path": "${root}/mine",
+        "time": {"column": "time", "unit": "s"},
+        "download": entry,
+    }
     (tmp_path / "conf" / "dataset").mkdir(parents=True)
     (tmp_path / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset))
     for what in ("done", "skipped"):
-        code, _, err = run_vehest(capsys, "ingest", "mine", "--download", "root=data", "output=outputs")
+        code, _, err = run_vehest(
+            capsys, "ingest", "mine", "--download", "root=data", "output=outputs"
+        )
         assert code == 0, err
         lines = [tuple(line.split()[:3]) for line in err.splitlines()]
-        assert lines == [(what, "download", "one.csv"), (what, "download", "two.csv"), (what, "ingest", "mine")]
+        assert lines == [
+            (what, "download", "one.csv"),
+            (what, "download", "two.csv"),
+            (what, "ingest", "mine"),
+        ]
         assert [path for path, _, _ in server.asked] == ["/files/one.csv", "/files/two.csv"]
     (stored,) = (tmp_path / "outputs" / "ingest").glob("mine-*/two.parquet")
     assert read_recording(stored)["vx"][0] == 21.0

@@ -13,7 +13,12 @@ RATE = 100.0
 SPEED = 2.0  # m/s
 RADIUS = 1.5  # m
 SLIP = 0.2  # rad, by which the car points out of the circle's tangent
-POSE = {"x": {"column": "px", "unit": "m"}, "y": {"column": "py", "unit": "m"}, "yaw": {"column": "yaw", "unit": "rad"}, "window": 5}
+POSE = {
+    "x": {"column": "px", "unit": "m"},
+    "y": {"column": "py", "unit": "m"},
+    "yaw": {"column": "yaw", "unit": "rad"},
+    "window": 5,
+}
 TIME = {"column": "t", "unit": "s"}
 
 
@@ -30,7 +35,14 @@ def circle(seconds=10.0, lever=(0.0, 0.0), turned=0.0):
 
 def source(folder, **options):
     channels = {"vx": {"column": "vx", "unit": "m/s"}}
-    declared = {"name": "mine", "source": "tabular", "path": str(folder), "files": "*.csv", "time": TIME, "channels": channels}
+    declared = {
+        "name": "mine",
+        "source": "tabular",
+        "path": str(folder),
+        "files": "*.csv",
+        "time": TIME,
+        "channels": channels,
+    }
     return TabularSource({**declared, **options})
 
 
@@ -50,13 +62,20 @@ def test_a_pose_on_a_circle_gives_the_velocities_of_its_closed_form(tmp_path):
 
 def test_lever_and_turn_of_the_body_are_taken_off(tmp_path):
     table = circle(lever=(0.115, -0.01), turned=0.05)
-    pose = POSE | {"yaw_offset": -0.05, "lever_x": -0.115, "lever_y": 0.01, "channels": ["vx_ref", "vy_ref"]}
+    pose = POSE | {
+        "yaw_offset": -0.05,
+        "lever_x": -0.115,
+        "lever_y": 0.01,
+        "channels": ["vx_ref", "vy_ref"],
+    }
     recording = read(table, tmp_path, pose=pose)
     assert recording["vy_ref"][5:-5] == pytest.approx(SPEED * np.sin(SLIP), abs=1e-3)
     assert recording["vx_ref"][5:-5] == pytest.approx(SPEED * np.cos(SLIP), abs=1e-3)
     assert set(recording.channels) == {"vx", "vx_ref", "vy_ref"}
     away = read(table, tmp_path, pose=POSE | {"yaw_offset": -0.05})
-    assert (away["vy_ref"] - recording["vy_ref"])[5:-5] == pytest.approx(0.115 * SPEED / RADIUS, abs=1e-3)
+    assert (away["vy_ref"] - recording["vy_ref"])[5:-5] == pytest.approx(
+        0.115 * SPEED / RADIUS, abs=1e-3
+    )
 
 
 def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
@@ -69,11 +88,17 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
     assert errors[1] > 20 * errors[0]
     assert even.rate_hz == RATE
     for lost in (3, 20):
-        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set dataset.clock=interpolate"):
+        with pytest.raises(
+            DataError,
+            match=r"samples are missing.*; leave rows out by drop_rows or set dataset.clock=interpolate",
+        ):
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 
-HELD_CHANNELS = {"vx": {"column": "vx", "unit": "m/s"}, "yaw_rate": {"column": "r", "unit": "rad/s"}}
+HELD_CHANNELS = {
+    "vx": {"column": "vx", "unit": "m/s"},
+    "yaw_rate": {"column": "r", "unit": "rad/s"},
+}
 
 
 @pytest.mark.parametrize("updated", ["sensor", None])
@@ -81,17 +106,26 @@ def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path, upda
     """A yaw rate that its sensor samples in every tenth row and that arrives four later, with the sensor's own clock beside it."""
     time, taken = np.arange(1000) / RATE, (np.arange(1000) - 4) // 10 * 10
     truth = np.sin(2 * np.pi * 0.5 * time)
-    values, stamps = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0), np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
+    values, stamps = (
+        np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0),
+        np.where(taken >= 0, 300.0 + taken / RATE, 0.0),
+    )
     table = pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps})
     held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
     recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
     at = np.rint(recording.time * RATE).astype(int)
-    np.testing.assert_allclose(recording["yaw_rate"][at % 10 == 0], truth[at][at % 10 == 0], atol=1e-9)
+    np.testing.assert_allclose(
+        recording["yaw_rate"][at % 10 == 0], truth[at][at % 10 == 0], atol=1e-9
+    )
     bound = (np.pi**2 * 0.1**2) / 8  # of a straight line over 0.1 s, by the largest curvature
     assert np.abs(recording["yaw_rate"] - truth[at]).max() < 1.001 * bound
     np.testing.assert_allclose(recording["vx"], 3.0 + recording.time, atol=1e-9)
     assert recording.time[0] == pytest.approx(0.0 if updated else 0.1, abs=0.011)
-    assert recording.provenance["held"] == {"channels": ["yaw_rate"], "rate_hz": pytest.approx(10.0), "delay": {"yaw_rate": 0.04}}
+    assert recording.provenance["held"] == {
+        "channels": ["yaw_rate"],
+        "rate_hz": pytest.approx(10.0),
+        "delay": {"yaw_rate": 0.04},
+    }
     plain = read(table, tmp_path, channels=HELD_CHANNELS)
     steps = plain["yaw_rate"][at] - truth[at]
     assert np.abs(steps).max() > 10 * bound
@@ -115,10 +149,15 @@ def test_a_pause_begins_a_run_and_one_of_several_can_be_chosen(tmp_path):
     table["t"] += np.repeat([0.0, 10.0, 20.0], [200, 50, 300])
     table.to_csv(tmp_path / "laps.csv", index=False)
     recordings = list(source(tmp_path, max_gap=1.0).recordings())
-    assert [(own.id, len(own), own.start_time) for own in recordings] == [("laps_run_0", 200, 0.0), ("laps_run_1", 300, 20.0)]
+    assert [(own.id, len(own), own.start_time) for own in recordings] == [
+        ("laps_run_0", 200, 0.0),
+        ("laps_run_1", 300, 20.0),
+    ]
     assert source(tmp_path, max_gap=1.0, run=1).read_file(tmp_path / "laps.csv").start_time == 20.0
     said = "holds no run 2 (0, 1)"
-    assert said in refusal(lambda: source(tmp_path, max_gap=1.0, run=2).read_file(tmp_path / "laps.csv"))
+    assert said in refusal(
+        lambda: source(tmp_path, max_gap=1.0, run=2).read_file(tmp_path / "laps.csv")
+    )
 
 
 def test_excluded_files_are_no_recordings(tmp_path):
@@ -130,13 +169,23 @@ def test_excluded_files_are_no_recordings(tmp_path):
     for options, kind, said in (
         ({"exclude": ["lap"]}, MissingError, "exclude names 'lap', which no file is called"),
         ({"exclude": ["*"]}, MissingError, "exclude leaves none"),
-        ({"drop_rows": {"lap2": [1]}}, MissingError, "drop_rows names 'lap2', which no file is called"),
+        (
+            {"drop_rows": {"lap2": [1]}},
+            MissingError,
+            "drop_rows names 'lap2', which no file is called",
+        ),
         ({"pose": POSE | {"window": 4}}, ConfigurationError, "window must be an odd number"),
-        (own | {"held": {"channels": ["ay"]}}, ConfigurationError, "names 'ay', which is not one of the data set's channels"),
+        (
+            own | {"held": {"channels": ["ay"]}},
+            ConfigurationError,
+            "names 'ay', which is not one of the data set's channels",
+        ),
         (own | {"held": held}, ConfigurationError, "delay names 'yaw_rate'"),
     ):
         assert said in refusal(lambda options=options: source(tmp_path, **options).ids(), kind)
-    assert "has 1000 data rows, and drop_rows names row 1001" in refusal(lambda: read(circle(), tmp_path, drop_rows={"lap": [1001]}))
+    assert "has 1000 data rows, and drop_rows names row 1001" in refusal(
+        lambda: read(circle(), tmp_path, drop_rows={"lap": [1001]})
+    )
 
 
 def test_where_channels_were_measured_is_said_in_words(tmp_path):

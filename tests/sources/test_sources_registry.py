@@ -23,11 +23,22 @@ VEHICLE = yaml.safe_load((CONF / "vehicle" / "bmw_320i_low.yaml").read_text(enco
 
 def simulated(**changes):
     drives = [drive("a", 3.0, seed=1), drive("b", 2.5, seed=2)]
-    return {"name": "sim", "source": "simulated", "vehicle": VEHICLE, "rate_hz": 50, "drives": drives, **changes}
+    return {
+        "name": "sim",
+        "source": "simulated",
+        "vehicle": VEHICLE,
+        "rate_hz": 50,
+        "drives": drives,
+        **changes,
+    }
 
 
 def drive(name, duration=2.0, **more):
-    return {"id": name, "manoeuvre": {"name": "laps", "course": "handling", "duration": duration}, **more}
+    return {
+        "id": name,
+        "manoeuvre": {"name": "laps", "course": "handling", "duration": duration},
+        **more,
+    }
 
 
 @pytest.mark.parametrize("file", DATASETS, ids=lambda file: file.stem)
@@ -43,7 +54,9 @@ def test_every_source_has_a_module_that_opens_and_an_unknown_one_is_refused_with
     for name in source_names():
         with pytest.raises(ConfigurationError, match="has no option 'spam'"):
             open_source({"name": "x", "source": name, "spam": 1})
-    with pytest.raises(ConfigurationError, match="is not one of: can, mdf, revs, rosbag, simulated, tabular"):
+    with pytest.raises(
+        ConfigurationError, match="is not one of: can, mdf, revs, rosbag, simulated, tabular"
+    ):
         source_class({"name": "x", "source": "revz"})
 
 
@@ -51,36 +64,60 @@ def test_a_simulated_drive_has_the_asked_length_and_rate_and_is_another_with_ano
     source = open_source(simulated())
     assert source.ids() == ["a", "b"]
     recording = source.read("b")
-    assert (recording.id, recording.kind, recording.rate_hz, len(recording)) == ("b", "simulated", 50.0, 125)
+    assert (recording.id, recording.kind, recording.rate_hz, len(recording)) == (
+        "b",
+        "simulated",
+        50.0,
+        125,
+    )
     assert {"vx", "yaw_rate", "ax", "ay", "vy_ref"} <= set(recording.channels)
     assert [finding for finding in checks_of_recording(recording) if finding.level == "error"] == []
     np.testing.assert_array_equal(source.read("b")["ay"], recording["ay"])
     other = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
     assert not np.array_equal(other.read("b")["ay"], recording["ay"])
     counted = SimulatedSource(simulated(drives=[drive("a", count=3)]))
-    assert (counted.ids(), len({counted.seed_of(name) for name in counted.ids()})) == (["a_001", "a_002", "a_003"], 3)
-    assert (kind_of({"source": "simulated"}), kind_of({"source": "tabular"})) == ("simulated", "real")
+    assert (counted.ids(), len({counted.seed_of(name) for name in counted.ids()})) == (
+        ["a_001", "a_002", "a_003"],
+        3,
+    )
+    assert (kind_of({"source": "simulated"}), kind_of({"source": "tabular"})) == (
+        "simulated",
+        "real",
+    )
 
 
 def test_of_several_vehicles_each_drive_has_the_one_it_names():
     heavier = {**VEHICLE, "name": "heavier"}
-    config = simulated(vehicles={"one": VEHICLE, "other": heavier}, drives=[drive("a", vehicle="one"), drive("b", vehicle="other")])
+    config = simulated(
+        vehicles={"one": VEHICLE, "other": heavier},
+        drives=[drive("a", vehicle="one"), drive("b", vehicle="other")],
+    )
     del config["vehicle"]
-    assert [open_source(config).read(name).vehicle for name in ("a", "b")] == [VEHICLE["name"], "heavier"]
-    with pytest.raises(ConfigurationError, match="drive 'a': vehicle 'None' is not one of: one, other"):
+    assert [open_source(config).read(name).vehicle for name in ("a", "b")] == [
+        VEHICLE["name"],
+        "heavier",
+    ]
+    with pytest.raises(
+        ConfigurationError, match="drive 'a': vehicle 'None' is not one of: one, other"
+    ):
         SimulatedSource({**config, "drives": [drive("a")]})
 
 
 def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles():
     dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
-    vehicle, vary = vehicle_from_configuration(dataset["vehicle"]), variations_from_config(dataset["vary"])
+    vehicle, vary = (
+        vehicle_from_configuration(dataset["vehicle"]),
+        variations_from_config(dataset["vary"]),
+    )
     cars = [compiled_parameters(varied(vehicle, vary, seed)) for seed in range(50)]
     for car in cars:
         assert car.m_s + car.m_uf + car.m_ur == pytest.approx(car.m, abs=1.0)
     for axle in ("tire", "tire_rear"):
         assert np.std([getattr(car, axle).p_ky1 for car in cars]) > 0.5
         assert np.std([getattr(car, axle).p_dy1 for car in cars]) > 0.05
-    assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), "the front axle lets go first, or about when the rear one does"
+    assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), (
+        "the front axle lets go first, or about when the rear one does"
+    )
 
 
 def test_sensors_of_a_fleet_differ_and_references_do_not():
@@ -97,11 +134,23 @@ def test_sensors_of_a_fleet_differ_and_references_do_not():
     ("changes", "said"),
     [
         ({"kind": "real"}, "simulated"),
-        ({"drives": [drive("a", seed=1, count=2)]}, "drive 'a': give seed for a single drive, or count, not both"),
+        (
+            {"drives": [drive("a", seed=1, count=2)]},
+            "drive 'a': give seed for a single drive, or count, not both",
+        ),
         ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
-        ({"vary": [{"parameters": ["nope"], "factor": [1, 1]}]}, "data set 'sim': vary: 'nope' is no parameter"),
-        ({"drives": [drive("a", count=6_000), drive("b", count=6_000)]}, "if that is meant, raise it: limits.jobs=NUMBER"),
-        ({"rate_hz": 1000, "drives": [drive("a", 36_000)]}, "if that is meant, raise it: limits.samples=NUMBER"),
+        (
+            {"vary": [{"parameters": ["nope"], "factor": [1, 1]}]},
+            "data set 'sim': vary: 'nope' is no parameter",
+        ),
+        (
+            {"drives": [drive("a", count=6_000), drive("b", count=6_000)]},
+            "if that is meant, raise it: limits.jobs=NUMBER",
+        ),
+        (
+            {"rate_hz": 1000, "drives": [drive("a", 36_000)]},
+            "if that is meant, raise it: limits.samples=NUMBER",
+        ),
     ],
     ids=lambda own: str(own)[:40],
 )

@@ -14,7 +14,10 @@ N = 300
 
 
 def configuration(root, **changes):
-    channels = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ayCG", "unit": "g", "sign": -1}}
+    channels = {
+        "vx": {"column": "vx", "unit": "m/s"},
+        "ay": {"column": "ayCG", "unit": "g", "sign": -1},
+    }
     base = {
         "name": "mine",
         "source": "revs",
@@ -46,9 +49,16 @@ def test_a_folder_of_text_files_is_a_recording(folder):
     source = open_source(configuration(folder))
     assert source.ids() == ["lap"]
     recording = source.read("lap")
-    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == ("lap", "car", "real", 100.0)
+    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == (
+        "lap",
+        "car",
+        "real",
+        100.0,
+    )
     assert recording.start_time == 149.99
-    np.testing.assert_array_equal(recording["vx"], [float(line) for line in (folder / "lap" / "vx.txt").read_text().split()])
+    np.testing.assert_array_equal(
+        recording["vx"], [float(line) for line in (folder / "lap" / "vx.txt").read_text().split()]
+    )
     np.testing.assert_allclose(recording["ay"], -9.80665 * np.linspace(-1, 1, N))
     assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
 
@@ -58,7 +68,11 @@ def test_missing_empty_and_incomplete_channel_files_are_named(folder):
     np.savetxt(file, np.zeros(N - 3))
     assert f"holds {N - 3} samples, the time file {N}" in refused(folder)
     for text, kind, said in (
-        ("1\n" * 41 + "spam\n", DataError, "vx.txt': column 'number' holds the text 'spam' in data row 42"),
+        (
+            "1\n" * 41 + "spam\n",
+            DataError,
+            "vx.txt': column 'number' holds the text 'spam' in data row 42",
+        ),
         ("", MissingError, "vx.txt' is empty"),
         ("\n\n", DataError, "vx.txt' has no rows"),
     ):
@@ -73,4 +87,6 @@ def test_the_ferrari_passes_every_check_and_its_bias_of_ay_is_that_of_the_paper(
     assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []
     derived = (ferrari["vy_ref"][2:] - ferrari["vy_ref"][:-2]) * 50.0
     residual = derived - (ferrari["ay"] - ferrari["yaw_rate"] * ferrari["vx"])[1:-1]
-    assert residual.mean() == pytest.approx(-0.028, abs=5e-4)  # -0.03 in Table I of Da Lio et al. 2023
+    assert residual.mean() == pytest.approx(
+        -0.028, abs=5e-4
+    )  # -0.03 in Table I of Da Lio et al. 2023

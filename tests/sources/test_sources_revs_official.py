@@ -12,7 +12,10 @@ from vehest.sources.base import open_source
 
 NAME = "20140222_01_01_03_250lm"
 SECONDS, BLANK = 4.0, 37
-ONE_ROUNDING = {"rtol": 4e-16, "atol": 1e-300}  # degrees and back: two multiplications by π/180 or its inverse
+ONE_ROUNDING = {
+    "rtol": 4e-16,
+    "atol": 1e-300,
+}  # degrees and back: two multiplications by π/180 or its inverse
 
 
 def source(root, *overrides, dataset="revs_targa_2014", **changes):
@@ -44,13 +47,20 @@ def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay
     drive, truth = smooth_drive(SECONDS, start_time=12.5)
     write_csv(csv, drive, blank_rows=BLANK)
     recording = read(root)
-    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == (NAME, "ferrari_250lm", "real", 1000.0)
+    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == (
+        NAME,
+        "ferrari_250lm",
+        "real",
+        1000.0,
+    )
     assert recording.start_time == pytest.approx(12.5 + BLANK / 1000, abs=1e-12)
     assert len(recording) == 1000 * SECONDS - BLANK
     rows = BLANK + np.arange(len(recording))
     assert set(recording.channels) == set(truth) - {"steer"}
     for name in recording.channels:
-        expected = truth[name][rows] if name == "handwheel" else truth[name][rows // 10 * 10]  # the INS delivers every 10 ms
+        expected = (
+            truth[name][rows] if name == "handwheel" else truth[name][rows // 10 * 10]
+        )  # the INS delivers every 10 ms
         np.testing.assert_allclose(recording[name], expected, **ONE_ROUNDING, err_msg=name)
 
 
@@ -65,7 +75,9 @@ def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root, csv):
     assert np.isnan(recording["roll"][:3500]).all()
     assert np.isfinite(recording["roll"][3500:]).all()
     write_csv(csv, drive, blank_rows=0)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, gappy=["roll"])["roll"])), np.arange(2000, 2300))
+    np.testing.assert_array_equal(
+        np.flatnonzero(np.isnan(read(root, gappy=["roll"])["roll"])), np.arange(2000, 2300)
+    )
 
 
 def test_provenance_tells_session_parameters_and_file(root, csv):
@@ -73,9 +85,15 @@ def test_provenance_tells_session_parameters_and_file(root, csv):
     write_vehicle_parameters(root / "revs" / "250lm.csv")
     assert set(source(root).inputs()) == {f"{NAME}.csv", "250lm.csv"}
     provenance = read(root).provenance
-    assert (provenance["file"], provenance["preamble"]) == (f"{NAME}.csv", [line for line in PREAMBLE if line])
+    assert (provenance["file"], provenance["preamble"]) == (
+        f"{NAME}.csv",
+        [line for line in PREAMBLE if line],
+    )
     assert provenance["vehicle_parameters"]["mass"] == {"value": 982.0, "unit": "kg"}
-    assert provenance["vehicle_parameters"]["handwheelAngle"] == {"value": [-90.0, 0.0, 90.0], "unit": "°"}
+    assert provenance["vehicle_parameters"]["handwheelAngle"] == {
+        "value": [-90.0, 0.0, 90.0],
+        "unit": "°",
+    }
     (root / "revs" / "250lm.csv").unlink()
     assert "vehicle_parameters" not in read(root).provenance
 
@@ -98,13 +116,22 @@ MALFORMED = {
         lambda content: content[: content.rindex(b",", 0, len(content) - 200)],
         r"Row #\d+: Expected 55 columns, got \d+.* is it truncated",
     ),
-    "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in data row 488"),
-    "blank after the head": (with_cell(500, "vyCG", ""), r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s"),
+    "text": (
+        with_cell(500, "vyCG", "n/a?"),
+        r"column 'vyCG' holds the text 'n/a\?' in data row 488",
+    ),
+    "blank after the head": (
+        with_cell(500, "vyCG", ""),
+        r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s",
+    ),
     "no units": (
         lambda content: b"".join((lines := content.splitlines(True))[:11] + lines[12:]),
         "line 12 should hold units of the 55 columns",
     ),
-    "UTF-16": (lambda content: content.decode("latin-1").encode("utf-16"), "line 11 should name the columns and has no 'time'"),
+    "UTF-16": (
+        lambda content: content.decode("latin-1").encode("utf-16"),
+        "line 11 should name the columns and has no 'time'",
+    ),
 }
 
 
@@ -126,7 +153,9 @@ def test_a_malformed_csv_is_one_line(root, csv, one_second, case):
 
 def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, csv, one_second):
     csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
-    assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refused(root)
+    assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refused(
+        root
+    )
     assert len(read(root, units_row="ignore")) == 1000 - BLANK
 
 

@@ -28,7 +28,10 @@ CONFIGURATION = ROOT / "conf" / "dataset" / "f1tenth_bag.yaml"
 START_NS = 1_700_000_000_123_456_789
 SECONDS = 3.0
 VX, VY, YAW_RATE = 2.0, -0.5, 1.5  # m/s, m/s, rad/s: a circle driven with a sideslip of -14°
-ACCELERATION, PULSATION = 3.0, 2.0 * np.pi  # ax = 3 m/s² · sin(2π·1 Hz·t), ay likewise with the cosine
+ACCELERATION, PULSATION = (
+    3.0,
+    2.0 * np.pi,
+)  # ax = 3 m/s² · sin(2π·1 Hz·t), ay likewise with the cosine
 WINDOW = 9
 LAYOUTS = {
     "car_msgs/msg/MotorStamped": "std_msgs/Header header\nMotor motor\n",
@@ -37,8 +40,18 @@ LAYOUTS = {
 TOPICS = {
     "imu": {"topic": "/imu", "type": "sensor_msgs/msg/Imu", "clock": "uniform", "rate_hz": 400},
     "motor": {"topic": "/motor", "type": "car_msgs/msg/MotorStamped"},
-    "servo": {"topic": "/servo", "type": "std_msgs/msg/Float64", "stamps": "received", "max_gap": 0.2},
-    "body": {"topic": "/body", "type": "geometry_msgs/msg/PoseStamped", "clock": "uniform", "rate_hz": 100},
+    "servo": {
+        "topic": "/servo",
+        "type": "std_msgs/msg/Float64",
+        "stamps": "received",
+        "max_gap": 0.2,
+    },
+    "body": {
+        "topic": "/body",
+        "type": "geometry_msgs/msg/PoseStamped",
+        "clock": "uniform",
+        "rate_hz": 100,
+    },
 }
 CHANNELS = {
     "ax": {"topic": "imu", "field": "linear_acceleration.x", "unit": "m/s²", "sign": -1},
@@ -46,9 +59,18 @@ CHANNELS = {
     "yaw_rate": {"topic": "imu", "field": "angular_velocity.z", "unit": "deg/s"},
     "vx": {"topic": "motor", "field": "motor.rpm", "factor": 1e-3, "unit": "m/s"},
     "motor_current": {"topic": "motor", "field": "motor.currents.1", "unit": "A"},
-    "steer": {"topic": "servo", "field": "data", "offset": 0.5, "sign": -1, "factor": 60.0, "unit": "deg"},
+    "steer": {
+        "topic": "servo",
+        "field": "data",
+        "offset": 0.5,
+        "sign": -1,
+        "factor": 60.0,
+        "unit": "deg",
+    },
 }
-Topic = namedtuple("Topic", "type times fields")  # messages of one topic: their times [s after START_NS] and fields
+Topic = namedtuple(
+    "Topic", "type times fields"
+)  # messages of one topic: their times [s after START_NS] and fields
 
 
 def drive(seconds=SECONDS):
@@ -72,7 +94,11 @@ def drive(seconds=SECONDS):
     }
     return {
         "/imu": Topic("sensor_msgs/msg/Imu", imu, sensed),
-        "/motor": Topic("car_msgs/msg/MotorStamped", motor, {"motor.rpm": 1000.0 * (1.0 + motor), "motor.currents.1": 5.0 - motor}),
+        "/motor": Topic(
+            "car_msgs/msg/MotorStamped",
+            motor,
+            {"motor.rpm": 1000.0 * (1.0 + motor), "motor.currents.1": 5.0 - motor},
+        ),
         "/servo": Topic("std_msgs/msg/Float64", servo, {"data": 0.5 - 0.1 * servo}),
         "/body": Topic("geometry_msgs/msg/PoseStamped", body, pose),
     }
@@ -92,7 +118,13 @@ def write_bag(folder, topics, storage="sqlite3", layouts=LAYOUTS, name="lap"):
             for k, stamp in enumerate(held.times.tolist()):
                 values = {path: samples[k] for path, samples in held.fields.items()}
                 message = _message(types, held.type, values | {"header.stamp": stamp})
-                messages.append((START_NS + round(stamp * 1e9), connection, bytes(types.serialize_cdr(message, held.type))))
+                messages.append(
+                    (
+                        START_NS + round(stamp * 1e9),
+                        connection,
+                        bytes(types.serialize_cdr(message, held.type)),
+                    )
+                )
         for stamp_ns, connection, raw in sorted(messages, key=lambda one: one[0]):
             writer.write(connection, stamp_ns, raw)
     return path
@@ -112,13 +144,31 @@ def _message(types, name, values, prefix=""):
             arguments[member] = np.array([values.get(f"{path}.{k}", 0.0) for k in range(detail[1])])
         else:
             kinds = {"string": str, "float64": float, "float32": float}
-            arguments[member] = kinds.get(detail[0], int)(values.get(path, kinds.get(detail[0], int)()))
+            arguments[member] = kinds.get(detail[0], int)(
+                values.get(path, kinds.get(detail[0], int)())
+            )
     return types.types[name](**arguments)
 
 
 def configuration(folder, **changes):
-    base = {"name": "mine", "source": "rosbag", "path": str(folder), "files": "lap*", "vehicle": "car", "rate_hz": 100, "messages": LAYOUTS}
-    return base | {"topics": TOPICS, "channels": CHANNELS, "pose": {"topic": "body", "window": WINDOW, "order": 2}} | changes
+    base = {
+        "name": "mine",
+        "source": "rosbag",
+        "path": str(folder),
+        "files": "lap*",
+        "vehicle": "car",
+        "rate_hz": 100,
+        "messages": LAYOUTS,
+    }
+    return (
+        base
+        | {
+            "topics": TOPICS,
+            "channels": CHANNELS,
+            "pose": {"topic": "body", "window": WINDOW, "order": 2},
+        }
+        | changes
+    )
 
 
 def read(folder, **changes):
@@ -152,11 +202,22 @@ def folder(bags, tmp_path):
 def test_a_circle_comes_back_from_its_poses(bags):
     """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and the stamps' nanoseconds."""
     recording = read(bags)
-    k = np.arange(1, WINDOW // 2 + 1)  # the slope of a Savitzky-Golay derivative of second order is Σ k·x_k / Σ k²
+    k = np.arange(
+        1, WINDOW // 2 + 1
+    )  # the slope of a Savitzky-Golay derivative of second order is Σ k·x_k / Σ k²
     gain = float((k * np.sin(YAW_RATE * k / 100.0)).sum() / (k**2).sum() * 100.0 / YAW_RATE)
-    assert gain == pytest.approx(1 - YAW_RATE**2 * 1.18e-3 / 6, abs=1e-6)  # second term: Σk⁴/Σk² = 11.8 samples² at 100 Hz
-    for name, expected in (("vx", gain * VX), ("vy", gain * VY), ("yaw_rate", YAW_RATE), ("sideslip", np.arctan2(VY, VX))):
-        np.testing.assert_allclose(recording[f"{name}_ref"][WINDOW:-WINDOW], expected, rtol=0, atol=1e-6)  # where no end is touched
+    assert gain == pytest.approx(
+        1 - YAW_RATE**2 * 1.18e-3 / 6, abs=1e-6
+    )  # second term: Σk⁴/Σk² = 11.8 samples² at 100 Hz
+    for name, expected in (
+        ("vx", gain * VX),
+        ("vy", gain * VY),
+        ("yaw_rate", YAW_RATE),
+        ("sideslip", np.arctan2(VY, VX)),
+    ):
+        np.testing.assert_allclose(
+            recording[f"{name}_ref"][WINDOW:-WINDOW], expected, rtol=0, atol=1e-6
+        )  # where no end is touched
 
 
 def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags):
@@ -174,7 +235,10 @@ def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags):
         np.testing.assert_allclose(recording[name], expected, rtol=0, atol=atol, err_msg=name)
 
 
-@pytest.mark.parametrize(("storage", "form"), [("sqlite3", "zip"), ("sqlite3", "file"), ("mcap", "folder"), ("mcap", "file")])
+@pytest.mark.parametrize(
+    ("storage", "form"),
+    [("sqlite3", "zip"), ("sqlite3", "file"), ("mcap", "folder"), ("mcap", "file")],
+)
 def test_storage_and_packing_make_no_difference(bags, tmp_path, storage, form):
     expected = read(bags)
     bag = write_bag(tmp_path / "made", drive(), storage)
@@ -186,14 +250,23 @@ def test_storage_and_packing_make_no_difference(bags, tmp_path, storage, form):
     else:
         shutil.move(bag if form == "folder" else data, there)
     recording = read(there)
-    assert (recording.id, recording.start_time, len(recording)) == ("lap", expected.start_time, len(expected))
+    assert (recording.id, recording.start_time, len(recording)) == (
+        "lap",
+        expected.start_time,
+        len(expected),
+    )
     for name, samples in expected.channels.items():
         np.testing.assert_array_equal(recording[name], samples)
 
 
 def test_a_command_is_held_and_a_range_is_cut_out(folder):
-    recording = read(folder, topics=topic_options("servo", interpolation="hold"), start=1.0, stop=2.0)
-    assert (recording.start_time, len(recording)) == (1.01, 95)  # poses at 1.0042 s to servo at 1.953 s
+    recording = read(
+        folder, topics=topic_options("servo", interpolation="hold"), start=1.0, stop=2.0
+    )
+    assert (recording.start_time, len(recording)) == (
+        1.01,
+        95,
+    )  # poses at 1.0042 s to servo at 1.953 s
     sent = 0.003 + 0.05 * np.floor((recording.time - 0.003) / 0.05 + 1e-6)
     np.testing.assert_allclose(recording["steer"], np.radians(6.0 * sent), rtol=0, atol=1e-8)
 
@@ -208,7 +281,9 @@ def test_a_moving_average_removes_what_would_alias(tmp_path):
     plain, averaged = read(bags), read(bags, topics=topic_options("imu", average=0.01))
     assert abs(plain["ay"].mean()) > 0.4
     np.testing.assert_allclose(averaged["ay"], 0.0, atol=1e-9)
-    np.testing.assert_allclose(averaged["ax"], -2.0 * averaged.time, rtol=0, atol=1e-8)  # a line stays the line: no delay
+    np.testing.assert_allclose(
+        averaged["ax"], -2.0 * averaged.time, rtol=0, atol=1e-8
+    )  # a line stays the line: no delay
 
 
 @pytest.mark.parametrize(("storage", "share"), [("sqlite3", 0.999), ("mcap", 0.3), ("mcap", 0.999)])
@@ -220,19 +295,32 @@ def test_a_truncated_bag_is_refused(tmp_path, storage, share):
     assert "truncated" in message or "is damaged" in message
 
 
-def test_absent_or_empty_topics_other_layouts_long_gaps_and_more_than_the_limits_are_refused(tmp_path, bags):
+def test_absent_or_empty_topics_other_layouts_long_gaps_and_more_than_the_limits_are_refused(
+    tmp_path, bags
+):
     topics = drive()
     absent = {name: topic for name, topic in topics.items() if name != "/motor"}
     empty = topics | {"/servo": Topic(topics["/servo"].type, topics["/servo"].times[:0], {})}
-    other = LAYOUTS | {"car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"}  # numbers would come from the wrong bytes
+    other = LAYOUTS | {
+        "car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"
+    }  # numbers would come from the wrong bytes
     for name, how, said in (
         ("absent", (absent,), "holds no messages of topic '/motor' (of /body, /imu, /servo)"),
         ("empty", (empty,), "holds no messages of topic '/servo'"),
-        ("other", (topics, "mcap", other), "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one"),
+        (
+            "other",
+            (topics, "mcap", other),
+            "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one",
+        ),
     ):
         assert said in refused(write_bag(tmp_path / name, *how).parent)
-    gap, whole = topic_options("motor", max_gap=0.009), topic_options("servo", type="std_msgs/msg/Int64")
-    assert "topic '/servo' carries 'std_msgs/msg/Float64', not 'std_msgs/msg/Int64'" in refused(bags, topics=whole)
+    gap, whole = (
+        topic_options("motor", max_gap=0.009),
+        topic_options("servo", type="std_msgs/msg/Int64"),
+    )
+    assert "topic '/servo' carries 'std_msgs/msg/Float64', not 'std_msgs/msg/Int64'" in refused(
+        bags, topics=whole
+    )
     assert "topic '/motor': field 'motor.rpm' has a gap of 0.01 s" in refused(bags, topics=gap)
     with use_limits(Limits(samples=250)):
         assert "raise it: limits.samples=NUMBER" in refused(bags)
@@ -246,7 +334,12 @@ ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SEL
     [
         (["DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"], "missing tables"),
         (["UPDATE messages SET timestamp = -1 WHERE id = 5"], "at no time there is"),
-        (["UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"], "is damaged"),
+        (
+            [
+                "UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"
+            ],
+            "is damaged",
+        ),
     ],
 )
 def test_a_hostile_database_ends_in_one_line(folder, statements, said):
@@ -261,7 +354,11 @@ def test_a_hostile_database_ends_in_one_line(folder, statements, said):
     [
         ("nanoseconds_since_epoch: 17", "nanoseconds_since_epoch: 9917", "which is no time"),
         ("- lap.db3", "- lap.db3\n  - lap.db3", "holds 2400 messages, the bag says 1200"),
-        ("- lap.db3", "- ../../../etc/passwd", "files are missing"),  # it is looked for in the bag's own folder
+        (
+            "- lap.db3",
+            "- ../../../etc/passwd",
+            "files are missing",
+        ),  # it is looked for in the bag's own folder
     ],
 )
 def test_metadata_that_lie_are_refused(folder, before, after, said):
@@ -273,14 +370,26 @@ def test_metadata_that_lie_are_refused(folder, before, after, said):
 
 
 def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
-    zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
-    expected, data, metadata = read(folder), folder / "lap" / "lap.db3", folder / "lap" / "metadata.yaml"
+    zstd = importlib.import_module(
+        "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+    )
+    expected, data, metadata = (
+        read(folder),
+        folder / "lap" / "lap.db3",
+        folder / "lap" / "metadata.yaml",
+    )
     about = yaml.safe_load(metadata.read_text())
-    told = {"compression_format": "zstd", "compression_mode": "file", "relative_file_paths": ["lap.db3.zstd"]}
+    told = {
+        "compression_format": "zstd",
+        "compression_mode": "file",
+        "relative_file_paths": ["lap.db3.zstd"],
+    }
     about["rosbag2_bagfile_information"] |= told
     metadata.write_text(yaml.safe_dump(about))
     content = data.read_bytes()
-    data.with_name("lap.db3.zstd").write_bytes(zstd.compress(content[:5000]) + zstd.compress(content[5000:]))
+    data.with_name("lap.db3.zstd").write_bytes(
+        zstd.compress(content[:5000]) + zstd.compress(content[5000:])
+    )
     data.unlink()
     np.testing.assert_array_equal(read(folder)["ax"], expected["ax"])
     assert "raise unpacked_limit" in refused(folder, unpacked_limit=1e-5)
@@ -294,7 +403,10 @@ def test_a_misspelt_declaration_is_refused(bags):
         ({"topics": topics("body", average=0.02)}, "orientations cannot be averaged"),
         ({"channels": {"vx_ref": vx}}, "'vx_ref' comes both from channels and from pose"),
         # what only the message types can tell
-        ({"channels": {"vx": vx | {"field": "motor.speed"}}}, "has no field 'motor.speed': 'speed' is none of: rpm, currents"),
+        (
+            {"channels": {"vx": vx | {"field": "motor.speed"}}},
+            "has no field 'motor.speed': 'speed' is none of: rpm, currents",
+        ),
         ({"channels": {"vx": vx | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topics("servo", stamps="header")}, "have no header; set stamps: received"),
     ):
@@ -309,19 +421,32 @@ def identify(car, root):
 
 @pytest.mark.slow
 def test_declared_constants_of_tables_are_those_that_the_data_show(data_root):
-    declared = {car: yaml.safe_load((CONFIGURATION.parent / f"{car}.yaml").read_text()) for car in ("av21", "dart", "roboracer")}
+    declared = {
+        car: yaml.safe_load((CONFIGURATION.parent / f"{car}.yaml").read_text())
+        for car in ("av21", "dart", "roboracer")
+    }
     identified = {car: identify(car, data_root) for car in declared}
-    assert declared["av21"]["transforms"][0]["wheel_radius"] == pytest.approx(identified["av21"]["wheel radius [m]"], abs=5e-5)
-    assert declared["dart"]["pose"]["yaw_offset"] == pytest.approx(identified["dart"]["body_yaw"], abs=5e-5)
-    assert declared["dart"]["held"]["delay"] == pytest.approx(1e-3 * identified["dart"]["vel encoder late [ms]"])
-    assert 1 / declared["roboracer"]["channels"]["vx"]["factor"] == pytest.approx(identified["roboracer"]["rpm for 1 m/s"], rel=1e-3)
+    assert declared["av21"]["transforms"][0]["wheel_radius"] == pytest.approx(
+        identified["av21"]["wheel radius [m]"], abs=5e-5
+    )
+    assert declared["dart"]["pose"]["yaw_offset"] == pytest.approx(
+        identified["dart"]["body_yaw"], abs=5e-5
+    )
+    assert declared["dart"]["held"]["delay"] == pytest.approx(
+        1e-3 * identified["dart"]["vel encoder late [ms]"]
+    )
+    assert 1 / declared["roboracer"]["channels"]["vx"]["factor"] == pytest.approx(
+        identified["roboracer"]["rpm for 1 m/s"], rel=1e-3
+    )
 
 
 @pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
     identified = identify("f1tenth", data_root)
-    declared = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
+    declared = yaml.safe_load(
+        CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root))
+    )
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
     rpm = 1 / channels["vx"]["factor"]
@@ -330,9 +455,23 @@ def test_declared_constants_are_those_that_the_data_show(data_root):
     assert channels["steer"]["offset"] == pytest.approx(identified["servo_neutral"], abs=1e-6)
     assert channels["steer"]["factor"] == pytest.approx(identified["servo_gain"], rel=1e-6)
     assert channels["steer"]["sign"] == -np.sign(identified["servo_agreement"])
-    for name, measured in (("ax", "ax by forward"), ("ay", "ay by lateral"), ("yaw_rate", "gyro by turning")):
-        assert channels[name].get("sign", 1) * identified[measured] == pytest.approx(1.0, abs=0.1)  # sign and unit
+    for name, measured in (
+        ("ax", "ax by forward"),
+        ("ay", "ay by lateral"),
+        ("yaw_rate", "gyro by turning"),
+    ):
+        assert channels[name].get("sign", 1) * identified[measured] == pytest.approx(
+            1.0, abs=0.1
+        )  # sign and unit
     assert identified["acc_z"] == pytest.approx(9.81, abs=0.05)  # z is up, in m/s²
-    for name, topic in (("imu", "/imu"), ("vesc", "/vesc/core"), ("body", "/optitrack/rigid_body_0")):
-        assert declared["topics"][name]["rate_hz"] == pytest.approx(identified[f"rate {topic}"], rel=1e-4)
-    assert identified["pose_roughness_even"] < 0.2 * identified["pose_roughness_header"]  # why the clock is declared even
+    for name, topic in (
+        ("imu", "/imu"),
+        ("vesc", "/vesc/core"),
+        ("body", "/optitrack/rigid_body_0"),
+    ):
+        assert declared["topics"][name]["rate_hz"] == pytest.approx(
+            identified[f"rate {topic}"], rel=1e-4
+        )
+    assert (
+        identified["pose_roughness_even"] < 0.2 * identified["pose_roughness_header"]
+    )  # why the clock is declared even

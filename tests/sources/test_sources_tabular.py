@@ -30,7 +30,16 @@ def rows(count, start=0):
 
 
 def source(folder, **options):
-    return TabularSource({"name": "mine", "source": "tabular", "path": str(folder), "files": "*", "time": TIME, **options})
+    return TabularSource(
+        {
+            "name": "mine",
+            "source": "tabular",
+            "path": str(folder),
+            "files": "*",
+            "time": TIME,
+            **options,
+        }
+    )
 
 
 def read(file, **options):
@@ -44,18 +53,31 @@ def written(folder, content, name="lap.csv"):
 
 
 def assert_reads_as(recording, frame):
-    pd.testing.assert_frame_equal(pd.DataFrame(dict(recording.channels)), frame.drop(columns="time"), check_exact=True, check_like=True)
+    pd.testing.assert_frame_equal(
+        pd.DataFrame(dict(recording.channels)),
+        frame.drop(columns="time"),
+        check_exact=True,
+        check_like=True,
+    )
 
 
 def test_csv_and_parquet_files_read_as_pandas_reads_them(tmp_path):
     table().to_csv(tmp_path / "lap.csv", index=False)
     recording = read(tmp_path / "lap.csv", vehicle="kart", kind="real", citation="me")
     assert_reads_as(recording, pd.read_csv(tmp_path / "lap.csv"))
-    assert (recording.id, recording.vehicle, recording.rate_hz, recording.start_time, recording.kind) == ("lap", "kart", 100.0, 5.0, "real")
+    assert (
+        recording.id,
+        recording.vehicle,
+        recording.rate_hz,
+        recording.start_time,
+        recording.kind,
+    ) == ("lap", "kart", 100.0, 5.0, "real")
     assert dict(recording.provenance) == {"dataset": "mine", "source": "tabular", "file": "lap.csv"}
     (tmp_path / "lap.csv").unlink()
     table().astype({"ay": "float32"}).to_parquet(tmp_path / "lap.pq")
-    assert_reads_as(read(tmp_path / "lap.pq"), pd.read_parquet(tmp_path / "lap.pq").astype("float64"))
+    assert_reads_as(
+        read(tmp_path / "lap.pq"), pd.read_parquet(tmp_path / "lap.pq").astype("float64")
+    )
 
 
 def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path):
@@ -77,7 +99,9 @@ def test_without_a_time_column_the_rate_is_given(tmp_path):
 
 
 def test_a_stored_recording_is_read_as_what_it_is(tmp_path):
-    kept = Recording("lap", "kart", 20.0, 450.0, {"ay": np.arange(4.0)}, "simulated", provenance={"seed": 3})
+    kept = Recording(
+        "lap", "kart", 20.0, 450.0, {"ay": np.arange(4.0)}, "simulated", provenance={"seed": 3}
+    )
     write_recording(kept, tmp_path / "lap.parquet")
     recording = read(tmp_path / "lap.parquet")
     assert recording["ay"].tolist() == kept["ay"].tolist()
@@ -97,12 +121,24 @@ def test_recordings_are_the_stems_in_order(tmp_path):
 BAD_TABLES = {
     "header only": (HEADER, ["has a header and no rows"]),
     "no such column": ("time,vx\n0,1\n0.01,2\n", ["no column 'ay'", "it has time, vx"]),
-    "column twice": ("time,vx,ay,ay\n" + "0,1,2,3\n0.01,1,2,3\n", ["2 columns called 'ay'", "rename or remove"]),
-    "text": (HEADER + rows(4) + "0.04,abc,1\n" + rows(3, 5), ["column 'vx'", "'abc'", "data row 5", "numbers are needed"]),
-    "short row": (HEADER + rows(4) + "0.04,1\n", ["cannot be read as a table", "Row #6", "Expected 3 columns, got 2"]),
+    "column twice": (
+        "time,vx,ay,ay\n" + "0,1,2,3\n0.01,1,2,3\n",
+        ["2 columns called 'ay'", "rename or remove"],
+    ),
+    "text": (
+        HEADER + rows(4) + "0.04,abc,1\n" + rows(3, 5),
+        ["column 'vx'", "'abc'", "data row 5", "numbers are needed"],
+    ),
+    "short row": (
+        HEADER + rows(4) + "0.04,1\n",
+        ["cannot be read as a table", "Row #6", "Expected 3 columns, got 2"],
+    ),
     "other encoding": (b"time,vx,ay\xb2\n0,1,2\n", ["no column 'ay' (it has time, vx, ay\\xb2)"]),
     "endless line": (HEADER + "a" * 3_000_000, ["a line is longer than 1048576 bytes"]),
-    "columns": ("time,vx" + "," * 20_000 + "\n", ["has 20002 columns, more than the limit of 10000"]),
+    "columns": (
+        "time,vx" + "," * 20_000 + "\n",
+        ["has 20002 columns, more than the limit of 10000"],
+    ),
     "escape": (HEADER + '0,"1\x1b[2J",2\n0.1,1,2\n', ["holds the text '1\\x1b[2J' in data row 1"]),
     "quote": (HEADER + rows(3) + '0.03,"' + "x,\n" * 10, []),
 }
@@ -142,16 +178,23 @@ def runs_csv(tmp_path, runs):
     return source(tmp_path, files="*.csv", runs="run_id")
 
 
-def test_each_run_becomes_a_recording_with_its_own_start_and_runs_that_cannot_be_told_apart_are_refused(tmp_path):
+def test_each_run_becomes_a_recording_with_its_own_start_and_runs_that_cannot_be_told_apart_are_refused(
+    tmp_path,
+):
     found = runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10)
     assert found.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
     recordings = list(found.recordings())
     assert [recording.start_time for recording in recordings] == [0.0, 0.2, 0.5]
-    np.testing.assert_array_equal(np.concatenate([recording["vx"] for recording in recordings]), np.arange(60))
+    np.testing.assert_array_equal(
+        np.concatenate([recording["vx"] for recording in recordings]), np.arange(60)
+    )
     assert recordings[1].provenance["run"] == 3
     for runs, said in (
         ([1, 1, 2, 2, 1, 1], "run 1 begins again in data row 5"),
-        ([1, 1, 1.5, 1.5], "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers"),
+        (
+            [1, 1, 1.5, 1.5],
+            "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers",
+        ),
     ):
         assert f"'{tmp_path / 'lap.csv'}': {said}" in refusal(runs_csv(tmp_path, runs).ids)
     assert len(runs_csv(tmp_path, [4] * 9).read_file(tmp_path / "lap.csv")) == 9
@@ -160,8 +203,15 @@ def test_each_run_becomes_a_recording_with_its_own_start_and_runs_that_cannot_be
 
 
 def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path):
-    assert len(read(written(tmp_path, gzip.compress((HEADER + rows(50)).encode()), "lap.csv.gz"))) == 50
-    bomb = written(tmp_path, gzip.compress(HEADER.encode() + (b"0,1,1" + b" " * 995 + b"\n") * 80_000, 9), "bomb.csv.gz")
+    assert (
+        len(read(written(tmp_path, gzip.compress((HEADER + rows(50)).encode()), "lap.csv.gz")))
+        == 50
+    )
+    bomb = written(
+        tmp_path,
+        gzip.compress(HEADER.encode() + (b"0,1,1" + b" " * 995 + b"\n") * 80_000, 9),
+        "bomb.csv.gz",
+    )
     with use_limits(Limits(memory=10_000_000)):
         assert "limits.memory=NUMBER" in refusal(lambda: read(bomb))
     torn = written(tmp_path, bomb.read_bytes()[:-100], "torn.csv.gz")

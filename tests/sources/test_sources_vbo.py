@@ -22,20 +22,41 @@ def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path)
     recording, true = read(tmp_path), drive()
     assert (recording.id, recording.rate_hz, len(recording)) == ("lap", 100.0, 1000)
     assert recording.start_time == pytest.approx(38_870.45)
-    for name, own in (("vx", "vx"), ("yaw_rate", "yaw_rate"), ("ax", "ax"), ("ay", "ay"), ("vy_ref", "vy")):
-        assert np.allclose(recording[name], true[own], rtol=0, atol=1e-4 if name == "vx" else 1e-7), name
+    for name, own in (
+        ("vx", "vx"),
+        ("yaw_rate", "yaw_rate"),
+        ("ax", "ax"),
+        ("ay", "ay"),
+        ("vy_ref", "vy"),
+    ):
+        assert np.allclose(
+            recording[name], true[own], rtol=0, atol=1e-4 if name == "vx" else 1e-7
+        ), name
     about = recording.provenance
-    assert about["slip_offsets_lateral_longitudinal_m"] == {"FL": [0.031, 1.79], "RL": [0.031, -1.06]}
-    assert (about["created"], about["rows_dropped_at_the_end"]) == ("File created on 12/09/2018 @ 12:47", 0)
+    assert about["slip_offsets_lateral_longitudinal_m"] == {
+        "FL": [0.031, 1.79],
+        "RL": [0.031, -1.06],
+    }
+    assert (about["created"], about["rows_dropped_at_the_end"]) == (
+        "File created on 12/09/2018 @ 12:47",
+        0,
+    )
 
 
 @pytest.mark.parametrize(
-    ("first", "end", "dropped"), [(86_395.0, "", 0), (38_870.45, "053 104", 1), (38_870.45, "053 104900.000" + " +0.0" * 16, 1)]
+    ("first", "end", "dropped"),
+    [(86_395.0, "", 0), (38_870.45, "053 104", 1), (38_870.45, "053 104900.000" + " +0.0" * 16, 1)],
 )
-def test_time_goes_on_past_midnight_and_a_last_row_that_is_cut_off_or_late_is_left_out_and_counted(tmp_path, first, end, dropped):
+def test_time_goes_on_past_midnight_and_a_last_row_that_is_cut_off_or_late_is_left_out_and_counted(
+    tmp_path, first, end, dropped
+):
     write_log(tmp_path / "lap.VBO", first, end=end)
     recording = read(tmp_path)
-    assert (recording.start_time, recording.rate_hz, len(recording)) == (pytest.approx(first), 100.0, 1000)
+    assert (recording.start_time, recording.rate_hz, len(recording)) == (
+        pytest.approx(first),
+        100.0,
+        1000,
+    )
     assert recording.provenance["rows_dropped_at_the_end"] == dropped
 
 
@@ -46,11 +67,21 @@ def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(t
     (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[650:]]))
     assert "gaps, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
     first, second = open_source(dataset(tmp_path, max_gap=1.0)).recordings()
-    assert (first.id, second.id, second.provenance["run"], second.start_time) == ("lap_run_0", "lap_run_1", 1, pytest.approx(38_876.95))
-    np.testing.assert_allclose(np.concatenate([first["yaw_rate"], second["yaw_rate"]]), np.delete(drive()["yaw_rate"], np.s_[400:650]))
+    assert (first.id, second.id, second.provenance["run"], second.start_time) == (
+        "lap_run_0",
+        "lap_run_1",
+        1,
+        pytest.approx(38_876.95),
+    )
+    np.testing.assert_allclose(
+        np.concatenate([first["yaw_rate"], second["yaw_rate"]]),
+        np.delete(drive()["yaw_rate"], np.s_[400:650]),
+    )
     alone = open_source(dataset(tmp_path, max_gap=1.0, run=1)).read_file(tmp_path / "lap.vbo")
     assert (len(alone), alone.start_time) == (350, second.start_time)
-    assert "name one by +dataset.run=0" in refusal(lambda: open_source(dataset(tmp_path, max_gap=1.0)).read_file(tmp_path / "lap.vbo"))
+    assert "name one by +dataset.run=0" in refusal(
+        lambda: open_source(dataset(tmp_path, max_gap=1.0)).read_file(tmp_path / "lap.vbo")
+    )
     assert "no run between its pauses" in refusal(lambda: read(tmp_path, max_gap=100.0))
     assert survey(tmp_path / "lap.vbo").runs == (slice(0, 400), slice(400, 750))
 
@@ -58,7 +89,9 @@ def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(t
 def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
     known = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
-    assert read_log(tmp_path / "lap.vbo").units == known | dict(zip(COLUMNS.split()[-7:], UNITS, strict=True))
+    assert read_log(tmp_path / "lap.vbo").units == known | dict(
+        zip(COLUMNS.split()[-7:], UNITS, strict=True)
+    )
     write_log(tmp_path / "lap.vbo", units=("rad", "km/h", "rad/s", "g", "g", "°", "°"))
     said = "column 'YawRate', for channel 'yaw_rate', is in 'rad/s' by the file and in 'deg/s'"
     assert said in refusal(lambda: read(tmp_path))
@@ -66,8 +99,12 @@ def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaratio
 
 def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path):
     write_log(tmp_path / "lap.vbo", swapped=True)
-    channels = dataset(tmp_path)["channels"] | {"sideslip_ref": {"column": "Slip_FL", "unit": "deg"}}
-    with pytest.raises(DataError, match=r"slip at the front and the rear left wheel differs by .* changed places") as refused:
+    channels = dataset(tmp_path)["channels"] | {
+        "sideslip_ref": {"column": "Slip_FL", "unit": "deg"}
+    }
+    with pytest.raises(
+        DataError, match=r"slip at the front and the rear left wheel differs by .* changed places"
+    ) as refused:
         read(tmp_path, channels=channels)
     assert "accept: [slip_offsets]" in str(refused.value)
     assert "sideslip_ref" in read(tmp_path, channels=channels, accept=["slip_offsets"])

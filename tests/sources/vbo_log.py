@@ -12,13 +12,21 @@ def drive(seconds=10.0):
     """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²], in ISO 8855 axes, (T,) each."""
     t = np.arange(round(seconds * RATE)) / RATE
     vx, yaw_rate, vy = 20.0 + np.sin(t / 3.0), 0.3 * np.sin(t), 0.2 * np.sin(t + 0.3)
-    return {"vx": vx, "yaw_rate": yaw_rate, "vy": vy, "ax": np.cos(t / 3.0) / 3.0, "ay": vx * yaw_rate}
+    return {
+        "vx": vx,
+        "yaw_rate": yaw_rate,
+        "vy": vy,
+        "ax": np.cos(t / 3.0) / 3.0,
+        "ay": vx * yaw_rate,
+    }
 
 
 def clock(seconds):
     """Clock times, hhmmss.sss."""
     ms = np.rint(seconds * 1000.0).astype(int) % 86_400_000
-    return [f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in ms]
+    return [
+        f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in ms
+    ]
 
 
 def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
@@ -29,16 +37,39 @@ def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
     for lateral, longitudinal in AXLES.values():
         ahead = lateral if swapped else longitudinal
         slip.append(np.degrees(np.arctan2(d["vy"] + ahead * d["yaw_rate"], d["vx"])))
-    numbers = [d["vx"] * 3.6, np.degrees(-d["yaw_rate"]), d["ax"] / 9.80665, d["ay"] / 9.80665, d["vy"] * 3.6]
+    numbers = [
+        d["vx"] * 3.6,
+        np.degrees(-d["yaw_rate"]),
+        d["ax"] / 9.80665,
+        d["ay"] / 9.80665,
+        d["vy"] * 3.6,
+    ]
     rows = []
     for k, stamp in enumerate(clock(first + np.arange(n) / RATE)):
         velocity, turn, ax, ay, vy = (values[k] for values in numbers)
         begin = f"053 {stamp} +3608.25426832 -1087.02882814 {velocity:07.4f} 195.27 +0040.11 -0000.01 +0000.00 +0000.00 0.000000"
         rest = f"{0.02:+.6E} {vy:+.9E} {turn:+.9E} {ax:+.9E} {ay:+.9E} {slip[0][k]:+.9E} {slip[1][k]:+.9E} "
         rows.append(f"{begin} {rest}")
-    offsets = [f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}" for point, (lateral, longitudinal) in AXLES.items()]
-    head = ["File created on 12/09/2018 @ 12:47   \r\n", "[header]\r\nsatellites\r\ntime\r\n", "[channel units]", *units, ""]
-    middle = ["[comments]", *offsets, "", "[module Information]\r\n026524 - VB3i - 2 5 79\r\n", "[column names]", COLUMNS, ""]
+    offsets = [
+        f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}"
+        for point, (lateral, longitudinal) in AXLES.items()
+    ]
+    head = [
+        "File created on 12/09/2018 @ 12:47   \r\n",
+        "[header]\r\nsatellites\r\ntime\r\n",
+        "[channel units]",
+        *units,
+        "",
+    ]
+    middle = [
+        "[comments]",
+        *offsets,
+        "",
+        "[module Information]\r\n026524 - VB3i - 2 5 79\r\n",
+        "[column names]",
+        COLUMNS,
+        "",
+    ]
     text = "\r\n".join([*head, *middle, "[data]", *rows])
     file.write_bytes((text + "\r\n" + end).encode("latin-1", "replace"))
 

@@ -19,13 +19,17 @@ SPANS = (Span("toy", "lap", 20.0, 40.0), Span("toy", "lap", 50.0, 90.0))
 def comparison_on(drive, folder, rate_hz):
     """One calibrated model on two ranges of a drive."""
     write_recording(drive, folder / "lap.parquet")
-    health = learn_health([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
+    health = learn_health(
+        [measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE
+    )
     write_trust(Trust(About("any"), health=health), folder)
     model = EvaluatedModel("any", "", "Any", 0, folder, folder, calibration_folder=folder)
     split = Split("toy", (), (), {"test": SPANS})
     protocol = Protocol(rate_hz=rate_hz, warm_up_seconds=2.0, skip_seconds=1.5)
     references = {("toy", "lap"): folder / "lap.parquet"}
-    part = PartArtefacts("toy", "", "", "", split, protocol, {"toy": "simulated"}, {}, None, [model], references, [])
+    part = PartArtefacts(
+        "toy", "", "", "", split, protocol, {"toy": "simulated"}, {}, None, [model], references, []
+    )
     return part, model
 
 
@@ -53,4 +57,6 @@ def test_no_health_is_shown_of_a_model_at_another_rate_and_ranges_are_chained_wi
     other = replace(part, protocol=replace(part.protocol, rate_hz=2 * RATE))
     assert health_over(model, pieces, other, 5) is None
     assert health_over(replace(model, calibration_folder=None), pieces, part, 5) is None
-    assert chained([np.ones(2), np.zeros(1)], 2).tolist() == pytest.approx([1.0, 1.0, np.nan, np.nan, 0.0], nan_ok=True)
+    assert chained([np.ones(2), np.zeros(1)], 2).tolist() == pytest.approx(
+        [1.0, 1.0, np.nan, np.nan, 0.0], nan_ok=True
+    )

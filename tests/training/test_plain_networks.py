@@ -25,7 +25,9 @@ class Perceptron(nn.Module):
 
     def __init__(self, dropout=0.0):
         super().__init__()
-        self.layers = nn.Sequential(nn.Flatten(), nn.Linear(4 * WINDOW, 6), nn.Dropout(dropout), nn.Tanh(), nn.Linear(6, 1))
+        self.layers = nn.Sequential(
+            nn.Flatten(), nn.Linear(4 * WINDOW, 6), nn.Dropout(dropout), nn.Tanh(), nn.Linear(6, 1)
+        )
 
     def forward(self, windows):
         assert windows.shape[-2:] == (WINDOW, 4)
@@ -54,13 +56,18 @@ class Attention(StandardisedNetwork):
         self.output = nn.Linear(4, 1)
 
     def forward(self, windows):
-        return self.output(self.encoder(self.embed(windows)).mean(1)).squeeze(-1) * self.output_scale + self.output_mean
+        return (
+            self.output(self.encoder(self.embed(windows)).mean(1)).squeeze(-1) * self.output_scale
+            + self.output_mean
+        )
 
 
 class Convolution(nn.Module):
     def __init__(self):
         super().__init__()
-        self.layers = nn.Sequential(nn.Conv1d(4, 3, 3), nn.Tanh(), nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(3, 1))
+        self.layers = nn.Sequential(
+            nn.Conv1d(4, 3, 3), nn.Tanh(), nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(3, 1)
+        )
 
     def forward(self, windows):
         return self.layers(windows.transpose(1, 2))
@@ -92,7 +99,9 @@ def estimator_of(network, seed=0):
 
 def fit(network, seeds, context=None, **training):
     members = [estimator_of(network, seed) for seed in seeds]
-    settings = SupervisedSettings(**{"dtype": "float64", "max_epochs": 4, "learning_rate": 1e-2} | training)
+    settings = SupervisedSettings(
+        **{"dtype": "float64", "max_epochs": 4, "learning_rate": 1e-2} | training
+    )
     return members, type(members[0]).fit_members(members, DATA, settings, context or FitContext())
 
 
@@ -106,7 +115,10 @@ def test_members_equal_training_each_alone(name):
     assert not np.allclose(flat_weights(together[0]), flat_weights(together[1]), atol=1e-2)
 
 
-@pytest.mark.parametrize(("name", "one_by_one"), [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)])
+@pytest.mark.parametrize(
+    ("name", "one_by_one"),
+    [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)],
+)
 def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one_by_one):
     members, _ = fit(NETWORKS[name], [0, 1])
     assert (members[0].network in _ONE_BY_ONE) is one_by_one
@@ -124,7 +136,10 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     member = known(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
     batch, stepper = member.estimate([drive])[0]["vy"], member.online()
-    online = [stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"] for k in range(len(drive))]
+    online = [
+        stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
+        for k in range(len(drive))
+    ]
     assert np.isnan(batch[:WINDOW]).all()
     assert np.abs(np.array(online)[WINDOW - 1 : -1] - batch[WINDOW:]).max() <= tolerance
 
@@ -138,8 +153,15 @@ def test_estimates_are_those_of_the_network_called_by_hand_on_each_window(name):
     if isinstance(network, StandardisedNetwork):
         series = (series - network.input_mean) / network.input_scale
     with torch.no_grad():
-        by_hand = network(torch.stack([series[k : k + WINDOW] for k in range(len(drive) - WINDOW)])).reshape(-1)
-    assert np.allclose(member.estimate([drive.without_references()])[0]["vy"][WINDOW:], by_hand.numpy(), rtol=0, atol=1e-12)
+        by_hand = network(
+            torch.stack([series[k : k + WINDOW] for k in range(len(drive) - WINDOW)])
+        ).reshape(-1)
+    assert np.allclose(
+        member.estimate([drive.without_references()])[0]["vy"][WINDOW:],
+        by_hand.numpy(),
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_initial_weights_are_those_that_torch_draws_from_the_seed():
@@ -209,8 +231,14 @@ def masked():
 @pytest.mark.parametrize(
     ("network", "message"),
     [
-        (lambda: nn.Sequential(nn.BatchNorm1d(4), nn.Linear(4, 1)), r"layer '0' \(BatchNorm1d\) keeps running statistics"),
-        (masked, "buffer 'mask' is torch.bool, no floating point; register it with persistent=False"),
+        (
+            lambda: nn.Sequential(nn.BatchNorm1d(4), nn.Linear(4, 1)),
+            r"layer '0' \(BatchNorm1d\) keeps running statistics",
+        ),
+        (
+            masked,
+            "buffer 'mask' is torch.bool, no floating point; register it with persistent=False",
+        ),
         (nn.Identity, "Identity has no parameters to train"),
         (
             lambda: nn.Sequential(nn.Linear(4, 1), nn.Flatten()),

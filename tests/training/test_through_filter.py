@@ -13,7 +13,14 @@ from vehest.estimators.base import FitData
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseSettings
-from vehest.training.through_filter import Drive, ThroughFilterSettings, filter_phases, gaussian_surprise, placed, sequences_of
+from vehest.training.through_filter import (
+    Drive,
+    ThroughFilterSettings,
+    filter_phases,
+    gaussian_surprise,
+    placed,
+    sequences_of,
+)
 
 DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
 ONE_STEP = PhaseSettings(learning_rate=5e-3, max_epochs=3)
@@ -21,8 +28,20 @@ THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
 def settings(**changes):
-    known = {"one_step": ONE_STEP, "one_step_batch": 100, "through": THROUGH, "noise": THROUGH, "steps": 40, "batch_size": 3}
-    known |= {"validation_steps": 60, "validation_drop_steps": 10, "mirrored": 0.0, "dtype": "float64"}
+    known = {
+        "one_step": ONE_STEP,
+        "one_step_batch": 100,
+        "through": THROUGH,
+        "noise": THROUGH,
+        "steps": 40,
+        "batch_size": 3,
+    }
+    known |= {
+        "validation_steps": 60,
+        "validation_drop_steps": 10,
+        "mirrored": 0.0,
+        "dtype": "float64",
+    }
     return ThroughFilterSettings(**known | changes)
 
 
@@ -73,7 +92,14 @@ def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others():
     for placing, same in (("fixed", True), ("random", False)):
         (phase,) = phases_of(made, parts, settings(placing=placing, start_spread=0.0))
         generator = torch.Generator().manual_seed(0)
-        epochs = [{tuple(row) for batch in phase.batches(generator) for row in batch[0].states[:, 0].tolist()} for _ in range(2)]
+        epochs = [
+            {
+                tuple(row)
+                for batch in phase.batches(generator)
+                for row in batch[0].states[:, 0].tolist()
+            }
+            for _ in range(2)
+        ]
         assert (epochs[0] == epochs[1]) == same
 
 
@@ -81,7 +107,16 @@ def phases_of(made, parts, training):
     from vehest.training.through_filter import Weights
 
     weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
-    return filter_phases(made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
+    return filter_phases(
+        made.filter,
+        parts,
+        parts,
+        weights,
+        training,
+        training.through,
+        lambda name: True,
+        "through_filter",
+    )
 
 
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true():
@@ -102,12 +137,17 @@ def test_a_share_of_sequences_is_seen_in_a_mirror():
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     signs = [torch.tensor(part, dtype=torch.float64) for part in made.filter.mirror]
     for share, allowed in ((0.0, {False}), (1.0, {True}), (0.5, {False, True})):
-        (phase,) = phases_of(made, parts, settings(mirrored=share, start_spread=0.0, placing="fixed"))
+        (phase,) = phases_of(
+            made, parts, settings(mirrored=share, start_spread=0.0, placing="fixed")
+        )
         known = sequences_of(parts, 40)
         seen = set()
         for batch, start in phase.batches(torch.Generator().manual_seed(0)):
             for row in range(len(start)):
-                (at,) = torch.nonzero((known.states[:, 0, 0] == start[row, 0]) & (known.states[:, 0, 3] == start[row, 3]))[0]
+                (at,) = torch.nonzero(
+                    (known.states[:, 0, 0] == start[row, 0])
+                    & (known.states[:, 0, 3] == start[row, 3])
+                )[0]
                 turned = not torch.equal(batch.states[row], known.states[at])
                 for own, whole, sign in zip(batch, known, signs, strict=True):
                     assert torch.equal(own[row], whole[at] * sign if turned else whole[at])
@@ -123,7 +163,9 @@ def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its
         made.filter.zero_grad()
         estimated, _ = made.filter.estimated(sequences, sequences.states[:, 0], steps)
         (estimated - sequences.states).square().sum().backward()
-        gradient = torch.cat([p.grad.reshape(-1) for p in made.filter.parameters() if p.grad is not None])
+        gradient = torch.cat(
+            [p.grad.reshape(-1) for p in made.filter.parameters() if p.grad is not None]
+        )
         results[steps] = (estimated.detach(), gradient)
     assert torch.allclose(results[15][0], results[None][0], rtol=0, atol=1e-12)
     assert torch.equal(results[40][1], results[None][1]), "as long as the sequence: nothing is cut"
@@ -142,8 +184,15 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     generator = np.random.default_rng(0)
     errors, factors = generator.standard_normal((7, 3)), generator.standard_normal((7, 3, 3))
     covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
-    expected = -np.mean([stats.multivariate_normal(cov=own).logpdf(error) for error, own in zip(errors, covariances, strict=True)])
-    assert float(gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))) == pytest.approx(expected, rel=1e-9)
+    expected = -np.mean(
+        [
+            stats.multivariate_normal(cov=own).logpdf(error)
+            for error, own in zip(errors, covariances, strict=True)
+        ]
+    )
+    assert float(
+        gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))
+    ) == pytest.approx(expected, rel=1e-9)
 
 
 def test_noise_starts_where_residuals_say_or_as_given():
@@ -152,17 +201,26 @@ def test_noise_starts_where_residuals_say_or_as_given():
     made.filter.to(torch.float64).begin_noise(parts, 0.0)
     with torch.no_grad():
         model = made.filter.dynamics
-        steps = torch.cat([model.transition(d.states[:-1], d.inputs[:-1], 0.01) - d.states[1:] for d in parts])
+        steps = torch.cat(
+            [model.transition(d.states[:-1], d.inputs[:-1], 0.01) - d.states[1:] for d in parts]
+        )
         seen = torch.cat([d.measurements - model.observation(d.states, d.inputs) for d in parts])
         process = made.filter.process_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
         observation = made.filter.observation_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
     expected = steps.T @ steps / len(steps)
     assert torch.allclose(process[:4, :4], expected[:4, :4], rtol=1e-5, atol=2e-7)
-    assert float(process[4, 4]) == pytest.approx(1e-4, rel=1e-2), "a friction that is constant in training says nothing about its noise"
+    assert float(process[4, 4]) == pytest.approx(1e-4, rel=1e-2), (
+        "a friction that is constant in training says nothing about its noise"
+    )
     off = observation - seen.T @ seen / len(seen)
-    assert torch.allclose(off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7)
+    assert torch.allclose(
+        off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7
+    )
     made = estimator()
-    fitted = made.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"))
+    fitted = made.fit(
+        DATA,
+        settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"),
+    )
     assert np.isfinite(fitted.metrics["best_validation_loss"])
     assert made.weights()["process_noise.unit"].tolist() == [1.0] * 5
     other = estimator()
@@ -175,15 +233,27 @@ def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
     alone, after = estimator(through_filter=False), estimator(through_filter=False)
     alone.fit(DATA, settings(noise=nothing))
     after.fit(DATA, settings(noise=PhaseSettings(learning_rate=1e-2, max_epochs=2)))
-    changed = {name for name, values in after.weights().items() if not np.array_equal(values, alone.weights()[name])}
+    changed = {
+        name
+        for name, values in after.weights().items()
+        if not np.array_equal(values, alone.weights()[name])
+    }
     assert changed
     assert all("noise" in name for name in changed)
     before, after = estimator(), estimator()
     before.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-300)))
     record = after.fit(DATA, settings(through=PhaseSettings(max_epochs=4, learning_rate=2e-3)))
     assert record.metrics["best_validation_loss"] < record.metrics["start_validation_loss"]
-    changed = {name for name, values in after.weights().items() if not np.array_equal(values, before.weights()[name])}
-    assert changed >= {"dynamics.network.0.weight", "dynamics.car.learnt.log_yaw_inertia", "process_noise.constant.factor"}
+    changed = {
+        name
+        for name, values in after.weights().items()
+        if not np.array_equal(values, before.weights()[name])
+    }
+    assert changed >= {
+        "dynamics.network.0.weight",
+        "dynamics.car.learnt.log_yaw_inertia",
+        "process_noise.constant.factor",
+    }
 
 
 def test_a_curriculum_trains_on_shorter_sequences_first():
@@ -191,11 +261,20 @@ def test_a_curriculum_trains_on_shorter_sequences_first():
     drives(made)
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     phases = phases_of(made, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
-    assert [phase.name for phase in phases] == ["through_filter_10", "through_filter_20", "through_filter"]
+    assert [phase.name for phase in phases] == [
+        "through_filter_10",
+        "through_filter_20",
+        "through_filter",
+    ]
     assert [phase.settings.max_epochs for phase in phases] == [3, 3, 2]
-    lengths = [next(iter(phase.batches(torch.Generator().manual_seed(0))))[0].states.shape[1] for phase in phases]
+    lengths = [
+        next(iter(phase.batches(torch.Generator().manual_seed(0))))[0].states.shape[1]
+        for phase in phases
+    ]
     assert lengths == [10, 20, 40]
-    assert [phase.prepare is not None for phase in phases] == [True, False, False], "the noise is started once"
+    assert [phase.prepare is not None for phase in phases] == [True, False, False], (
+        "the noise is started once"
+    )
     record = made.fit(DATA, settings(curriculum=[10], curriculum_epochs=1))
     assert record.history["phase"] == [0.0] * 3 + [1.0] + [2.0] * 2
 
@@ -205,7 +284,11 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
     whole = estimator(seed=3)
     record = whole.fit(DATA, settings())
     with pytest.raises(KeyboardInterrupt):
-        estimator(seed=3).fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path], on_progress=die_after(stop)))
+        estimator(seed=3).fit(
+            DATA,
+            settings(checkpoint_seconds=0.0),
+            FitContext([tmp_path], on_progress=die_after(stop)),
+        )
     resumed = estimator(seed=3)
     again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
     assert np.array_equal(flat_weights(resumed), flat_weights(whole))

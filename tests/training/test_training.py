@@ -18,7 +18,11 @@ from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
 from vehest.training.supervised import SupervisedSettings, _shuffle_seed
 
 DATA = FitData([planar_drive(30.0, seed=1, noise=0.05)], [planar_drive(15.0, seed=2, noise=0.05)])
-SHAPES = [("ksnn", {"n_hidden": 1, "bias": True}), ("gru", {"n_states": 2}), ("lstm", {"n_states": 2})]
+SHAPES = [
+    ("ksnn", {"n_hidden": 1, "bias": True}),
+    ("gru", {"n_states": 2}),
+    ("lstm", {"n_states": 2}),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -41,12 +45,16 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
 def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
     settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
     together, records = _fit(name, config, [0, 1, 2, 3], settings)
-    assert len({record.metrics["epochs"] for record in records}) > 1, "members must stop at different times for this to mean anything"
+    assert len({record.metrics["epochs"] for record in records}) > 1, (
+        "members must stop at different times for this to mean anything"
+    )
     for seed, member, record in zip(range(4), together, records, strict=True):
         (alone,), (own,) = _fit(name, config, [seed], settings)
         assert own.metrics["epochs"] == record.metrics["epochs"]
         assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
-        assert np.allclose(own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8)
+        assert np.allclose(
+            own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8
+        )
 
 
 def test_early_stopping_keeps_the_best_weights_on_validation():
@@ -69,18 +77,24 @@ def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkey
     assert np.array_equal(flat_weights(one), flat_weights(other))
 
 
-@pytest.mark.parametrize(("name", "config", "averaging"), [*((*shape, 0.0) for shape in SHAPES), (*SHAPES[2], 0.95)])
+@pytest.mark.parametrize(
+    ("name", "config", "averaging"), [*((*shape, 0.0) for shape in SHAPES), (*SHAPES[2], 0.95)]
+)
 def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config, averaging):
     settings = SupervisedSettings(max_epochs=12, patience=4, averaging=averaging)
     whole, whole_records = _fit(name, config, [0, 1, 2], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
-    _, records = _fit(name, config, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(25)))
+    _, records = _fit(
+        name, config, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(25))
+    )
     assert all(record.interrupted for record in records)
     assert records[0].metrics["epochs"] < whole_records[0].metrics["epochs"]
     losses = records[0].history["validation_loss"]
     assert records[0].metrics["best_validation_loss"] == min(losses)
     resumed, resumed_records = _fit(name, config, [0, 1, 2], settings, FitContext(folders))
-    for one, other, record, resumed_record in zip(whole, resumed, whole_records, resumed_records, strict=True):
+    for one, other, record, resumed_record in zip(
+        whole, resumed, whole_records, resumed_records, strict=True
+    ):
         assert np.array_equal(flat_weights(one), flat_weights(other))
         assert record.history == resumed_record.history
 
@@ -111,19 +125,30 @@ def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error(
         with pytest.raises(ConfigurationError, match=said):
             settings_from_config(SupervisedSettings, config, "training")
     with pytest.raises(DataError, match=r"lower training\.learning_rate"):
-        _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
+        _fit(
+            "ksnn",
+            {"n_hidden": 0, "bias": True},
+            [0],
+            SupervisedSettings(max_epochs=200, learning_rate=1e3),
+        )
 
 
 def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     def cost(p):
         return float((p[0] - 7.0) ** 2 + 30 * abs(p[1] - 0.11) + 5 * np.sin(3 * p[0]) ** 2)
 
-    record = nelder_mead_over_grid(cost, [(0, 50), (0, 0.5)], [(3, 20), (0, 0.3)], DirectSearchSettings(), FitContext())
+    record = nelder_mead_over_grid(
+        cost, [(0, 50), (0, 0.5)], [(3, 20), (0, 0.3)], DirectSearchSettings(), FitContext()
+    )
     grid = optimize.brute(cost, ((0, 50), (0, 0.5)), Ns=401, finish=optimize.fmin)
     assert record.cost <= cost(grid) + 1e-6
     assert len(record.starts) == 16
     record = nelder_mead_over_grid(
-        lambda p: float(-p.sum()), [(0, 2), (0, 1)], [(0.5, 1), (0.1, 0.5)], DirectSearchSettings(), FitContext()
+        lambda p: float(-p.sum()),
+        [(0, 2), (0, 1)],
+        [(0.5, 1), (0.1, 0.5)],
+        DirectSearchSettings(),
+        FitContext(),
     )
     assert np.allclose(record.best, [2, 1], atol=1e-3)
     assert (record.best <= [2, 1]).all()
@@ -134,9 +159,17 @@ def _loop_with_all_its_weights(averaging):
     member = estimator_class("ksnn").from_config({"n_hidden": 1, "bias": True})
     member.seed(3)
     network = member._seeded_network(list(DATA.train), torch.float64)
-    sets = [windows_of(part, member.channels, "vy_ref", member.settings.window) for part in (DATA.train, DATA.validation)]
+    sets = [
+        windows_of(part, member.channels, "vy_ref", member.settings.window)
+        for part in (DATA.train, DATA.validation)
+    ]
     (x, y), (x_validation, y_validation) = (
-        (torch.as_tensor(w.series, dtype=torch.float64).unfold(0, w.n_window, 1).transpose(1, 2)[w.starts], torch.as_tensor(w.targets))
+        (
+            torch.as_tensor(w.series, dtype=torch.float64)
+            .unfold(0, w.n_window, 1)
+            .transpose(1, 2)[w.starts],
+            torch.as_tensor(w.targets),
+        )
         for w in sets
     )
     adam = torch.optim.Adam(network.parameters(), lr=1e-2)
@@ -148,7 +181,9 @@ def _loop_with_all_its_weights(averaging):
             (network(x[batch]) - y[batch]).square().mean().backward()
             adam.step()
             with torch.no_grad():
-                network.constrain({name: values.unsqueeze(0) for name, values in network.named_parameters()})
+                network.constrain(
+                    {name: values.unsqueeze(0) for name, values in network.named_parameters()}
+                )
             steps.append(torch.cat([p.detach().reshape(-1).clone() for p in network.parameters()]))
         weights = averaging ** torch.arange(len(steps) - 1, -1, -1, dtype=torch.float64)
         averages.append((weights[:, None] * torch.stack(steps)).sum(0) / weights.sum())

@@ -36,13 +36,37 @@ def _phase(network, name="fit", trainable=None, loss=None, validation=None, **se
         return float((network(X) - Y).square().mean())
 
     defaults = {"learning_rate": 1e-2, "max_epochs": 12}
-    return Phase(name, PhaseSettings(**{**defaults, **settings}), network, batches, loss or squared, validation or judge, trainable)
+    return Phase(
+        name,
+        PhaseSettings(**{**defaults, **settings}),
+        network,
+        batches,
+        loss or squared,
+        validation or judge,
+        trainable,
+    )
 
 
 def _two_phases(network):
     """The read-out first, then all together, in steps so large that patience ends it after its fourth epoch, the second being the best."""
-    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2, learning_rate=0.6)
-    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=2, schedule="cosine", learning_rate=0.3)]
+    first = _phase(
+        network,
+        "read-out",
+        lambda name: name.startswith("2."),
+        max_epochs=7,
+        validate_every=2,
+        learning_rate=0.6,
+    )
+    return [
+        first,
+        _phase(
+            nn.ModuleDict({"inner": network})["inner"],
+            "all",
+            patience=2,
+            schedule="cosine",
+            learning_rate=0.3,
+        ),
+    ]
 
 
 def _flat(network):
@@ -53,13 +77,17 @@ def _without_times(records):
     return [repr({**vars(record), "seconds": 0.0}) for record in records]
 
 
-@pytest.mark.parametrize("often", [0.0, 1e9], ids=["checkpoint after every epoch", "checkpoint when stopped"])
+@pytest.mark.parametrize(
+    "often", [0.0, 1e9], ids=["checkpoint after every epoch", "checkpoint when stopped"]
+)
 def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_path, often):
     whole = _network()
     records = train_phases(_two_phases(whole), 3, FitContext())
     assert [record.name for record in records] == ["read-out", "all"]
     stops, interrupted = 0, True
-    while interrupted:  # each run gets eight questions further, in a fresh network as in a fresh process
+    while (
+        interrupted
+    ):  # each run gets eight questions further, in a fresh network as in a fresh process
         resumed = _network()
         context = FitContext([tmp_path], should_stop=stop_after(8))
         again = train_phases(_two_phases(resumed), 3, context, checkpoint_seconds=often)
@@ -74,10 +102,17 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     train_phases(_two_phases(whole), 3, FitContext())
     killed = _network()
     with pytest.raises(KeyboardInterrupt):
-        train_phases(_two_phases(killed), 3, FitContext([tmp_path], on_progress=die_after(11)), checkpoint_seconds=0.0)
+        train_phases(
+            _two_phases(killed),
+            3,
+            FitContext([tmp_path], on_progress=die_after(11)),
+            checkpoint_seconds=0.0,
+        )
     assert resume_epoch(tmp_path) == 10, "in the second phase"
     kept = load_checkpoint(tmp_path).tensors
-    assert not torch.equal(kept["now.0.0.weight"], kept["best.0.0.weight"]), "it goes on from the first and ends with the second"
+    assert not torch.equal(kept["now.0.0.weight"], kept["best.0.0.weight"]), (
+        "it goes on from the first and ends with the second"
+    )
     resumed = _network()
     train_phases(_two_phases(resumed), 3, FitContext([tmp_path]))
     assert torch.equal(_flat(whole), _flat(resumed))
@@ -88,7 +123,9 @@ def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finishe
     records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
     assert resume_epoch(tmp_path) == -1
     asked = []
-    assert _without_times(train_phases(_two_phases(other), 3, FitContext([tmp_path], on_progress=asked.append))) == _without_times(records)
+    assert _without_times(
+        train_phases(_two_phases(other), 3, FitContext([tmp_path], on_progress=asked.append))
+    ) == _without_times(records)
     assert not asked
     assert torch.equal(_flat(one), _flat(other))
     folders = [tmp_path / "0", tmp_path / "1"]
@@ -113,7 +150,9 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
         asked.update({name: value.requires_grad for name, value in network.named_parameters()})
         return (network(batch[0]) - batch[1]).square().mean()
 
-    phase = _phase(network, trainable=lambda name: name.startswith("2."), loss=loss, weight_decay=0.1)
+    phase = _phase(
+        network, trainable=lambda name: name.startswith("2."), loss=loss, weight_decay=0.1
+    )
     train_phases([phase], 0, FitContext())
     assert asked == {"0.weight": False, "0.bias": False, "2.weight": True, "2.bias": True}
     for name, value in network.named_parameters():
@@ -129,15 +168,28 @@ def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_o
         seen.append(_flat(network))
         return next(losses)
 
-    (record,) = train_phases([_phase(network, validation=validation, max_epochs=5)], 0, FitContext())
+    (record,) = train_phases(
+        [_phase(network, validation=validation, max_epochs=5)], 0, FitContext()
+    )
     assert (record.start_loss, record.best_epoch, record.best_loss) == (5.0, 2, 2.0)
     assert torch.equal(_flat(network), seen[2])
     start = _flat(network)
     (record,) = train_phases([_phase(network, validation=lambda: 1.0, patience=3)], 0, FitContext())
-    assert (record.best_epoch, record.epochs) == (0, 3), "no better than the start, and out of patience"
+    assert (record.best_epoch, record.epochs) == (0, 3), (
+        "no better than the start, and out of patience"
+    )
     assert torch.equal(_flat(network), start)
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
-    assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
+    assert [math.isfinite(loss) for loss in record.validation_loss] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]
     told = []
     train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
     assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
@@ -148,7 +200,10 @@ def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_o
 def test_adam_is_that_of_torch_bit_by_bit(decay):
     generator = torch.Generator().manual_seed(0)
     own, other = (_network(), _network())
-    adam, theirs = Adam(own.parameters(), 0.01, decay), torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay)
+    adam, theirs = (
+        Adam(own.parameters(), 0.01, decay),
+        torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay),
+    )
     for _ in range(20):
         for one, two in zip(own.parameters(), other.parameters(), strict=True):
             one.grad = torch.randn(one.shape, generator=generator, dtype=one.dtype)
@@ -162,7 +217,14 @@ def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
     """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
-    phase = Phase("clip", PhaseSettings(clip=3.0, max_epochs=1), line, lambda _: [0], lambda _: (line.weight * gradient).sum(), lambda: 0.0)
+    phase = Phase(
+        "clip",
+        PhaseSettings(clip=3.0, max_epochs=1),
+        line,
+        lambda _: [0],
+        lambda _: (line.weight * gradient).sum(),
+        lambda: 0.0,
+    )
     seen = []
     step = Adam.step
 
@@ -183,7 +245,11 @@ def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Adam, "step", watched)
-        train_phases([_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")], 0, FitContext())
+        train_phases(
+            [_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")],
+            0,
+            FitContext(),
+        )
     expected = [0.1 * (1 + math.cos(math.pi * epoch / 4)) for epoch in range(4) for _ in range(3)]
     assert rates == pytest.approx(expected)
 
@@ -199,7 +265,9 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
         good = (network(batch[0]) - batch[1]).square().mean()
         if calls != 2:
             return good
-        return good * math.nan if where == "loss" else good + torch.sqrt(network[2].bias.sum() * 0.0)
+        return (
+            good * math.nan if where == "loss" else good + torch.sqrt(network[2].bias.sum() * 0.0)
+        )
 
     (record,) = train_phases([_phase(network, loss=loss, max_epochs=1)], 0, FitContext())
     assert record.skipped_steps == 1
@@ -210,15 +278,22 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
 
 def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     network = _network()
-    phase = _phase(network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf)
-    with pytest.raises(DataError, match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate"):
+    phase = _phase(
+        network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf
+    )
+    with pytest.raises(
+        DataError,
+        match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate",
+    ):
         train_phases([phase], 0, FitContext())
     network, calls = _network(), 0
 
     def loss(batch):
         nonlocal calls
         calls += 1
-        return (network(batch[0]) - batch[1]).square().mean() * (1.0 if calls % 3 == 0 else math.nan)
+        return (network(batch[0]) - batch[1]).square().mean() * (
+            1.0 if calls % 3 == 0 else math.nan
+        )
 
     (record,) = train_phases([_phase(network, loss=loss)], 0, FitContext())
     assert record.skipped_steps == 24, "two of three in twelve epochs"
@@ -233,14 +308,24 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     assert records[-1].epochs == 4
     checkpoint = load_checkpoint(tmp_path)
     assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
-    assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
+    assert math.isclose(
+        records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6
+    )
 
 
 def test_phases_that_make_no_sense_are_refused():
     network = _network()
-    assert "different names" in refusal(lambda: train_phases([_phase(network), _phase(network)], 0, FitContext()), ConfigurationError)
+    assert "different names" in refusal(
+        lambda: train_phases([_phase(network), _phase(network)], 0, FitContext()),
+        ConfigurationError,
+    )
     with pytest.raises(ConfigurationError, match="no parameters to learn"):
         train_phases([_phase(network, trainable=lambda name: False)], 0, FitContext())
-    for settings in ({"learning_rate": 0.0}, {"validate_every": 0}, {"clip": -1.0}, {"schedule": "linear"}):
+    for settings in (
+        {"learning_rate": 0.0},
+        {"validate_every": 0},
+        {"clip": -1.0},
+        {"schedule": "linear"},
+    ):
         with pytest.raises(ConfigurationError, match=next(iter(settings))):
             settings_from_config(PhaseSettings, settings, "training.phase")

@@ -25,7 +25,9 @@ def measured_drive(seed=0, seconds=120.0):
     channels["ax"] -= drive["vy_ref"] * drive["yaw_rate_ref"]
     side = {name: HALF_TRACK if name.endswith("r") else -HALF_TRACK for name in WHEELS}
     for name in WHEELS:
-        channels[name] = (channels["vx"] + side[name] * channels["yaw_rate"]) / RADIUS + WHEEL_NOISE * generator.standard_normal(len(drive))
+        channels[name] = (
+            channels["vx"] + side[name] * channels["yaw_rate"]
+        ) / RADIUS + WHEEL_NOISE * generator.standard_normal(len(drive))
     for name, level in ADDED.items():
         channels[name] = channels[name] + level * generator.standard_normal(len(drive))
     return replace(drive, channels=channels)

@@ -30,7 +30,13 @@ from vehest.trust.bands import (
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
-ORIGIN = {"vehicles": ("my car",), "datasets": ("mine",), "scaled_on": ("one (all)",), "calibrated_on": ("two (all)",), "horizon_steps": 0}
+ORIGIN = {
+    "vehicles": ("my car",),
+    "datasets": ("mine",),
+    "scaled_on": ("one (all)",),
+    "calibrated_on": ("two (all)",),
+    "horizon_steps": 0,
+}
 
 
 def piece_of(rng, n, deviation=0.1, variance=math.nan):
@@ -41,18 +47,27 @@ def piece_of(rng, n, deviation=0.1, variance=math.nan):
     error = sigma * (shared + rng.standard_normal(n)) / math.sqrt(2.0)
     time = np.arange(n) / 20.0
     return Piece(
-        rows, rng.standard_normal(n), np.full(n, variance), np.stack([error, error / rows[:, 1]], 1), 0.3 * np.sin(0.5 * time), 20.0
+        rows,
+        rng.standard_normal(n),
+        np.full(n, variance),
+        np.stack([error, error / rows[:, 1]], 1),
+        0.3 * np.sin(0.5 * time),
+        20.0,
     )
 
 
 def bands_of(seed=0, **changes):
     rng = np.random.default_rng(seed)
-    return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN)
+    return calibrated(
+        [piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN
+    )
 
 
 def test_scale_follows_a_planted_growth_with_acceleration_and_that_of_a_filter_its_variance_and_a_floor():
     rng = np.random.default_rng(1)
-    terms = np.stack([np.ones(200_000), 3.0 * rng.standard_normal(200_000), rng.standard_normal(200_000)], axis=1)
+    terms = np.stack(
+        [np.ones(200_000), 3.0 * rng.standard_normal(200_000), rng.standard_normal(200_000)], axis=1
+    )
     errors = np.sqrt(0.04 + 0.01 * terms[:, 1] ** 2) * rng.standard_normal(200_000)
     weights, floor = fitted_scale(terms, errors)
     assert weights == pytest.approx([0.04, 0.01, 0.0], abs=1e-3)
@@ -89,7 +104,10 @@ def test_each_block_counts_once_and_blocks_that_say_nothing_as_their_samples():
     assert pooled_quantile(scores, np.arange(1008), 0.003)[0] == 4.0
     scores = np.random.default_rng(5).permutation(np.arange(1.0, 1001.0))
     assert pooled_quantile(scores, np.arange(1000) // 100, 0.9)[0] == pytest.approx(901.0, abs=3.0)
-    scores, blocks = np.repeat(np.arange(1.0, 6.0), 2), np.arange(10) // 2  # K = 5, alike within: levels up to 5/6
+    scores, blocks = (
+        np.repeat(np.arange(1.0, 6.0), 2),
+        np.arange(10) // 2,
+    )  # K = 5, alike within: levels up to 5/6
     assert pooled_quantile(scores, blocks, 0.9) == (pytest.approx(5.0 * 1.2), True)
     assert pooled_quantile(scores, blocks, 0.68)[1] is False
 
@@ -102,14 +120,19 @@ def test_coverage_of_a_further_block_averages_the_level():
         sizes = rng.integers(5, 60, 13)
         blocks = np.repeat(np.arange(13), sizes)
         scores = np.abs(
-            np.exp(0.7 * rng.standard_normal(13))[blocks] * (rng.standard_normal(13)[blocks] + rng.standard_normal(len(blocks)))
+            np.exp(0.7 * rng.standard_normal(13))[blocks]
+            * (rng.standard_normal(13)[blocks] + rng.standard_normal(len(blocks)))
         )
         seen = blocks < 12
         for level, own in covered.items():
-            own[draw] = np.mean(scores[~seen] <= pooled_quantile(scores[seen], blocks[seen], level)[0])
+            own[draw] = np.mean(
+                scores[~seen] <= pooled_quantile(scores[seen], blocks[seen], level)[0]
+            )
     for level, own in covered.items():
         error = own.std() / math.sqrt(len(own))
-        assert level - 3.0 * error <= own.mean() <= level + 0.02  # with all weight of K at infinity it would be up to 1/13 more
+        assert (
+            level - 3.0 * error <= own.mean() <= level + 0.02
+        )  # with all weight of K at infinity it would be up to 1/13 more
 
 
 def by_numpy(bands, rows, vy, variance, *, elsewhere):
@@ -118,9 +141,14 @@ def by_numpy(bands, rows, vy, variance, *, elsewhere):
     largest = np.array([bands.largest.get(name, 0.0) for name in TERMS])
     terms = np.where(np.isfinite(terms), terms, largest)
     features = np.array([name not in ("variance", "one") for name in TERMS]) & (largest > 0)
-    wider = np.maximum((np.abs(terms[:, features]) / largest[features]).max(axis=1), 1.0) * (OTHER_VEHICLE if elsewhere else 1.0)
+    wider = np.maximum((np.abs(terms[:, features]) / largest[features]).max(axis=1), 1.0) * (
+        OTHER_VEHICLE if elsewhere else 1.0
+    )
     half = []
-    for own, feature in ((bands.vy, terms), (bands.sideslip, terms / np.maximum(np.abs(rows[:, [1]]), LOWEST_SPEED))):
+    for own, feature in (
+        (bands.vy, terms),
+        (bands.sideslip, terms / np.maximum(np.abs(rows[:, [1]]), LOWEST_SPEED)),
+    ):
         weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
         scale = np.sqrt(np.maximum(np.square(feature) @ weights, own.floor**2))
         half.append(scale * wider * own.factors[LEVELS.index(SHOWN_LEVEL)])
@@ -137,7 +165,9 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
     rows[10, 0], rows[20, 1], vy[30], spread[40] = np.nan, np.nan, np.nan, -1.0
     rows[50, 1] = 0.0
     found = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
-    np.testing.assert_allclose(found, by_numpy(bands, rows, vy, spread, elsewhere=elsewhere), rtol=1e-13, equal_nan=True)
+    np.testing.assert_allclose(
+        found, by_numpy(bands, rows, vy, spread, elsewhere=elsewhere), rtol=1e-13, equal_nan=True
+    )
 
 
 def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are():
@@ -145,7 +175,14 @@ def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are(
     together, one = np.empty((50, 2)), np.empty((1, 2))
     band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
     for k in range(50):
-        band_rows(own.rows[k : k + 1], own.vy[k : k + 1], own.variance[k : k + 1], packed.columns, packed.numbers, one)
+        band_rows(
+            own.rows[k : k + 1],
+            own.vy[k : k + 1],
+            own.variance[k : k + 1],
+            packed.columns,
+            packed.numbers,
+            one,
+        )
         assert np.array_equal(one[0], together[k])
     bands, own = bands_of(), piece_of(np.random.default_rng(8), 20)
     rows, vy = own.rows.copy(), own.vy.copy()
@@ -163,7 +200,9 @@ def test_bands_widen_with_the_excess_over_training_and_where_nothing_was_measure
     rows[1, 2] = 1.7 * bands.largest["ay"]
     inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
     assert outside / inside == pytest.approx(1.7)
-    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0] == pytest.approx(OTHER_VEHICLE * inside)
+    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[
+        0, 0
+    ] == pytest.approx(OTHER_VEHICLE * inside)
     rows = np.tile([0.0, 25.0, bands.largest["ay"], 0.0, 0.0], (2, 1))
     rows[1, 2] = np.nan
     half = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))
@@ -171,13 +210,17 @@ def test_bands_widen_with_the_excess_over_training_and_where_nothing_was_measure
 
 
 def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewhere():
-    yaw_rate = 0.3 * np.sin(2.0 * math.pi * np.arange(400) / 100.0)  # 20 s at 20 Hz, a turn each 2.5 s
+    yaw_rate = 0.3 * np.sin(
+        2.0 * math.pi * np.arange(400) / 100.0
+    )  # 20 s at 20 Hz, a turn each 2.5 s
     labels, kind = block_labels([yaw_rate] * 10, [400] * 10, 20.0)
     assert kind == "range"
     assert [own[0] for own in labels] == list(range(10))
     labels, kind = block_labels([yaw_rate, None], [400, 50], 20.0)
     assert kind == "turn"
-    assert len(np.unique(labels[0])) == 8  # turns start at 0.13, 2.63 … s; that at 0.13 s comes too soon after the range's start
+    assert (
+        len(np.unique(labels[0])) == 8
+    )  # turns start at 0.13, 2.63 … s; that at 0.13 s comes too soon after the range's start
     assert np.unique(labels[1]).tolist() == [8]
     yaw_rate = np.zeros(200)
     yaw_rate[[50, 60, 70, 100, 190]] = 0.1
@@ -187,25 +230,35 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewher
 
 def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
     bands = bands_of()
-    assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (("my car",), ("mine",), ("two (all)",))
+    assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (
+        ("my car",),
+        ("mine",),
+        ("two (all)",),
+    )
     assert bands.blocks == "turn"
     assert bands.n_blocks == 32  # 200 s, a turn each 2π s
     assert 1.0 < bands.vy.effective_blocks <= bands.n_blocks
     assert bands.seconds == 200.0
     rng = np.random.default_rng(9)
     blind = replace(piece_of(rng, 100), errors=np.full((100, 2), np.nan))
-    assert "no sample of the validation ranges" in refusal(lambda: calibrated([piece_of(rng, 100)], [blind], CHANNELS, **ORIGIN))
+    assert "no sample of the validation ranges" in refusal(
+        lambda: calibrated([piece_of(rng, 100)], [blind], CHANNELS, **ORIGIN)
+    )
 
 
 def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
     rng, n = np.random.default_rng(10), 100
     own = piece_of(rng, n)
     measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, own.rows.T, strict=True)))
-    estimate = Estimate("lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])})
+    estimate = Estimate(
+        "lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])}
+    )
     ahead = replace(bands_of(), horizon_steps=1)
     found = with_bands(estimate, measured, ahead)
     expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])
-    np.testing.assert_allclose(np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13)
+    np.testing.assert_allclose(
+        np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13
+    )
     rows, _, variance = band_inputs(estimate, measured, CHANNELS, 0)
     assert np.array_equal(rows, own.rows)
     assert np.isnan(variance).all()

@@ -52,7 +52,10 @@ def hostile_columns(estimator, drive, seed):
 def online(estimator, samples):
     stepper = GuardedStepper(estimator)
     steps = len(next(iter(samples.values())))
-    vy = [stepper.step({name: values[k] for name, values in samples.items()})["vy"] for k in range(steps)]
+    vy = [
+        stepper.step({name: values[k] for name, values in samples.items()})["vy"]
+        for k in range(steps)
+    ]
     return np.concatenate([np.full(estimator.horizon_steps, np.nan), vy])[:steps]
 
 
@@ -67,7 +70,9 @@ def test_a_drive_without_faults_is_estimated_as_without_the_contract(name):
 
 @pytest.mark.parametrize("name", estimator_names())
 @pytest.mark.parametrize("seed", range(2))
-def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_online_as_in_batch(name, seed):
+def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_online_as_in_batch(
+    name, seed
+):
     estimator = ready(name)
     drive = short_drive(estimator)
     samples = hostile_columns(estimator, drive, seed)
@@ -76,10 +81,14 @@ def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_o
     np.testing.assert_allclose(batch["vy"], one_by_one, rtol=0.0, atol=1e-9)
     after = estimator.warm_up_steps + estimator.horizon_steps
     assert np.isfinite(one_by_one[after:]).all()
-    assert "vx" not in drive or np.abs(one_by_one[after:]).max() <= max(np.abs(drive["vx"]).max(), 1.0)
+    assert "vx" not in drive or np.abs(one_by_one[after:]).max() <= max(
+        np.abs(drive["vx"]).max(), 1.0
+    )
 
 
-@pytest.mark.parametrize("name", [name for name in estimator_names() if not name.startswith("learned_ukf")])
+@pytest.mark.parametrize(
+    "name", [name for name in estimator_names() if not name.startswith("learned_ukf")]
+)
 def test_one_bad_sample_does_no_lasting_harm(name):
     estimator = ready(name)
     drive = short_drive(estimator)
@@ -87,7 +96,10 @@ def test_one_bad_sample_does_no_lasting_harm(name):
     at, later = len(drive) // 3, len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
     values = HOSTILE[:-1]  # 0 is a value like any other
     channels = estimator.channels
-    for channel, value in {*((channels[0], value) for value in values), *zip(channels, cycle(values), strict=False)}:
+    for channel, value in {
+        *((channels[0], value) for value in values),
+        *zip(channels, cycle(values), strict=False),
+    }:
         samples = columns(estimator, drive)
         samples[channel][at] = value
         difference = np.abs(online(estimator, samples) - whole)
@@ -110,7 +122,14 @@ class Constant(Stepper):
 class Saying:
     """As much of an estimator as the wrapper asks of one."""
 
-    channels, skippable, causal, warm_up_steps, horizon_steps, name = ("yaw_rate", "vx", "ay"), (), True, 0, 0, "saying"
+    channels, skippable, causal, warm_up_steps, horizon_steps, name = (
+        ("yaw_rate", "vx", "ay"),
+        (),
+        True,
+        0,
+        0,
+        "saying",
+    )
 
     def __init__(self, says):
         self.says, self.begun = says, 0
@@ -139,7 +158,10 @@ def test_an_estimate_never_exceeds_what_the_speed_allows_and_a_lost_estimator_st
 
 def test_a_car_that_stands_has_no_sideslip_and_one_that_slides_across_has():
     stepper = GuardedStepper(Saying(lambda step: 0.05 if step < 5 else 0.2))
-    said = [stepper.step({"yaw_rate": 0.01 * k, "vx": 0.01 * k, "ay": 0.01 * k})["sideslip"] for k in range(10)]
+    said = [
+        stepper.step({"yaw_rate": 0.01 * k, "vx": 0.01 * k, "ay": 0.01 * k})["sideslip"]
+        for k in range(10)
+    ]
     assert said == [0.0] * 5 + [pytest.approx(math.atan2(0.2, 0.01 * k)) for k in range(5, 10)]
 
 
@@ -174,7 +196,14 @@ def test_none_missing_channels_and_words_count_as_not_measured_and_repeated_samp
     estimator = Saying(float)
     stepper = GuardedStepper(estimator)
     times = [0.0, 0.05, 0.05, 0.1, 0.3, 0.35]
-    assert [stepper.step(moving(k), time)["vy"] for k, time in enumerate(times)] == [0.0, 1.0, 1.0, 2.0, 6.0, 7.0]
+    assert [stepper.step(moving(k), time)["vy"] for k, time in enumerate(times)] == [
+        0.0,
+        1.0,
+        1.0,
+        2.0,
+        6.0,
+        7.0,
+    ]
     assert stepper.step(moving(6), 10.0)["vy"] == 0.0  # starts anew after a gap of 10 s
     assert estimator.begun == 2
 
@@ -199,11 +228,16 @@ def test_a_clock_at_another_rate_and_the_delay_of_the_filter_are_said_and_a_slow
         warnings.simplefilter("always")
         for k in range(60):
             stepper.step(moving(k), 0.1 * k)
-    assert [str(warning.message) for warning in said] == ["samples come at 10 Hz instead of 20 Hz; set bus_rate_hz=10"]
+    assert [str(warning.message) for warning in said] == [
+        "samples come at 10 Hz instead of 20 Hz; set bus_rate_hz=10"
+    ]
     assert GuardedStepper(ready("ksnn"), bus_rate_hz=100.0).delay == pytest.approx(0.0509, abs=1e-3)
     assert GuardedStepper(ready("ksnn")).delay == 0.0
     for rate in (10.0, 0.0):
-        with pytest.raises(ConfigurationError, match=f"samples at {rate:g} Hz are too slow for an estimator that works at 20 Hz"):
+        with pytest.raises(
+            ConfigurationError,
+            match=f"samples at {rate:g} Hz are too slow for an estimator that works at 20 Hz",
+        ):
             GuardedStepper(ready("ksnn"), bus_rate_hz=rate)
 
 
@@ -217,7 +251,9 @@ def test_a_spinning_car_may_slide_as_fast_as_it_drove_and_is_marked():
     assert not (said.marks[26:36] & CLIPPED).any()
     calm = Watch(usual_limits(("vx", "yaw_rate", "ay"), 20.0), 0, 20.0)
     slow = np.tile([3.0, 0.2, 0.6], (20, 1))
-    assert calm(np.full(26, 15.0), np.concatenate([drive, slow]), np.zeros(40, np.int8)).vy[20] == 3.0
+    assert (
+        calm(np.full(26, 15.0), np.concatenate([drive, slow]), np.zeros(40, np.int8)).vy[20] == 3.0
+    )
 
 
 def test_offline_estimators_and_missing_channels_are_refused():
@@ -241,7 +277,9 @@ def test_front_end_filters_as_scipy_does_and_passes_on_at_the_estimators_rate():
     expected, _ = signal.sosfilt(sections, samples, zi=state)
     np.testing.assert_allclose(rows, expected[::10], rtol=0.0, atol=1e-12)
     late = np.sin(2 * np.pi * 0.7 * (time[::10] - front.delay))
-    assert np.sqrt(np.mean((rows - late)[20:] ** 2)) < 0.02  # the signal comes late by the stated delay, the noise is gone
+    assert (
+        np.sqrt(np.mean((rows - late)[20:] ** 2)) < 0.02
+    )  # the signal comes late by the stated delay, the noise is gone
 
 
 def test_front_end_keeps_uneven_rates_and_starts_anew_after_a_gap():

@@ -55,15 +55,26 @@ def test_offsets_are_physical_of_either_sign_and_the_same_again(samples):
         assert np.abs(after - before) == pytest.approx(size)
         assert np.ptp(after - before) == pytest.approx(0.0, abs=1e-12)
     angles = {"yaw_rate": 10.0, "steer": 6.0, "handwheel": 90.0, "roll": 6.0}
-    for channel, severe in {**{name: math.radians(degrees) for name, degrees in angles.items()}, "vx": 5.0}.items():
+    for channel, severe in {
+        **{name: math.radians(degrees) for name, degrees in angles.items()},
+        "vx": 5.0,
+    }.items():
         assert size_of("bias", channel, "severe") == pytest.approx(severe), channel
-    assert size_of("bias", "brake_pressure_front", "medium") == pytest.approx(0.05 * CHANNELS["brake_pressure_front"].high)
+    assert size_of("bias", "brake_pressure_front", "medium") == pytest.approx(
+        0.05 * CHANNELS["brake_pressure_front"].high
+    )
     before, after = faulted(samples, "bias", "wheel_speed_fl", "mild")
     assert np.abs(after - before) == pytest.approx(0.02 * samples["wheel_speed_fl"].max())
-    signs = {np.sign(np.subtract(*faulted(samples, "bias", "ay", seed=seed)[::-1])[0]) for seed in range(20)}
+    signs = {
+        np.sign(np.subtract(*faulted(samples, "bias", "ay", seed=seed)[::-1])[0])
+        for seed in range(20)
+    }
     assert signs == {-1.0, 1.0}
     for kind in KINDS:
-        one, other = (faulted(samples, kind, "vx" if kind == "lost_wheel" else "ay", seed=5)[1] for _ in range(2))
+        one, other = (
+            faulted(samples, kind, "vx" if kind == "lost_wheel" else "ay", seed=5)[1]
+            for _ in range(2)
+        )
         np.testing.assert_array_equal(one, other, err_msg=kind)
 
 
@@ -119,7 +130,9 @@ def test_frozen_and_lost_samples_are_as_many_as_the_severity_says(samples):
 def test_noise_has_the_standard_deviation_that_it_says_short_faults_strike_and_gaps_stay(samples):
     long = {"ay": np.zeros(40_000)}
     noise = inject(long, RATE, Fault("noise", "ay", "medium"))["ay"]
-    assert noise.std() == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * len(noise))), "within four standard errors"
+    assert noise.std() == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * len(noise))), (
+        "within four standard errors"
+    )
     assert abs(noise[1:] @ noise[:-1]) / len(noise) < 4.0 / math.sqrt(len(noise)), "white"
     made = inject(samples, RATE, Fault("inf", "ay", "mild", ONSET, 1.0 / RATE))["ay"]
     assert np.flatnonzero(~np.isfinite(made)).tolist() == [FIRST]
@@ -145,7 +158,9 @@ def test_a_wrong_unit_is_its_factor(samples, channel, severity, factor):
 
 def test_a_lost_wheel_drops_out_spins_or_locks(samples):
     before = samples["wheel_speed_fl"][FIRST:END]
-    gone, spinning, locked = (faulted(samples, "lost_wheel", "wheel_speed_fl", severity)[1] for severity in SEVERITIES)
+    gone, spinning, locked = (
+        faulted(samples, "lost_wheel", "wheel_speed_fl", severity)[1] for severity in SEVERITIES
+    )
     assert np.isnan(gone).all()
     assert spinning[4:] == pytest.approx(1.5 * before[4:])
     assert locked[4:] == pytest.approx(0.0)
@@ -153,11 +168,18 @@ def test_a_lost_wheel_drops_out_spins_or_locks(samples):
 
 
 def test_a_fault_lasts_from_its_onset_on_and_every_kind_is_for_some_channel_and_none_for_a_reference():
-    for onset, duration, found in ((0.0, math.inf, (0, 600)), (10.0, 8.0, (200, 360)), (29.9, 5.0, (598, 600)), (40.0, 5.0, (600, 600))):
+    for onset, duration, found in (
+        (0.0, math.inf, (0, 600)),
+        (10.0, 8.0, (200, 360)),
+        (29.9, 5.0, (598, 600)),
+        (40.0, 5.0, (600, 600)),
+    ):
         assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
     for kind in KINDS:
         assert any(applies(kind, channel) for channel in CHANNELS), kind
-        assert not any(applies(kind, channel) for channel, own in CHANNELS.items() if own.is_reference)
+        assert not any(
+            applies(kind, channel) for channel, own in CHANNELS.items() if own.is_reference
+        )
     tried = ("vx", "wheel_speed_rr", "ay", "yaw_rate", "brake_pressure_rear")
     assert [channel for channel in tried if applies("sign", channel)] == ["ay", "yaw_rate"]
 
@@ -167,7 +189,10 @@ def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
     assert Fault("bias", "ay", size=-0.25, seed=2).condition == "bias:ay:-0.25:2"
     assert is_fault(Fault("nan", "vx").condition)
     assert not is_fault("nominal")
-    with pytest.raises(ConfigurationError, match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate",
+    ):
         inject(samples, RATE, Fault("bias", "handwheel", "mild"))
 
 
@@ -181,7 +206,10 @@ def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
         (("sign", "vx"), "a fault 'sign' makes no sense for channel 'vx'; it is for yaw_rate, ax"),
         (("lost_wheel", "ay"), "it is for vx, wheel_speed_fl"),
         (("bias", "ay", "mild", 0.0, 0.0), "fault.duration must be positive"),
-        (("bias", "ay", "mild", 0.0, 1.0, 0, 0.0), "fault.size of a fault 'bias' must be a number other than 0"),
+        (
+            ("bias", "ay", "mild", 0.0, 1.0, 0, 0.0),
+            "fault.size of a fault 'bias' must be a number other than 0",
+        ),
         (("nan", "ay", "mild", 0.0, 1.0, 0, 1.5), "must be a share above 0, up to 1, not 1.5"),
     ],
 )
@@ -196,9 +224,13 @@ def cells(start):
     return [cell.strip() for cell in row.strip("|").split("|")]
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"bias", "drift", "spikes", "noise", "unit", "lost_wheel", "huge"}))
+@pytest.mark.parametrize(
+    "kind", sorted(set(KINDS) - {"bias", "drift", "spikes", "noise", "unit", "lost_wheel", "huge"})
+)
 def test_the_page_states_the_sizes_of_a_kind(kind):
-    assert [float(cell) for cell in cells(f"`{kind}`")[-3:]] == [size_of(kind, "ay", severity) for severity in SEVERITIES]
+    assert [float(cell) for cell in cells(f"`{kind}`")[-3:]] == [
+        size_of(kind, "ay", severity) for severity in SEVERITIES
+    ]
 
 
 @pytest.mark.parametrize(
@@ -215,4 +247,6 @@ def test_the_page_states_the_sizes_of_a_kind(kind):
 )
 def test_the_page_states_the_offsets_of_a_channel(row, channel, scale):
     stated = [float(cell.split()[0]) for cell in cells(row)[-3:]]
-    assert stated == pytest.approx([scale * size_of("bias", channel, severity) for severity in SEVERITIES])
+    assert stated == pytest.approx(
+        [scale * size_of("bias", channel, severity) for severity in SEVERITIES]
+    )

@@ -7,7 +7,16 @@ import pytest
 
 from conftest import planar_drive
 from vehest.data.recording import Recording
-from vehest.trust.guard import RESTART, USE, WAIT, ChannelLimits, Guard, GuardLimits, learn_limits, usual_limits
+from vehest.trust.guard import (
+    RESTART,
+    USE,
+    WAIT,
+    ChannelLimits,
+    Guard,
+    GuardLimits,
+    learn_limits,
+    usual_limits,
+)
 
 CHANNELS = ("yaw_rate", "vx", "ay", "ax")
 RATE = 20.0
@@ -111,7 +120,10 @@ def test_limits_are_never_tighter_than_what_a_car_reaches(drive):
     for name, own in limits.channels.items():
         assert own.low <= usual.channels[name].low
         assert own.high >= usual.channels[name].high
-        assert own.jump >= usual.channels[name].jump - {"vx": 2.0, "yaw_rate": 0.5}.get(name, 6.0) - 1e-12
+        assert (
+            own.jump
+            >= usual.channels[name].jump - {"vx": 2.0, "yaw_rate": 0.5}.get(name, 6.0) - 1e-12
+        )
 
 
 def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
@@ -119,11 +131,17 @@ def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
     rows = rows_of(drive)
     for _ in range(60):
         k, c = generator.integers(0, len(rows)), generator.integers(0, 4)
-        rows[k : k + generator.integers(1, 30), c] = generator.choice([math.nan, math.inf, 0.0, 1e6, 3.0])
+        rows[k : k + generator.integers(1, 30), c] = generator.choice(
+            [math.nan, math.inf, 0.0, 1e6, 3.0]
+        )
     limits = GuardLimits({"ay": ChannelLimits(-20.0, 20.0, 2.0, 0.2)})
     at_once, one_by_one = guard(("ay",), limits), guard(("ay",), limits)
     together, parts = at_once(rows), [one_by_one(rows[k : k + 1]) for k in range(len(rows))]
     for name in ("rows", "measured", "flow"):
-        assert np.array_equal(getattr(together, name), np.concatenate([getattr(part, name) for part in parts]), equal_nan=name == "rows")
+        assert np.array_equal(
+            getattr(together, name),
+            np.concatenate([getattr(part, name) for part in parts]),
+            equal_nan=name == "rows",
+        )
     assert (together.flow == WAIT).any()
     assert not together.measured.all()

@@ -120,14 +120,25 @@ def sliding(seed, slide=0.0):
     return replace(drive, channels={**drive.channels, "ax": ax, "ay": ay})
 
 
-@pytest.mark.parametrize(("channels", "accused"), [(("yaw_rate", "vx", "ay", "ax"), False), (("yaw_rate", "vx", "ax"), True)])
-def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(channels, accused):
+@pytest.mark.parametrize(
+    ("channels", "accused"),
+    [(("yaw_rate", "vx", "ay", "ax"), False), (("yaw_rate", "vx", "ax"), True)],
+)
+def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(
+    channels, accused
+):
     """v r of a slide of 3 m/s is in ax. It is known from ay; without ay it has to go with r², which it does in grip alone."""
     model = learn_health([sliding(0), sliding(1)], [sliding(2)], channels, RATE)
     rows = np.ascontiguousarray(sliding(3, 3.0).stack(channels))
     statistics = np.empty((len(rows), len(model.statistics)))
-    kernel.health_kernel(rows, np.isfinite(rows), model.packed(), model.start(), np.empty((3, len(rows))), statistics)
-    at = [k for k, one in enumerate(model.statistics) if (one.kind, one.channel) == (kernel.CONTRADICTION, "ax")]
+    kernel.health_kernel(
+        rows, np.isfinite(rows), model.packed(), model.start(), np.empty((3, len(rows))), statistics
+    )
+    at = [
+        k
+        for k, one in enumerate(model.statistics)
+        if (one.kind, one.channel) == (kernel.CONTRADICTION, "ax")
+    ]
     assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
 
 
@@ -138,8 +149,15 @@ def test_noise_jumps_and_lost_channels_are_told():
     assert found.status[ONSET + round(0.6 * RATE)] == INVALID
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
     drive, generator = measured_drive(3), np.random.default_rng(0)
-    noisy = judged(model_of(), drive, ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))))
-    assert reason_in_words(noisy.reason[ONSET + round(RATE)]) == "ax jumps, or is noisier than where the model learnt"
+    noisy = judged(
+        model_of(),
+        drive,
+        ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))),
+    )
+    assert (
+        reason_in_words(noisy.reason[ONSET + round(RATE)])
+        == "ax jumps, or is noisier than where the model learnt"
+    )
     spiky = np.array(drive["steer"])
     spiky[ONSET] += 0.1
     assert judged(model_of(), drive, steer=spiky).status[ONSET] > VALID
@@ -164,22 +182,30 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
     rows[2600] = np.inf
     measured, packed = np.isfinite(rows), model.packed()
     whole, state = health_rows(packed, rows, measured, model.start()), model.start()
-    single = [health_rows(packed, rows[k : k + 1], measured[k : k + 1], state) for k in range(len(rows))]
+    single = [
+        health_rows(packed, rows[k : k + 1], measured[k : k + 1], state) for k in range(len(rows))
+    ]
     for name in Health._fields:
-        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in single]), getattr(whole, name))
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(part, name) for part in single]), getattr(whole, name)
+        )
     assert np.isfinite(whole.ratio).all()
 
 
 def test_without_compilation_health_is_the_same(tmp_path):
     """As under a debugger; 6 s of a drive with a fault."""
     model, drive = model_of(), measured_drive(3)
-    rows = np.ascontiguousarray(np.stack([np.asarray(drive[name]) for name in model.channels], axis=1)[:300])
+    rows = np.ascontiguousarray(
+        np.stack([np.asarray(drive[name]) for name in model.channels], axis=1)[:300]
+    )
     rows[200:, 0] += 0.5
     measured, file = np.isfinite(rows), tmp_path / "health.npz"
     compiled = health_rows(model.packed(), rows, measured, model.start())
     np.savez(file, tables=model.packed(), rows=rows, measured=measured, start=model.start())
     program = "import sys, numpy as np; from vehest.trust.health import health_rows; own = np.load(sys.argv[1])\n"
-    program += "found = health_rows(own['tables'], own['rows'], own['measured'], own['start'].copy())\n"
+    program += (
+        "found = health_rows(own['tables'], own['rows'], own['measured'], own['start'].copy())\n"
+    )
     program += "np.savez(sys.argv[1], status=found.status, reason=found.reason)"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", program, str(file)], env=environment, check=True)
@@ -203,10 +229,15 @@ def test_senseless_values_leave_nothing_behind():
 
 
 def test_a_channel_that_never_moved_in_training_is_watched_and_a_glitch_of_the_recording_no_limit():
-    drives = [replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))}) for drive in map(measured_drive, range(4))]
+    drives = [
+        replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))})
+        for drive in map(measured_drive, range(4))
+    ]
     model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
     assert not judged(model, drives[3]).status.any()
-    assert (judged(model, drives[3], steer=after(drives[3]["steer"], 0.01)).status[ONSET:] > VALID).any()
+    assert (
+        judged(model, drives[3], steer=after(drives[3]["steer"], 0.01)).status[ONSET:] > VALID
+    ).any()
     drive = measured_drive(0)
     steer = np.array(drive["steer"])
     steer[1234] += 0.2
@@ -220,7 +251,11 @@ def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
     drives = [small_car_drive(60.0, seed) for seed in range(4)]
     model = learn_health(drives[:2], drives[2:3], channels, 100.0)
     assert np.mean(judged(model, drives[3]).status == VALID) > 0.99
-    for channel, change in (("yaw_rate", np.negative), ("ay", lambda part: part / 9.81), ("motor_speed", lambda part: part[0])):
+    for channel, change in (
+        ("yaw_rate", np.negative),
+        ("ay", lambda part: part / 9.81),
+        ("motor_speed", lambda part: part[0]),
+    ):
         found = judged(model, drives[3], **{channel: after(drives[3][channel], change)})
         assert (found.status[ONSET : ONSET + 100] > VALID).any(), channel
 
@@ -236,7 +271,9 @@ def test_a_locked_wheel_is_told_from_a_lost_one(braking):
         faulty["vx"] = after(drive["vx"], lambda part: part - slowing)
         for name in WHEELS[1:]:
             faulty[name] = after(drive[name], lambda part: part - slowing / 0.3)
-        faulty["wheel_speed_fl"] = after(drive["wheel_speed_fl"], lambda part: (part - slowing / 0.3) * slows)
+        faulty["wheel_speed_fl"] = after(
+            drive["wheel_speed_fl"], lambda part: (part - slowing / 0.3) * slows
+        )
     found = judged(model, drive, **faulty)
     words = reason_in_words(found.reason[ONSET + round(0.5 * RATE)])
     assert words == ("locked wheel: wheel_speed_fl" if braking else "lost wheel: wheel_speed_fl")
@@ -247,11 +284,17 @@ def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_an
     fast = {name: np.array(drive[name]) for name in CHANNELS}
     assert domain_verdict(model, outside_domain(model, fast)) == ""
     fast["ay"][: len(drive) // 4] = 50.0
-    assert domain_verdict(model, outside_domain(model, fast)).startswith("25 % of the drive outside what the model learnt: |ay| above ")
+    assert domain_verdict(model, outside_domain(model, fast)).startswith(
+        "25 % of the drive outside what the model learnt: |ay| above "
+    )
     model = model_of()
-    read = validated(HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'")
+    read = validated(
+        HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'"
+    )
     np.testing.assert_array_equal(read.packed(), model.packed())
-    assert "is sampled at 50 Hz, health is learnt at 20 Hz" in refusal(lambda: learn_health([measured_drive(0)], [], CHANNELS, 20.0))
+    assert "is sampled at 50 Hz, health is learnt at 20 Hz" in refusal(
+        lambda: learn_health([measured_drive(0)], [], CHANNELS, 20.0)
+    )
 
 
 def plain(value):
@@ -265,7 +308,9 @@ def ferrari(data_root, start, stop):
     return real_drive(data_root).cut(start, stop).without_references()
 
 
-def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(data_root):
+def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(
+    data_root,
+):
     train, validation = ferrari(data_root, 150.0, 450.0), ferrari(data_root, 450.0, 550.0)
     model = learn_health([train], [validation], CHANNELS, 100.0)
     found = judged(model, validation)
@@ -278,14 +323,23 @@ def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly
 
 
 def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root):
-    runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 3, 4, 0)]
+    runs = [
+        real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references()
+        for k in (1, 3, 4, 0)
+    ]
     channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
     model = learn_health(runs[:3], runs[3:], channels, 100.0)
     healthy = judged(model, runs[3])
-    outside = np.array([reason_kind(code) == kernel.OUTSIDE for code in healthy.reason])  # three runs hold less than all of ay
+    outside = np.array(
+        [reason_kind(code) == kernel.OUTSIDE for code in healthy.reason]
+    )  # three runs hold less than all of ay
     assert not healthy.status[~outside].any()
     first = len(runs[3]) // 3
-    for channel, change in (("yaw_rate", np.negative), ("ay", lambda part: part / 9.81), ("motor_speed", lambda part: part[0])):
+    for channel, change in (
+        ("yaw_rate", np.negative),
+        ("ay", lambda part: part / 9.81),
+        ("motor_speed", lambda part: part[0]),
+    ):
         changed = np.array(runs[3][channel])
         changed[first:] = change(changed[first:])
         found = judged(model, runs[3], **{channel: changed})
@@ -293,16 +347,30 @@ def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root):
 
 
 def test_a_steering_at_its_lock_is_not_frozen(data_root):
-    runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 2, 3, 4, 0)]
-    model = learn_health(runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0)
+    runs = [
+        real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references()
+        for k in (1, 2, 3, 4, 0)
+    ]
+    model = learn_health(
+        runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0
+    )
     assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=3e-3)
-    at_lock = real_drive(data_root, "hoons_all_test_run_21", "f1tenth").without_references()  # stays at full lock for 5 s
+    at_lock = real_drive(
+        data_root, "hoons_all_test_run_21", "f1tenth"
+    ).without_references()  # stays at full lock for 5 s
     found = judged(model, at_lock)
-    assert kernel.FROZEN not in {reason_kind(code) for code, status in zip(found.reason, found.status, strict=True) if status > VALID}
+    assert kernel.FROZEN not in {
+        reason_kind(code)
+        for code, status in zip(found.reason, found.status, strict=True)
+        if status > VALID
+    }
     half = np.array(at_lock["steer"])
     half[400:] = 0.2
     frozen = judged(model, at_lock, steer=half)
-    assert any(reason_kind(code) == kernel.FROZEN and reason_channel(code) == "steer" for code in frozen.reason[400:])
+    assert any(
+        reason_kind(code) == kernel.FROZEN and reason_channel(code) == "steer"
+        for code in frozen.reason[400:]
+    )
 
 
 def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged():
@@ -321,5 +389,7 @@ def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged():
     assert (found.status > VALID).mean() < 0.02
     frozen = rows.copy()
     frozen[len(rows) // 2 :, 0] = frozen[len(rows) // 2, 0]
-    flagged = health_rows(model.packed(behind_front_end=True), frozen, np.isfinite(frozen), model.start())
+    flagged = health_rows(
+        model.packed(behind_front_end=True), frozen, np.isfinite(frozen), model.start()
+    )
     assert (flagged.status[len(rows) // 2 + 20 :] > VALID).mean() > 0.9

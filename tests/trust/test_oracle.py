@@ -29,11 +29,19 @@ def test_the_planted_autoregression_is_found_with_its_order_whatever_outliers_do
     assert model.order == 2
     np.testing.assert_allclose(model.coefficients, COEFFICIENTS, atol=0.03)
     np.testing.assert_allclose(model.covariance, COVARIANCE, atol=0.03)
-    np.testing.assert_allclose(np.linalg.solve(np.eye(2) - model.coefficients.sum(0), model.constant), [3.0, -1.0], atol=0.4)
+    np.testing.assert_allclose(
+        np.linalg.solve(np.eye(2) - model.coefficients.sum(0), model.constant),
+        [3.0, -1.0],
+        atol=0.4,
+    )
     samples = planted(20_000)
     samples[[500, 7000, 12_000], 0] += 500.0
-    np.testing.assert_allclose(fit_autoregression([samples], max_order=4).coefficients[:2], COEFFICIENTS, atol=0.05)
-    assert "too few for an autoregression of order 10 in 2 channels" in refusal(lambda: fit_autoregression([planted(60)], max_order=10))
+    np.testing.assert_allclose(
+        fit_autoregression([samples], max_order=4).coefficients[:2], COEFFICIENTS, atol=0.05
+    )
+    assert "too few for an autoregression of order 10 in 2 channels" in refusal(
+        lambda: fit_autoregression([planted(60)], max_order=10)
+    )
 
 
 def test_innovations_move_by_what_the_filter_makes_of_a_signature():
@@ -41,18 +49,26 @@ def test_innovations_move_by_what_the_filter_makes_of_a_signature():
     healthy, signature = planted(300, seed=5), np.zeros((300, 2))
     signature[100:, 1] = np.linspace(0.0, 5.0, 200)
     moved = model.innovations(healthy + signature) - model.innovations(healthy)
-    np.testing.assert_allclose(moved[model.order :], filtered(model, signature)[model.order :], atol=1e-9)
+    np.testing.assert_allclose(
+        moved[model.order :], filtered(model, signature)[model.order :], atol=1e-9
+    )
     model = Autoregression(np.zeros(1), np.array([[[0.5]], [[0.1]]]), np.ones((1, 1)))
     found = model.innovations(np.arange(5.0)[:, None])[:, 0]
-    np.testing.assert_allclose(found[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2])
+    np.testing.assert_allclose(
+        found[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2]
+    )
     assert np.isnan(found[:2]).all()
 
 
 def test_noise_that_grows_with_the_speed_is_found():
     generator = np.random.default_rng(0)
     speed = generator.uniform(10.0, 50.0, 50_000)
-    levels = learn_noise_levels((speed / 30.0 * generator.standard_normal(50_000))[:, None], np.ones((1, 1)), speed, 5)
-    np.testing.assert_allclose(levels_at(levels, np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
+    levels = learn_noise_levels(
+        (speed / 30.0 * generator.standard_normal(50_000))[:, None], np.ones((1, 1)), speed, 5
+    )
+    np.testing.assert_allclose(
+        levels_at(levels, np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05
+    )
 
 
 def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
@@ -62,17 +78,31 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     power = float(signature[0] @ np.linalg.solve(covariance, signature[0]))
     test, delays = known_test(signature, covariance), []
     for _ in range(200):
-        above = np.cumsum(test(generator.multivariate_normal(np.zeros(2), covariance, 6000) + signature)) > 6.0
-        delays.append(int(np.flatnonzero(above)[0]) + 1)  # samples from the onset of a known fault to its alarm
+        above = (
+            np.cumsum(
+                test(generator.multivariate_normal(np.zeros(2), covariance, 6000) + signature)
+            )
+            > 6.0
+        )
+        delays.append(
+            int(np.flatnonzero(above)[0]) + 1
+        )  # samples from the onset of a known fault to its alarm
     found = np.array(delays, np.float64)
-    assert abs(found.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))) < 3.0 * found.std() / math.sqrt(len(found))
+    assert abs(
+        found.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))
+    ) < 3.0 * found.std() / math.sqrt(len(found))
 
 
 def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once():
-    oracle = learn_oracle([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
+    oracle = learn_oracle(
+        [measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE
+    )
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
-    seen = [oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000) for slope in (1e-4, 0.3, 1.0, 5.0)]
+    seen = [
+        oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000)
+        for slope in (1e-4, 0.3, 1.0, 5.0)
+    ]
     assert [each.visible for each in seen] == [False, True, True, True]
     assert seen[1].delay > seen[2].delay > seen[3].delay > 0.0
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}

@@ -25,8 +25,23 @@ def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, l
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
     statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
     statuses[first:last], reasons[first:last] = status, code(kind, channel)
-    rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
-    isolate_rows(statuses, reasons, NUMBERS_OF, SKIPPABLE, starts_anew, rollback, rows, measured, flow, np.zeros(2))
+    rows, measured, flow = (
+        np.ones((STEPS, 3)),
+        np.ones((STEPS, 3), np.bool_),
+        np.full(STEPS, USE, np.int8),
+    )
+    isolate_rows(
+        statuses,
+        reasons,
+        NUMBERS_OF,
+        SKIPPABLE,
+        starts_anew,
+        rollback,
+        rows,
+        measured,
+        flow,
+        np.zeros(2),
+    )
     return rows, measured, flow
 
 
@@ -52,15 +67,32 @@ def test_what_is_no_fault_of_a_sensor_changes_nothing(kind):
 def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
     assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
-    assert np.flatnonzero(heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART).tolist() == [18, 28, 38]
+    assert np.flatnonzero(
+        heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART
+    ).tolist() == [18, 28, 38]
     assert not (heeded(kernel.OFFSET, "ay", rollback=10, starts_anew=False)[2] == RESTART).any()
     reasons, statuses = np.zeros(STEPS), np.zeros(STEPS)
     statuses[10:40], reasons[10:40] = 2.0, code(kernel.SCALE, "vx")
-    rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
+    rows, measured, flow = (
+        np.ones((STEPS, 3)),
+        np.ones((STEPS, 3), np.bool_),
+        np.full(STEPS, USE, np.int8),
+    )
     state = np.zeros(2)
     for k in range(STEPS):
         part = slice(k, k + 1)
-        isolate_rows(statuses[part], reasons[part], NUMBERS_OF, SKIPPABLE, False, 10, rows[part], measured[part], flow[part], state)
+        isolate_rows(
+            statuses[part],
+            reasons[part],
+            NUMBERS_OF,
+            SKIPPABLE,
+            False,
+            10,
+            rows[part],
+            measured[part],
+            flow[part],
+            state,
+        )
     assert np.array_equal(flow, heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2])
 
 
@@ -69,10 +101,18 @@ def test_the_verdict_names_what_guard_and_watch_know():
     measured = np.ones((5, 3), np.bool_)
     measured[1, 1] = False
     status, reason = np.zeros(5), np.zeros(5)
-    verdict_rows(np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason)
+    verdict_rows(
+        np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason
+    )
     assert status.tolist() == [0, 1, 1, 2, 2]
     said = [reason_in_words(own) for own in reason]
-    assert said == ["", "vx is not measured", "spin", "the estimate exceeds what the speed allows", "there is no estimate"]
+    assert said == [
+        "",
+        "vx is not measured",
+        "spin",
+        "the estimate exceeds what the speed allows",
+        "there is no estimate",
+    ]
     assert reason[3] == BEYOND_SPEED * 10_000
     assert reason[4] == NO_ESTIMATE * 10_000
 
@@ -80,9 +120,19 @@ def test_the_verdict_names_what_guard_and_watch_know():
 def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_degrees():
     bands = np.full((4, 2), 0.1)
     marks = np.array([0, 0, 0, EXTRAPOLATED], np.int8)
-    widen_rows(np.array([0.0, 1.0, 2.0, 2.0]), np.zeros(4), marks, np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
+    widen_rows(
+        np.array([0.0, 1.0, 2.0, 2.0]),
+        np.zeros(4),
+        marks,
+        np.full(4, 0.5),
+        np.full(4, 20.0),
+        1.5,
+        bands,
+    )
     assert bands[:3, 0].tolist() == pytest.approx([0.1, 0.2, 0.4])
-    assert bands[3].tolist() == pytest.approx([2.0, max(0.4, math.atan(2.0 / 20.0))])  # as far as |v| and the farthest in training
+    assert bands[3].tolist() == pytest.approx(
+        [2.0, max(0.4, math.atan(2.0 / 20.0))]
+    )  # as far as |v| and the farthest in training
     # Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded.
     status, reason = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 40_200.0, 40_200.0, 0.0])
     bands = np.radians([[2.0, 2.0], [2.0, 2.0], [4.0, 4.0], [7.0, 7.0]])

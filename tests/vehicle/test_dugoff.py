@@ -22,7 +22,14 @@ def drawn(*shape, seed=0):
 def driven(count):
     """Points from straight ahead to a spin, and inputs from a standstill to fast."""
     points = drawn(count, 5, 2) * torch.tensor([3.0, 1.0])
-    inputs = torch.stack([40.0 * torch.rand(count, dtype=torch.float64), 0.2 * drawn(count, seed=1), 4.0 * drawn(count, seed=2)], -1)
+    inputs = torch.stack(
+        [
+            40.0 * torch.rand(count, dtype=torch.float64),
+            0.2 * drawn(count, seed=1),
+            4.0 * drawn(count, seed=2),
+        ],
+        -1,
+    )
     points[0], inputs[0, 1] = 0.0, 0.0
     return points, inputs
 
@@ -40,7 +47,9 @@ def test_tyres_are_those_of_the_paper():
         smooth = 2.0 / (np.exp(-4.0 * ratio) + 1.0) - 1.0
         for tyres, used in (("plain", plain), ("smooth", smooth)):
             expected = FRONT.cornering_stiffness * tangent * used
-            assert float(force(torch.tensor(tangent, dtype=torch.float64), tyres)) == pytest.approx(expected, rel=1e-12)
+            assert float(force(torch.tensor(tangent, dtype=torch.float64), tyres)) == pytest.approx(
+                expected, rel=1e-12
+            )
 
 
 @BOTH
@@ -67,10 +76,15 @@ def test_the_compiled_track_is_the_readable_one(tyres):
     readable, compiled = TorchModel(track.transition, track.observation), CompiledDugoffTrack(track)
     points, inputs = (part.numpy() for part in driven(300))
     for entry, size in enumerate((2, 5)):
-        expected, found = (called(model, entry, points, inputs, size) for model in (readable, compiled))
+        expected, found = (
+            called(model, entry, points, inputs, size) for model in (readable, compiled)
+        )
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
         upstream = drawn(300, 5, size, seed=3).numpy()
-        expected, found = (called(model, 2 + entry, points, inputs, 2, upstream, []) for model in (readable, compiled))
+        expected, found = (
+            called(model, 2 + entry, points, inputs, 2, upstream, [])
+            for model in (readable, compiled)
+        )
         assert np.isfinite(found).all()
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
@@ -78,7 +92,14 @@ def test_the_compiled_track_is_the_readable_one(tyres):
 def test_gradients_through_the_filter_reach_measurements_and_both_noises():
     """Of compiled code, and of automatic differentiation through readable code."""
     track = dugoff_track("smooth")
-    inputs = torch.stack([torch.tensor([[20.0], [2.0], [28.0]]).expand(3, 8), 0.05 * torch.ones(3, 8), torch.zeros(3, 8)], -1).double()
+    inputs = torch.stack(
+        [
+            torch.tensor([[20.0], [2.0], [28.0]]).expand(3, 8),
+            0.05 * torch.ones(3, 8),
+            torch.zeros(3, 8),
+        ],
+        -1,
+    ).double()
     inputs[1, 4:, 0] = 8.0  # rolls, then drives
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
     given = [
@@ -102,7 +123,9 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
         leaves = [part.clone().requires_grad_() for part in given]
         return list(torch.autograd.grad(outcome(leaves, compiled=compiled), leaves))
 
-    for found, expected, size in zip(gradients(compiled=True), gradients(compiled=False), (sizes, 0.1, sizes), strict=True):
+    for found, expected, size in zip(
+        gradients(compiled=True), gradients(compiled=False), (sizes, 0.1, sizes), strict=True
+    ):
         assert torch.isfinite(found).all()
         scale = float((expected * size).abs().max())
         torch.testing.assert_close(found * size, expected * size, rtol=0.0, atol=1e-8 * scale)
@@ -113,17 +136,28 @@ def test_a_sequence_has_the_same_digits_alone_as_beside_others():
     track, count = dugoff_track("smooth"), 11
     inputs = torch.tensor([20.0, 0.05, 0.0]) + drawn(count, 6, 3) * torch.tensor([2.0, 0.03, 0.5])
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
-    measurements = torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(count, 6, 5, seed=3) * sizes
+    measurements = (
+        torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(count, 6, 5, seed=3) * sizes
+    )
     measurements[2, 3] = torch.nan
-    process = torch.diag_embed((torch.tensor([0.05, 0.02]) * (1.0 + drawn(count, 6, 2, seed=4).abs())).square())
+    process = torch.diag_embed(
+        (torch.tensor([0.05, 0.02]) * (1.0 + drawn(count, 6, 2, seed=4).abs())).square()
+    )
     process[9, 2] *= -100.0
 
     def outcome(rows):
         leaves = [part[rows].clone().requires_grad_() for part in (measurements, process)]
-        filtered = TrackFilter(track).filtered(leaves[0], inputs[rows], leaves[1], sizes.double().square().diag())
+        filtered = TrackFilter(track).filtered(
+            leaves[0], inputs[rows], leaves[1], sizes.double().square().diag()
+        )
         found = filtered.steps.filtered
         (found.mean.square().sum() + found.covariance.sum()).backward()
-        return [found.mean.detach(), found.covariance.detach(), filtered.repaired, *(leaf.grad for leaf in leaves)]
+        return [
+            found.mean.detach(),
+            found.covariance.detach(),
+            filtered.repaired,
+            *(leaf.grad for leaf in leaves),
+        ]
 
     together = outcome(slice(None))
     assert together[2].any()

@@ -15,12 +15,18 @@ from vehest.vehicle.single_track import lateral_model
 from vehest.vehicle.tyres import PacejkaTyres, PositiveParameters, TyreForces, magic_formula
 
 TYRES = {"friction": 0.8916, "B_x": 2.8, "C_x": 1.2, "D_x": 1.0}
-TYRES |= {f"{name}_{axle}": value for axle in ("front", "rear") for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))}
+TYRES |= {
+    f"{name}_{axle}": value
+    for axle in ("front", "rear")
+    for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))
+}
 
 
 @pytest.fixture
 def car():
-    return PlanarCar().double().requires_grad_(False), PacejkaTyres(TYRES).double().requires_grad_(False)
+    return PlanarCar().double().requires_grad_(False), PacejkaTyres(TYRES).double().requires_grad_(
+        False
+    )
 
 
 def rates(car, state, inputs):
@@ -35,7 +41,13 @@ def tensor(*values):
 def test_runge_kutta_is_an_independent_integrator(car):
     """Over 10 ms from a drifting state; and its error falls with the fourth power of the step."""
     state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
-    known = solve_ivp(lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(), (0.0, 0.01), state.numpy(), rtol=1e-12, atol=1e-13)
+    known = solve_ivp(
+        lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(),
+        (0.0, 0.01),
+        state.numpy(),
+        rtol=1e-12,
+        atol=1e-13,
+    )
     errors = []
     for steps in (1, 2):
         own = state
@@ -69,15 +81,24 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
 def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_for(car):
     state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
     mirror = tensor(1.0, -1.0, -1.0, 1.0)
-    assert torch.allclose(rates(car, mirror * state, tensor(-0.2, 8.0)), mirror * rates(car, state, inputs), atol=1e-12)
+    assert torch.allclose(
+        rates(car, mirror * state, tensor(-0.2, 8.0)),
+        mirror * rates(car, state, inputs),
+        atol=1e-12,
+    )
     front, rear = car[0].loads()
     assert float(front + rear) == pytest.approx(F1TENTH["mass"] * GRAVITY)
     assert float(front * (F1TENTH["wheelbase"] - 0.115)) == pytest.approx(float(rear * 0.115))
     plain, curved = PacejkaTyres(TYRES), PacejkaTyres(TYRES, with_curvature=True)
-    assert sum(p.numel() for p in curved.parameters()) - sum(p.numel() for p in plain.parameters()) == 3
+    assert (
+        sum(p.numel() for p in curved.parameters()) - sum(p.numel() for p in plain.parameters())
+        == 3
+    )
     chassis = PlanarCar()
     slips = chassis.slips(torch.tensor([3.0, 0.5, 1.0, 3.5]), torch.tensor([0.1, 0.0]))
-    for one, other in zip(plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True):
+    for one, other in zip(
+        plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True
+    ):
         assert one.item() == pytest.approx(other.item(), rel=1e-5)
     own = PositiveParameters({"inertia": 0.46})
     with torch.no_grad():
@@ -88,7 +109,9 @@ def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_f
 def test_for_small_slips_it_is_the_linear_single_track(car):
     chassis, tyres = car
     front, rear = (float(load) * 0.8916 * 0.8095 * 5.948 * 2.2754 for load in chassis.loads())
-    linear = SingleTrackParameters(F1TENTH["mass"], 0.46, F1TENTH["wheelbase"] - 0.115, 0.115, front, rear)
+    linear = SingleTrackParameters(
+        F1TENTH["mass"], 0.46, F1TENTH["wheelbase"] - 0.115, 0.115, front, rear
+    )
     speed, sideslip, yaw_rate, steer = 4.0, 2e-4, 3e-3, 1e-3
     state, inputs = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed), tensor(steer, 0.0)
     own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
@@ -104,7 +127,9 @@ def test_the_magic_formula_has_its_slope_its_peak_and_its_curvature():
     stiffness, shape = tensor(5.948), tensor(2.2754)
     slip = torch.linspace(-0.6, 0.6, 2001, dtype=torch.float64)
     curve = magic_formula(slip, stiffness, shape)
-    assert float(magic_formula(tensor(1e-6), stiffness, shape)) == pytest.approx(1e-6 * 5.948 * 2.2754, rel=1e-6)
+    assert float(magic_formula(tensor(1e-6), stiffness, shape)) == pytest.approx(
+        1e-6 * 5.948 * 2.2754, rel=1e-6
+    )
     peak = math.tan(math.pi / (2.0 * 2.2754)) / 5.948
     assert float(magic_formula(tensor(peak), stiffness, shape)) == pytest.approx(1.0, abs=1e-12)
     assert float(curve.max()) <= 1.0

@@ -17,7 +17,9 @@ def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
     state = np.array([sideslip, yaw_rate])
     A, B, C, D = lateral_model(CAR, SPEEDS)
     for k, u in enumerate(SPEEDS.tolist()):
-        front = CAR.cornering_stiffness_front * (steer - (sideslip + CAR.cg_to_front_axle * yaw_rate / u))
+        front = CAR.cornering_stiffness_front * (
+            steer - (sideslip + CAR.cg_to_front_axle * yaw_rate / u)
+        )
         rear = -CAR.cornering_stiffness_rear * (sideslip - CAR.cg_to_rear_axle * yaw_rate / u)
         acceleration = (front + rear) / CAR.mass
         moment = CAR.cg_to_front_axle * front - CAR.cg_to_rear_axle * rear
@@ -26,7 +28,12 @@ def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
         assert float(derivative[1]) == pytest.approx(moment / CAR.yaw_inertia, rel=1e-12)
         assert float(C[k] @ state + D[k] * steer) == pytest.approx(acceleration, rel=1e-12)
     # λ² + 2σλ + ω²: sum and product of the poles as vehicle dynamics books give them.
-    front, rear, lf, lr = CAR.cornering_stiffness_front, CAR.cornering_stiffness_rear, CAR.cg_to_front_axle, CAR.cg_to_rear_axle
+    front, rear, lf, lr = (
+        CAR.cornering_stiffness_front,
+        CAR.cornering_stiffness_rear,
+        CAR.cg_to_front_axle,
+        CAR.cg_to_rear_axle,
+    )
     m, J, wheelbase = CAR.mass, CAR.yaw_inertia, CAR.cg_to_front_axle + CAR.cg_to_rear_axle
     for u, A in zip(SPEEDS, lateral_model(CAR, SPEEDS).A, strict=True):
         damping = (front + rear) / (m * u) + (lf**2 * front + lr**2 * rear) / (J * u)
@@ -38,17 +45,29 @@ def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
     A, B, C, D = lateral_model(CAR, SPEEDS)
     steady = -np.linalg.solve(A, B[..., None])[..., 0]
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
-    surplus = CAR.cg_to_rear_axle * CAR.cornering_stiffness_rear - CAR.cg_to_front_axle * CAR.cornering_stiffness_front
-    understeer = CAR.mass * surplus / (wheelbase * CAR.cornering_stiffness_front * CAR.cornering_stiffness_rear)
+    surplus = (
+        CAR.cg_to_rear_axle * CAR.cornering_stiffness_rear
+        - CAR.cg_to_front_axle * CAR.cornering_stiffness_front
+    )
+    understeer = (
+        CAR.mass
+        * surplus
+        / (wheelbase * CAR.cornering_stiffness_front * CAR.cornering_stiffness_rear)
+    )
     assert np.allclose(steady[:, 1], SPEEDS / (wheelbase + understeer * SPEEDS**2), rtol=1e-12)
-    assert np.allclose((C * steady).sum(-1) + D, SPEEDS * steady[:, 1], rtol=1e-10), "in steady state ay = u r"
+    assert np.allclose((C * steady).sum(-1) + D, SPEEDS * steady[:, 1], rtol=1e-10), (
+        "in steady state ay = u r"
+    )
 
 
 def test_forward_euler_is_first_order():
     """Against the exact solution over 0.1 s: half the step, half the error."""
     model = lateral_model(CAR, SPEEDS[1])
     exact = linalg.expm(0.1 * model.A)
-    errors = [np.abs(np.linalg.matrix_power(model.in_steps(0.1 / n).A, n) - exact).max() for n in (100, 200)]
+    errors = [
+        np.abs(np.linalg.matrix_power(model.in_steps(0.1 / n).A, n) - exact).max()
+        for n in (100, 200)
+    ]
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.02)
     assert np.array_equal(model.in_steps(0.01).B, 0.01 * model.B)
     assert lateral_model(CAR, SPEEDS.reshape(1, 3)).D.shape == (1, 3)

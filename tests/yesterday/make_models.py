@@ -25,7 +25,13 @@ PREPARATION = {"method": "polyphase", "transforms": []}
 
 def drive_name(estimator):
     """File of the drive that suits an estimator's channels, at its rate."""
-    kind = "small_car" if "motor_current" in estimator.channels else "steered" if "steer" in estimator.channels else "planar"
+    kind = (
+        "small_car"
+        if "motor_current" in estimator.channels
+        else "steered"
+        if "steer" in estimator.channels
+        else "planar"
+    )
     return f"{kind}_{estimator.settings.rate_hz:g}hz.parquet"
 
 
@@ -48,7 +54,9 @@ def main():
         estimator = fitted(name)
         folder.mkdir(parents=True)
         save_model(estimator, folder, {"seed": 0, "downsample": PREPARATION})
-        learnt, stopped = ([Stretch(drive, drive.start_time, "", drive.id)] for drive in _drives(estimator))
+        learnt, stopped = (
+            [Stretch(drive, drive.start_time, "", drive.id)] for drive in _drives(estimator)
+        )
         trust = learn_trust(estimator, learnt, stopped)
         write_trust(trust, folder)
         drive = drive_for(estimator)

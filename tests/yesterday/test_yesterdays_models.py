@@ -29,14 +29,26 @@ def test_a_model_of_yesterday_estimates_as_it_did(name):
     then = read_estimate(folder / "estimate.parquet")
     now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
-    expected, wide = dict(then.channels), np.nan_to_num(then["band_sideslip"]) > WIDEST  # then valid or degraded, now invalid
+    expected, wide = (
+        dict(then.channels),
+        np.nan_to_num(then["band_sideslip"]) > WIDEST,
+    )  # then valid or degraded, now invalid
     unexplained = wide & (then["health_reason"] == 0.0)
     expected["health"] = np.where(wide, INVALID, then["health"])
     expected["health_reason"] = np.where(unexplained, TOO_WIDE * 10_000.0, then["health_reason"])
-    jumps = (then["health_reason"] // 10_000 == JUMP) & (now["health_reason"] // 10_000 == JUMP)  # now of the largest likelihood ratio
+    jumps = (then["health_reason"] // 10_000 == JUMP) & (
+        now["health_reason"] // 10_000 == JUMP
+    )  # now of the largest likelihood ratio
     expected["health_reason"] = np.where(jumps, now["health_reason"], expected["health_reason"])
     for channel, values in expected.items():
-        np.testing.assert_allclose(now[channel], values, rtol=0.0, atol=TOLERANCE, equal_nan=True, err_msg=f"{name}: {channel}")
+        np.testing.assert_allclose(
+            now[channel],
+            values,
+            rtol=0.0,
+            atol=TOLERANCE,
+            equal_nan=True,
+            err_msg=f"{name}: {channel}",
+        )
 
 
 def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
@@ -45,14 +57,29 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     drive = read_recording(HERE / "drives" / drive_name(model))
     monkeypatch.chdir(tmp_path)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
-    code, out, err = run_vehest(capsys, "estimate", str(folder), "lap.csv", "-o", "out.csv", "--json")
+    code, out, err = run_vehest(
+        capsys, "estimate", str(folder), "lap.csv", "-o", "out.csv", "--json"
+    )
     assert code == 0, err
     assert "of the drive" in json.loads(out)["verdict"]
     table, then = pd.read_csv("out.csv"), read_estimate(folder / "estimate.parquet")
     wider = {"band_sideslip": 2.0}  # since a table names no vehicle that bands were calibrated on
     for channel in ("vy", "sideslip", "band_sideslip"):
-        np.testing.assert_allclose(table[channel], wider.get(channel, 1.0) * then[channel], rtol=0.0, atol=TOLERANCE, equal_nan=True)
+        np.testing.assert_allclose(
+            table[channel],
+            wider.get(channel, 1.0) * then[channel],
+            rtol=0.0,
+            atol=TOLERANCE,
+            equal_nan=True,
+        )
 
 
 def test_every_family_has_a_model_of_yesterday():
-    assert sorted(name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")) == MODELS
+    assert (
+        sorted(
+            name
+            for name in estimator_names()
+            if estimator_class(name).__module__.startswith("vehest.")
+        )
+        == MODELS
+    )

@@ -103,7 +103,9 @@ class Alignment:
     recording: Recording  # as it was
     settings: AlignmentSettings
     parameters: tuple[Parameter, ...]  # in the order of `UNITS`
-    transforms: tuple[Mapping[str, Any], ...]  # configurations of the transforms that would correct it, in the order of their application
+    transforms: tuple[
+        Mapping[str, Any], ...
+    ]  # configurations of the transforms that would correct it, in the order of their application
     residuals: tuple[Residual, ...] = ()  # of the channels that were compared
     correlation: Correlation | None = None  # where there is a reference
     notes: tuple[str, ...] = ()  # a sentence or two each
@@ -135,9 +137,16 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     notes: list[str] = []
     corrected, correlation = recording, None
     if settings.kinematic:
-        fit = fit_imu(recording, settings, [name for quantity in settings.kinematic for name in QUANTITIES[quantity]])
+        fit = fit_imu(
+            recording,
+            settings,
+            [name for quantity in settings.kinematic for name in QUANTITIES[quantity]],
+        )
         uncertainties = zip(fit.names, fit.scatter.tolist(), fit.tilt.tolist(), strict=True)
-        parameters = [_parameter(name, fit.values[name], scatter, tilt, fit.blocks - 1) for name, scatter, tilt in uncertainties]
+        parameters = [
+            _parameter(name, fit.values[name], scatter, tilt, fit.blocks - 1)
+            for name, scatter, tilt in uncertainties
+        ]
         transforms = _imu_transforms(parameters)
         for transform in transforms:
             corrected = transform_from_config(transform)(corrected)
@@ -145,15 +154,29 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         correlation, notes = fit.correlation, _imu_notes(fit, parameters, settings)
     if "steering_ratio" in settings.estimate:
         found, transform, note = _align_steering(corrected, settings)
-        parameters, transforms, notes = [*parameters, *found], [*transforms, transform], [*notes, note]
-    return Alignment(recording, settings, tuple(parameters), tuple(transforms), residuals, correlation, tuple(notes))
+        parameters, transforms, notes = (
+            [*parameters, *found],
+            [*transforms, transform],
+            [*notes, note],
+        )
+    return Alignment(
+        recording,
+        settings,
+        tuple(parameters),
+        tuple(transforms),
+        residuals,
+        correlation,
+        tuple(notes),
+    )
 
 
 def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
     """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch and Satterthwaite (GUM, G.4.1)."""
     uncertainty = math.hypot(scatter, tilt)
     effective = freedom * (uncertainty / scatter) ** 4 if scatter > 0 else math.inf
-    half = uncertainty * float(stats.t.ppf(0.975, effective) if effective < 1e6 else stats.norm.ppf(0.975))
+    half = uncertainty * float(
+        stats.t.ppf(0.975, effective) if effective < 1e6 else stats.norm.ppf(0.975)
+    )
     return Parameter(name, value, uncertainty, value - half, value + half, scatter, tilt)
 
 
@@ -162,10 +185,19 @@ def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
     found = {parameter.name: _rounded(parameter.value) for parameter in parameters}
     transforms: list[dict[str, Any]] = []
     if "delay" in found:
-        transforms.append({"name": "delay_correction", "delay": found["delay"], "channels": list(IMU_CHANNELS)})
+        transforms.append(
+            {"name": "delay_correction", "delay": found["delay"], "channels": list(IMU_CHANNELS)}
+        )
     if "offset_ax" in found:
-        transforms.append({"name": "offset_correction", "offsets": {channel: found[f"offset_{channel}"] for channel in IMU_CHANNELS}})
-    mounting: dict[str, Any] = {name: found[name] for name in ("lever_x", "lever_y", "yaw") if name in found}
+        transforms.append(
+            {
+                "name": "offset_correction",
+                "offsets": {channel: found[f"offset_{channel}"] for channel in IMU_CHANNELS},
+            }
+        )
+    mounting: dict[str, Any] = {
+        name: found[name] for name in ("lever_x", "lever_y", "yaw") if name in found
+    }
     if mounting:
         transforms.append({"name": "mounting_correction", **mounting})
     return transforms
@@ -185,40 +217,66 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     return tuple(found)
 
 
-def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings) -> list[str]:
+def _imu_notes(
+    fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings
+) -> list[str]:
     signals, values, notes = fit.signals, fit.values, []
-    left = [name for name in QUANTITIES if name not in settings.estimate and name != "steering_ratio"]
+    left = [
+        name for name in QUANTITIES if name not in settings.estimate and name != "steering_ratio"
+    ]
     if left:
         notes.append(f"Not asked for and taken as zero: {', '.join(left)}.")
     if fit.suspects:
-        found = listed([f"{name} {in_words(name, value)} ± {in_words(name, sigma)}" for name, (value, sigma) in fit.suspects.items()])
+        found = listed(
+            [
+                f"{name} {in_words(name, value)} ± {in_words(name, sigma)}"
+                for name, (value, sigma) in fit.suspects.items()
+            ]
+        )
         notes.append(
             f"The residuals suggest quantities that were not asked for, each taken alone: {found}. The others may change with them."
         )
-    unproven = [parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high]
+    unproven = [
+        parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high
+    ]
     if unproven:
-        notes.append(f"Zero lies within the interval of {listed(unproven)}: this drive gives no reason to correct it.")
+        notes.append(
+            f"Zero lies within the interval of {listed(unproven)}: this drive gives no reason to correct it."
+        )
     if signals.speed == "vx":
-        notes.append("There is no vx_ref: vx serves as the reference's forward velocity, taken to be on its clock.")
+        notes.append(
+            "There is no vx_ref: vx serves as the reference's forward velocity, taken to be on its clock."
+        )
     if signals.reference_rate is None:
         notes.append(
             "There is no yaw_rate_ref: delay and yaw rate offset come from the accelerations, less well, and a banked road shows in them."
         )
     if "offset_ax" in fit.names:
-        angles = (math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0))) for name in ("offset_ax", "offset_ay"))
+        angles = (
+            math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0)))
+            for name in ("offset_ax", "offset_ay")
+        )
         notes.append(
-            "The offsets of ax and ay may as well be {:.2f}° and {:.2f}° of pitch and roll of the mounting: no drive tells.".format(*angles)
+            "The offsets of ax and ay may as well be {:.2f}° and {:.2f}° of pitch and roll of the mounting: no drive tells.".format(
+                *angles
+            )
         )
     if signals.gravity is not None:
-        notes.append("Gravity is taken off the accelerations by the measured roll and pitch for this estimate.")
+        notes.append(
+            "Gravity is taken off the accelerations by the measured roll and pitch for this estimate."
+        )
     if settings.tilt > 0:
         gains = f"{_percent(values['tilt_gain_x'])} of it in ax and {_percent(values['tilt_gain_y'])} in ay"
         causes = "gravity by pitch and roll of the body (1 % is 0.57° at 1 g), or a scale error; no transform takes it off"
-        notes.append(f"Beyond the acceleration of the reference the sensor shows {gains}: {causes}.")
+        notes.append(
+            f"Beyond the acceleration of the reference the sensor shows {gains}: {causes}."
+        )
     return notes
 
 
-def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[list[Parameter], dict[str, Any], str]:
+def _align_steering(
+    recording: Recording, settings: AlignmentSettings
+) -> tuple[list[Parameter], dict[str, Any], str]:
     """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives calmly.
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
@@ -236,18 +294,34 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
 
     speed = np.maximum(recording["vx"], 0.1 * settings.min_speed)
     angle = np.arctan(settings.wheelbase * recording[yaw_rate] / speed)
-    calm = (low(recording["vx"]) >= settings.min_speed) & (np.abs(low(recording["ay"])) <= settings.max_ay)
-    seconds, least = float(calm.sum()) * smoothing.step / recording.rate_hz, FEWEST_BLOCKS * SHORTEST_BLOCK
+    calm = (low(recording["vx"]) >= settings.min_speed) & (
+        np.abs(low(recording["ay"])) <= settings.max_ay
+    )
+    seconds, least = (
+        float(calm.sum()) * smoothing.step / recording.rate_hz,
+        FEWEST_BLOCKS * SHORTEST_BLOCK,
+    )
     if seconds < least:
         calm_is = f"above {settings.min_speed:g} m/s with less than {settings.max_ay:g} m/s² of ay"
-        raise DataError(f"recording '{recording.id}': only {seconds:.3g} s are {calm_is}; the steering ratio needs at least {least:g} s")
-    columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[:, calm]
+        raise DataError(
+            f"recording '{recording.id}': only {seconds:.3g} s are {calm_is}; the steering ratio needs at least {least:g} s"
+        )
+    columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[
+        :, calm
+    ]
     measured = low(recording[source])[calm]
     names = ["steering_ratio", "steering_offset", "understeer_gradient", "lead"]
     require_condition(recording, columns @ columns.T, names, names[:3])
     solution = np.linalg.lstsq(columns.T, measured, rcond=None)[0]
     error = measured - solution @ columns
-    fit = Fit(names, dict(zip(names, solution.tolist(), strict=True)), error[None], columns[:, None], np.ones(1), np.zeros((4, 4)))
+    fit = Fit(
+        names,
+        dict(zip(names, solution.tolist(), strict=True)),
+        error[None],
+        columns[:, None],
+        np.ones(1),
+        np.zeros((4, 4)),
+    )
     blocks = n_blocks(seconds)
     ratio, offset, slope, _ = solution.tolist()
     to_gradient = np.diag([1.0, 1.0, 1.0 / ratio, 1.0])  # understeer gradient = slope / ratio
@@ -257,8 +331,15 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     found = [_parameter(name, value, size, 0.0, blocks - 1) for name, value, size in values]
     if found[0].low <= 0.0 <= found[0].high:
         what = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
-        raise DataError(f"recording '{recording.id}': {what}; check its sign, or use a drive with slow turns")
-    transform = {"name": "steering_ratio", "ratio": _rounded(ratio), "offset": _rounded(offset), "channel": source}
+        raise DataError(
+            f"recording '{recording.id}': {what}; check its sign, or use a drive with slow turns"
+        )
+    transform = {
+        "name": "steering_ratio",
+        "ratio": _rounded(ratio),
+        "offset": _rounded(offset),
+        "channel": source,
+    }
     ratio_of = f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
     note = f"{ratio_of}, from {seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
     return found, transform, note

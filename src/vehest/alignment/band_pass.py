@@ -16,13 +16,20 @@ def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArra
     Source: Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.3 (bilinear transformation).
     """
     low, high = 4.0 * np.tan(np.pi * np.array([low_hz, high_hz]) / rate_hz)
-    half = -np.exp(0.25j * np.pi) * (high - low) / 2.0  # one of the low-pass prototype's two poles, as wide as the band
+    half = (
+        -np.exp(0.25j * np.pi) * (high - low) / 2.0
+    )  # one of the low-pass prototype's two poles, as wide as the band
     root = np.sqrt(half**2 - low * high)
     poles = (4.0 + half + [root, -root]) / (4.0 - half - [root, -root])
     gain = (high - low) ** 2 * 16.0 / np.prod(np.abs(4.0 - half - [root, -root]) ** 2)
     slow, fast = sorted(poles, key=lambda pole: abs(np.angle(pole)))
     rows = ((gain, 2.0, fast), (1.0, -2.0, slow))
-    return np.array([(scale, middle * scale, scale, -2.0 * pole.real, abs(pole) ** 2) for scale, middle, pole in rows])
+    return np.array(
+        [
+            (scale, middle * scale, scale, -2.0 * pole.real, abs(pole) ** 2)
+            for scale, middle, pole in rows
+        ]
+    )
 
 
 def without_phase(sections: FloatArray, samples: FloatArray) -> FloatArray:

@@ -30,7 +30,11 @@ def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, La
     """
     lateral = f"d({motion.velocity})/dt"
     together = {"ay": {"ay": 1.0}, "lateral": {"turning": 1.0, "sliding": 1.0}}
-    sideways = spectra.combined(together) if {"ay", "turning", "sliding"} <= set(spectra.names) else spectra
+    sideways = (
+        spectra.combined(together)
+        if {"ay", "turning", "sliding"} <= set(spectra.names)
+        else spectra
+    )
     candidates = [
         ("ax", f"d({motion.speed})/dt", _established(spectra, "forward", "ax")),
         ("yaw_rate", "yaw_rate_ref", _established(spectra, "yaw_rate_ref", "yaw_rate")),
@@ -39,7 +43,9 @@ def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, La
     ]
     found: dict[str, tuple[str, Lag]] = {}
     for channel, text, lag in candidates:
-        if lag is not None and (channel != "ay" or "yaw_rate" not in found or lag.fit > found["yaw_rate"][1].fit):
+        if lag is not None and (
+            channel != "ay" or "yaw_rate" not in found or lag.fit > found["yaw_rate"][1].fit
+        ):
             found.setdefault(channel, (text, lag))
     return found
 
@@ -53,7 +59,9 @@ def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | Non
     return lag if slow and not advanced else None
 
 
-def low_pass_findings(motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]) -> list[Finding]:
+def low_pass_findings(
+    motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]
+) -> list[Finding]:
     """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held against."""
     findings = []
     for channel, (text, lag) in slow.items():
@@ -62,8 +70,16 @@ def low_pass_findings(motion: Motion, spectra: CrossSpectra, slow: Mapping[str, 
             f"transients are gone; an estimator must be trained with it as it is, or do without"
         )
         findings.append(Finding("warning", "bandwidth", channel, message))
-    steered = lag_of(spectra, "steered", "yaw_rate", low_pass=True) if not {"ay", "yaw_rate_ref"} & set(motion.channels) else None
-    if steered is not None and steered.fit > LEAST_FIT and steered.together.low > LONGEST_YAW_RESPONSE:
+    steered = (
+        lag_of(spectra, "steered", "yaw_rate", low_pass=True)
+        if not {"ay", "yaw_rate_ref"} & set(motion.channels)
+        else None
+    )
+    if (
+        steered is not None
+        and steered.fit > LEAST_FIT
+        and steered.together.low > LONGEST_YAW_RESPONSE
+    ):
         message = (
             f"follows {motion.steering} by {_seconds(steered.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
             f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide"
@@ -91,7 +107,9 @@ def held_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
             f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
             f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)"
         )
-        findings.append(Finding("warning" if delay > LONGEST_UNREPORTED else "note", "held", names[0], message))
+        findings.append(
+            Finding("warning" if delay > LONGEST_UNREPORTED else "note", "held", names[0], message)
+        )
     return findings
 
 

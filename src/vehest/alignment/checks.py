@@ -47,7 +47,10 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
-FASTEST_REVERSE, LEAST_TURN = 8.0, 0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
+FASTEST_REVERSE, LEAST_TURN = (
+    8.0,
+    0.03,
+)  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
@@ -82,7 +85,9 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
     findings = checks_of_recording(recording)
     for finding in findings:
         if finding.level == "error" and finding.check not in accepted:
-            raise DataError(f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
+            raise DataError(
+                f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])"
+            )
     return findings
 
 
@@ -94,7 +99,11 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         if not len(outside):
             continue
         worst = outside[np.argmax(np.abs(samples[outside]))]
-        hint = "is the column in degrees? then say so in its unit" if channel.is_angular else "check its unit and its column"
+        hint = (
+            "is the column in degrees? then say so in its unit"
+            if channel.is_angular
+            else "check its unit and its column"
+        )
         message = (
             f"{len(outside)} samples beyond what a vehicle can do, {samples[worst]:.6g} {channel.unit} at {recording.time[worst]:.12g} s "
             f"(possible: {channel.low:.4g} to {channel.high:.4g}); {'the simulated car spun here' if spun else hint}"
@@ -126,16 +135,24 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     spectra = spectra_of(motion)
     if spectra is not None:
         slow = low_passed(motion, spectra)
-        clocks = low_pass_findings(motion, spectra, slow) + delay_findings(delays_of(motion, spectra, frozenset(slow)))
+        clocks = low_pass_findings(motion, spectra, slow) + delay_findings(
+            delays_of(motion, spectra, frozenset(slow))
+        )
     explained = any(finding.channel in ("ay", "yaw_rate", "vy_ref") for finding in clocks)
-    kinematics = [finding for finding in _kinematics(motion) if finding.level == "note" or not explained]
+    kinematics = [
+        finding for finding in _kinematics(motion) if finding.level == "note" or not explained
+    ]
     return findings + kinematics + offset_findings(motion) + clocks
 
 
 def _kinematics(motion: Motion) -> Iterator[Finding]:
     """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
     band = kinematic_band(motion)
-    if band is None or motion.velocity != "vy_ref" or not {"ay", "yaw_rate"} <= set(motion.channels):
+    if (
+        band is None
+        or motion.velocity != "vy_ref"
+        or not {"ay", "yaw_rate"} <= set(motion.channels)
+    ):
         return
     expected = motion["ay"] - motion.turning
     predicted, derived = band(expected), band(motion.sliding)
@@ -145,7 +162,12 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
     figures = f"(correlation {correlation:.2f} between {KINEMATIC_BAND_HZ[0]:g} and {KINEMATIC_BAND_HZ[1]:g} Hz)"
     if correlation >= SIGN_CORRELATION:
         bias = float((motion.sliding - expected)[motion.moving].mean())
-        yield Finding("note", "kinematics", "vy_ref", f"d(vy_ref)/dt follows ay - vx·yaw_rate {figures}, mean bias {bias:.3f} m/s²")
+        yield Finding(
+            "note",
+            "kinematics",
+            "vy_ref",
+            f"d(vy_ref)/dt follows ay - vx·yaw_rate {figures}, mean bias {bias:.3f} m/s²",
+        )
     else:
         message = f"ay - vx·yaw_rate hardly follows d(vy_ref)/dt {figures}: check units, delays and where the sensors sit"
         yield Finding("warning", "kinematics", "vy_ref", message)
@@ -155,7 +177,12 @@ def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:
-            yield Finding("note", "nan", name, f"{100 * missing / len(recording):.1f} % of the samples are 'not measured'")
+            yield Finding(
+                "note",
+                "nan",
+                name,
+                f"{100 * missing / len(recording):.1f} % of the samples are 'not measured'",
+            )
 
 
 def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
@@ -167,17 +194,30 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
         if rests and not samples[known].any():
             continue
         if len(known) > 1 and (samples[known] == samples[known[0]]).all():
-            yield Finding("warning", "stuck", name, f"never changes: {samples[known[0]]:.6g} {unit} throughout")
+            yield Finding(
+                "warning",
+                "stuck",
+                name,
+                f"never changes: {samples[known[0]]:.6g} {unit} throughout",
+            )
             continue
         runs = equal_runs(samples[known])
-        runs = runs[(runs[:, 1] - runs[:, 0] >= FEWEST_STUCK) & ~(rests & (samples[known[runs[:, 0]]] == 0.0))]
+        runs = runs[
+            (runs[:, 1] - runs[:, 0] >= FEWEST_STUCK)
+            & ~(rests & (samples[known[runs[:, 0]]] == 0.0))
+        ]
         begins, ends = known[runs[:, 0]], known[runs[:, 1] - 1] + 1
         held = moved[ends] - moved[begins]
         if len(runs) and held.max() >= STUCK_SECONDS * recording.rate_hz:
             longest = int(np.argmax(held))
             first = int(begins[longest] + np.argmax(moving[begins[longest] : ends[longest]]))
             seconds, time = held[longest] / recording.rate_hz, recording.time[first]
-            yield Finding("warning", "stuck", name, f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s")
+            yield Finding(
+                "warning",
+                "stuck",
+                name,
+                f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s",
+            )
 
 
 def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
@@ -188,11 +228,19 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
         between = known[(known > lowest) & (known < highest)]
         if not len(between):
             continue
-        for side, extreme, beside in (("highest", highest, between.max()), ("lowest", lowest, between.min())):
+        for side, extreme, beside in (
+            ("highest", highest, between.max()),
+            ("lowest", lowest, between.min()),
+        ):
             at = known == extreme
             number, fewest = int(at.sum()), SATURATED_EXCESS * np.count_nonzero(known == beside)
             is_extreme = abs(extreme) >= 0.1 * max(abs(lowest), abs(highest))
-            if is_extreme and number > SATURATED_FRACTION * len(known) and number >= fewest and len(true_runs(at)) > 1:
+            if (
+                is_extreme
+                and number > SATURATED_FRACTION * len(known)
+                and number >= fewest
+                and len(true_runs(at)) > 1
+            ):
                 message = f"{100 * number / len(known):.2g} % of the samples sit at the {side} value, {extreme:.6g} {CHANNELS[name].unit}"
                 yield Finding("warning", "saturated", name, message)
 
@@ -201,13 +249,24 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """Straight ahead the steering angle must be about zero: its median where a moving car hardly turns."""
     if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
         return
-    straight = (recording["vx"] > STRAIGHT_SPEED) & (np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE) & np.isfinite(recording["steer"])
+    straight = (
+        (recording["vx"] > STRAIGHT_SPEED)
+        & (np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE)
+        & np.isfinite(recording["steer"])
+    )
     seconds = straight.sum() / recording.rate_hz
     shown = recording["steer"][straight]
-    if seconds >= STRAIGHT_SECONDS and abs(np.median(shown)) >= max(MOST_STEERING_OFFSET, 2.0 * float(shown.std())):
+    if seconds >= STRAIGHT_SECONDS and abs(np.median(shown)) >= max(
+        MOST_STEERING_OFFSET, 2.0 * float(shown.std())
+    ):
         offset = float(np.median(shown))
         message = f"shows {np.rad2deg(offset):.3g} deg where the car hardly turns ({seconds:.3g} s of it): "
-        yield Finding("warning", "offset", "steer", f"{message}take {offset:.3g} rad off with the transform offset_correction")
+        yield Finding(
+            "warning",
+            "offset",
+            "steer",
+            f"{message}take {offset:.3g} rad off with the transform offset_correction",
+        )
 
 
 def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -228,7 +287,12 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         runs = runs[runs[:, 1] - runs[:, 0] > DROPOUT_SECONDS * recording.rate_hz]
         if len(runs):
             message = f"shows next to nothing {len(runs)} times while the other wheels turn, the longest {_longest(runs, recording)}"
-            yield Finding("warning", "dropout", name, f"{message}; the transform speed_from_wheels leaves such a wheel out")
+            yield Finding(
+                "warning",
+                "dropout",
+                name,
+                f"{message}; the transform speed_from_wheels leaves such a wheel out",
+            )
 
 
 def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -251,22 +315,34 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """A positive speed while the reference goes backwards, or while ay and steering both oppose the yaw rate for a part of the drive."""
     angle = next((name for name in ("steer", "handwheel") if name in recording), "")
-    if "vx" not in recording or ("vx_ref" not in recording and not {"yaw_rate", "ay", angle} <= set(recording.channels)):
+    if "vx" not in recording or (
+        "vx_ref" not in recording and not {"yaw_rate", "ay", angle} <= set(recording.channels)
+    ):
         return
     if "vx_ref" in recording:
         backwards = recording["vx_ref"] < -REVERSE_SPEED
     else:
         second = np.full(min(round(recording.rate_hz) or 1, len(recording)), 1.0)
-        rate, ay, turned = (np.convolve(recording[name], second / len(second), "same") for name in ("yaw_rate", "ay", angle))
+        rate, ay, turned = (
+            np.convolve(recording[name], second / len(second), "same")
+            for name in ("yaw_rate", "ay", angle)
+        )
         turns = np.abs(rate) > LEAST_TURN
         against = turns & (ay * rate < 0.0) & (turned * rate < 0.0)
-        is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(turns)  # else a channel's sign is wrong
+        is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(
+            turns
+        )  # else a channel's sign is wrong
         backwards = against & (recording["vx"] < FASTEST_REVERSE) & is_part
     runs = true_runs(backwards & (recording["vx"] > REVERSE_SPEED))
     runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
     if len(runs):
         message = f"has no sign: the car goes backwards {len(runs)} times while it counts up, the longest {_longest(runs, recording)}"
-        yield Finding("warning", "reverse", "vx", f"{message}; leave the range out (start and stop of a split), or log a signed speed")
+        yield Finding(
+            "warning",
+            "reverse",
+            "vx",
+            f"{message}; leave the range out (start and stop of a split), or log a signed speed",
+        )
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:

@@ -41,7 +41,12 @@ class Delay:
     @property
     def turned(self) -> Delay:
         """The same seen from the other channel."""
-        return Delay(self.against, self.channel, self.signals, Measured(-self.delay.value, self.delay.half_width))
+        return Delay(
+            self.against,
+            self.channel,
+            self.signals,
+            Measured(-self.delay.value, self.delay.half_width),
+        )
 
 
 @dataclass(frozen=True)
@@ -60,8 +65,15 @@ def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
         signals |= {"ay": motion["ay"], "turning": motion.turning}
         if motion.velocity:
             signals["sliding"] = motion.sliding
-            steady = motion.vx / (np.square(motion.vx) + np.square(0.3 * np.sqrt(np.mean(np.square(motion.vx)))) + np.finfo(float).tiny)
-            signals |= {"turned": motion.turning * steady, "turn": (motion["ay"] - motion.sliding) * steady}
+            steady = motion.vx / (
+                np.square(motion.vx)
+                + np.square(0.3 * np.sqrt(np.mean(np.square(motion.vx))))
+                + np.finfo(float).tiny
+            )
+            signals |= {
+                "turned": motion.turning * steady,
+                "turn": (motion["ay"] - motion.sliding) * steady,
+            }
     if motion.speed and "ax" in motion:
         signals |= {"ax": motion["ax"], "forward": motion.forward}
     for name in ("vx", "vx_ref"):
@@ -75,7 +87,10 @@ def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
         if name in motion:
             signals[name] = motion[name]
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
-        signals |= {"sideslip_ref": motion["sideslip_ref"], "slip of vy_ref": np.arctan2(motion.vy, motion.vx)}
+        signals |= {
+            "sideslip_ref": motion["sideslip_ref"],
+            "slip of vy_ref": np.arctan2(motion.vy, motion.vx),
+        }
     if motion.speed and motion.steering:
         signals["steered"] = motion.vx * motion[motion.steering]
     return {name: samples for name, samples in signals.items() if 0.0 < np.ptp(samples) < np.inf}
@@ -87,17 +102,27 @@ def spectra_of(motion: Motion) -> CrossSpectra | None:
     return cross_spectra(signals, motion.rate_hz, motion.moving) if signals else None
 
 
-def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()) -> list[Delay]:
+def delays_of(
+    motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()
+) -> list[Delay]:
     """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed channels."""
     found: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
         found += _lateral(motion)
-    found += _pair(spectra, "forward", "ax", (motion.speed, "ax"), f"ax and d({motion.speed})/dt", tilted=True)
+    found += _pair(
+        spectra, "forward", "ax", (motion.speed, "ax"), f"ax and d({motion.speed})/dt", tilted=True
+    )
     found += _pair(spectra, "yaw_rate_ref", "yaw_rate", ("yaw_rate_ref", "yaw_rate"), "both")
     found += _pair(spectra, "d(vx_ref)", "d(vx)", ("vx_ref", "vx"), "both")
     for name in ("motor_speed", "wheel speeds"):
         found += _pair(spectra, f"d({motion.speed})", f"d({name})", (motion.speed, name), "both")
-    found += _pair(spectra, "slip of vy_ref", "sideslip_ref", ("vy_ref", "sideslip_ref"), f"sideslip_ref and atan2(vy_ref, {motion.speed})")
+    found += _pair(
+        spectra,
+        "slip of vy_ref",
+        "sideslip_ref",
+        ("vy_ref", "sideslip_ref"),
+        f"sideslip_ref and atan2(vy_ref, {motion.speed})",
+    )
     return [delay for delay in found if not {delay.channel, delay.against} & slow]
 
 
@@ -115,7 +140,13 @@ def _lateral(motion: Motion) -> list[Delay]:
 
 
 def _pair(
-    spectra: CrossSpectra, source: str, follower: str, channels: tuple[str, str], signals: str, *, tilted: bool = False
+    spectra: CrossSpectra,
+    source: str,
+    follower: str,
+    channels: tuple[str, str],
+    signals: str,
+    *,
+    tilted: bool = False,
 ) -> list[Delay]:
     if not {source, follower} <= set(spectra.names):
         return []
@@ -144,7 +175,12 @@ def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
     """A warning for every channel that is later than another."""
     remedy = "{{name: delay_correction, delay: {:.3f}, channels: [{}]}} takes it off"
     return [
-        Finding("warning", "delay", one.channels[0], f"{one.evidence}; {remedy.format(one.delay, ', '.join(one.channels))}")
+        Finding(
+            "warning",
+            "delay",
+            one.channels[0],
+            f"{one.evidence}; {remedy.format(one.delay, ', '.join(one.channels))}",
+        )
         for one in _late(delays)
     ]
 
@@ -154,20 +190,51 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
 
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
     """
-    beyond = [own for own in delays if abs(own.delay.value) - own.delay.half_width > LONGEST_UNREPORTED]  # with its whole interval
+    beyond = [
+        own for own in delays if abs(own.delay.value) - own.delay.half_width > LONGEST_UNREPORTED
+    ]  # with its whole interval
     late = [delay if delay.delay.value > 0.0 else delay.turned for delay in beyond]
-    late = [delay for delay in late if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")]
-    within = [own for own in delays if abs(own.delay.value) + own.delay.half_width < LONGEST_UNREPORTED]
+    late = [
+        delay
+        for delay in late
+        if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")
+    ]
+    within = [
+        own for own in delays if abs(own.delay.value) + own.delay.half_width < LONGEST_UNREPORTED
+    ]
     punctual = {delay.channel for delay in within if delay.against.endswith(REFERENCE_SUFFIX)}
-    late = [delay for delay in late if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))]
+    late = [
+        delay
+        for delay in late
+        if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))
+    ]
     found = []
     for channel in dict.fromkeys(delay.channel for delay in late):
         own = [delay for delay in late if delay.channel == channel]
-        signals = "; ".join(dict.fromkeys(delay.signals for delay in own if delay.signals != "both"))
-        intervals = [(delay.against, *(1e3 * ms for ms in (delay.delay.value, delay.delay.low, delay.delay.high))) for delay in own]
-        figures = " and ".join(f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f}) behind {name}" for name, ms, low, high in intervals)
-        text = f"is late{' with the other wheels' if channel in DELAYED else ''}, {figures}" + (f", from {signals}" if signals else "")
+        signals = "; ".join(
+            dict.fromkeys(delay.signals for delay in own if delay.signals != "both")
+        )
+        intervals = [
+            (
+                delay.against,
+                *(1e3 * ms for ms in (delay.delay.value, delay.delay.low, delay.delay.high)),
+            )
+            for delay in own
+        ]
+        figures = " and ".join(
+            f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f}) behind {name}"
+            for name, ms, low, high in intervals
+        )
+        text = f"is late{' with the other wheels' if channel in DELAYED else ''}, {figures}" + (
+            f", from {signals}" if signals else ""
+        )
         if [delay.against for delay in own] == ["vx"]:
             text += "; or vx comes from wheels, whose slip makes it lead"
-        found.append(Late(DELAYED.get(channel, (channel,)), round(max(delay.delay.value for delay in own), 3), text))
+        found.append(
+            Late(
+                DELAYED.get(channel, (channel,)),
+                round(max(delay.delay.value for delay in own), 3),
+                text,
+            )
+        )
     return found

@@ -31,7 +31,9 @@ IMU_CHANNELS = ("ax", "ay", "yaw_rate")
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
 TILT_GAIN = 0.1  # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g
-TILT_LIKENESS = 0.3  # assumed correlation of the remaining tilt of body and road with the effect of a parameter
+TILT_LIKENESS = (
+    0.3  # assumed correlation of the remaining tilt of body and road with the effect of a parameter
+)
 
 ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
 
@@ -42,7 +44,9 @@ LEAST_CORRELATION = 0.5
 LARGEST_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
 LARGEST_NOISE_SHARE = 0.05
 SHORTEST_KERNEL = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
-LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (2.0 * math.pi * SHORTEST_KERNEL)  # of the sampling rate
+LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (
+    2.0 * math.pi * SHORTEST_KERNEL
+)  # of the sampling rate
 KERNEL_REACH = 6.0  # standard deviations
 N_ITERATIONS = 60
 SETTLED = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
@@ -50,8 +54,15 @@ SMALLEST_VARIANCE = 1e-24
 SUSPICIOUS = 3.0  # standard uncertainties
 MORE_MOTION = "more turning, braking and accelerating"
 
-TILT_PRIOR = {"tilt_gain_x": TILT_GAIN, "tilt_gain_y": TILT_GAIN, "tilt_lag_x": TILT_LAG_GAIN, "tilt_lag_y": TILT_LAG_GAIN}
-NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)  # all parameters of a sensor that is aligned
+TILT_PRIOR = {
+    "tilt_gain_x": TILT_GAIN,
+    "tilt_gain_y": TILT_GAIN,
+    "tilt_lag_x": TILT_LAG_GAIN,
+    "tilt_lag_y": TILT_LAG_GAIN,
+}
+NOTHING = dict.fromkeys(
+    [*IMU_PARAMETERS, *TILT_PRIOR], 0.0
+)  # all parameters of a sensor that is aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +84,9 @@ class ImuFit:
     scatter: FloatArray  # standard uncertainty of each by the scatter of the residuals, (N,)
     tilt: FloatArray  # standard uncertainty of each by roll and pitch that are not modelled, (N,)
     blocks: int  # number of blocks that ``scatter`` comes from
-    suspects: Mapping[str, tuple[float, float]]  # name -> value and standard uncertainty of others that the residuals suggest
+    suspects: Mapping[
+        str, tuple[float, float]
+    ]  # name -> value and standard uncertainty of others that the residuals suggest
     correlation: Correlation  # by which the delay was looked for first
     signals: Signals  # that were compared
 
@@ -87,21 +100,42 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
         expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, model.measured))
         if "offset_ax" in names:
             expected, shown = expected - expected.mean(), shown - shown.mean()
-        start["yaw"] = -float(np.angle(np.vdot(expected, shown)))  # brings both together best, without delay and lever arm
+        start["yaw"] = -float(
+            np.angle(np.vdot(expected, shown))
+        )  # brings both together best, without delay and lever arm
     correlation = _cross_correlation(signals, start["yaw"], settings)
     if "delay" in names:
         _require_peak(recording, correlation, settings)
         start["delay"] = correlation.peak
     noise = _noise_of_columns(signals)
-    tilts = [name for name in TILT_PRIOR if settings.tilt > 0 and _is_seen(columns[name], noise[name])]
+    tilts = [
+        name for name in TILT_PRIOR if settings.tilt > 0 and _is_seen(columns[name], noise[name])
+    ]
     fit = _most_likely(model, start, [*names, *tilts], names)
     _require_identified(signals, fit, names, noise)
     if "delay" in names and abs(fit.values["delay"]) > settings.max_delay:
-        raise DataError(f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay")
-    blocks, columns, rate_hz = n_blocks(signals.duration), model(fit.values)[1], signals.rate_hz / signals.smoothing.step
-    uncertainties = partial(_uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=rate_hz)
+        raise DataError(
+            f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay"
+        )
+    blocks, columns, rate_hz = (
+        n_blocks(signals.duration),
+        model(fit.values)[1],
+        signals.rate_hz / signals.smoothing.step,
+    )
+    uncertainties = partial(
+        _uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=rate_hz
+    )
     scatter, tilt = (sizes[: len(names)] for sizes in uncertainties(fit))
-    return ImuFit(names, fit.values, scatter, tilt, blocks, _suspects(fit, columns, uncertainties), correlation, signals)
+    return ImuFit(
+        names,
+        fit.values,
+        scatter,
+        tilt,
+        blocks,
+        _suspects(fit, columns, uncertainties),
+        correlation,
+        signals,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +148,9 @@ class Signals:
     velocity: ComplexArray  # vx + i·vy of the reference, (T,)
     gyro: FloatArray  # yaw rate of the sensor, (T,)
     reference_rate: FloatArray | None  # yaw rate of the reference if there is one, (T,)
-    gravity: ComplexArray | None  # in the accelerometer by measured roll and pitch; None where they are not measured or not used, (T,)
+    gravity: (
+        ComplexArray | None
+    )  # in the accelerometer by measured roll and pitch; None where they are not measured or not used, (T,)
     smoothing: Smoothing
     margin: int  # samples at either end that serve filtering and shifting only
 
@@ -149,7 +185,9 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     """Signals of a recording; raises `DataError` where one is missing, short or has gaps, `ConfigurationError` for too high a cut-off."""
     asked = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
-        raise DataError(f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against")
+        raise DataError(
+            f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against"
+        )
     speed = "vx_ref" if "vx_ref" in recording else "vx"
     optional = [name for name in ("yaw_rate_ref", "roll", "pitch") if name in recording]
     require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref", *optional], asked)
@@ -163,9 +201,21 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
     check_limit("filter_samples", lags, what, ConfigurationError)
     shift = math.ceil(lags) if "delay" in settings.estimate else 0
-    measured, velocity = recording["ax"] + 1j * recording["ay"], recording[speed] + 1j * recording["vy_ref"]
+    measured, velocity = (
+        recording["ax"] + 1j * recording["ay"],
+        recording[speed] + 1j * recording["vy_ref"],
+    )
     rates = recording["yaw_rate"], recording.channels.get("yaw_rate_ref")
-    signals = Signals(recording, speed, measured, velocity, *rates, gravity, smoothing, margin=smoothing.reach + shift)
+    signals = Signals(
+        recording,
+        speed,
+        measured,
+        velocity,
+        *rates,
+        gravity,
+        smoothing,
+        margin=smoothing.reach + shift,
+    )
     require_length(recording, signals.duration, 2 * signals.margin / recording.rate_hz)
     return signals
 
@@ -180,7 +230,11 @@ class ImuModel:
         self._gravity = 0.0 if signals.gravity is None else low(signals.gravity)
         self._clock = np.arange(len(signals.measured)) / signals.rate_hz
         self._velocity = CubicSpline(self._clock, signals.velocity)
-        self._rate = None if signals.reference_rate is None else CubicSpline(self._clock, signals.reference_rate)
+        self._rate = (
+            None
+            if signals.reference_rate is None
+            else CubicSpline(self._clock, signals.reference_rate)
+        )
 
     def __call__(self, at: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Prediction (C, T) and its derivatives, name -> (C, T), at a set of parameters."""
@@ -189,10 +243,15 @@ class ImuModel:
         v, v_dot = self._velocity(now), self._velocity(now, 1)
         r = self.signals.gyro - at["offset_yaw_rate"] if self._rate is None else self._rate(now)
         lever = at["lever_x"] + 1j * at["lever_y"]
-        gain, lag = (complex(at[f"tilt_{what}_x"], at[f"tilt_{what}_y"]) for what in ("gain", "lag"))
+        gain, lag = (
+            complex(at[f"tilt_{what}_x"], at[f"tilt_{what}_y"]) for what in ("gain", "lag")
+        )
 
         rv = r * v
-        acceleration, jerk = low(v, 1) + 1j * low(rv), low(v, 2) + 1j * low(rv, 1)  # at the reference point
+        acceleration, jerk = (
+            low(v, 1) + 1j * low(rv),
+            low(v, 2) + 1j * low(rv, 1),
+        )  # at the reference point
         r_low, r_dot, r_squared = low(r), low(r, 1), low(r * r)
         arm = 1j * r_dot - r_squared
         tilted = acceleration + _axiswise(gain, acceleration) + _axiswise(lag, jerk)
@@ -200,9 +259,17 @@ class ImuModel:
         plane = turned * (tilted + arm * lever + self._gravity)
 
         if self._rate is None:  # the yaw rate is on the sensor's own clock
-            late, late_dot, late_arm = low(v, 2) + 1j * low(r * v_dot), low(v, 3) + 1j * low(r * v_dot, 1), np.zeros_like(arm)
+            late, late_dot, late_arm = (
+                low(v, 2) + 1j * low(r * v_dot),
+                low(v, 3) + 1j * low(r * v_dot, 1),
+                np.zeros_like(arm),
+            )
         else:
-            late, late_dot, late_arm = jerk, low(v, 3) + 1j * low(rv, 2), 1j * low(r, 2) - low(r * r, 1)
+            late, late_dot, late_arm = (
+                jerk,
+                low(v, 3) + 1j * low(rv, 2),
+                1j * low(r, 2) - low(r * r, 1),
+            )
         by_delay = late + _axiswise(gain, late) + _axiswise(lag, late_dot) + late_arm * lever
         rows, ones = self.signals.as_rows, np.ones(len(plane), dtype=np.complex128)
         columns = {
@@ -221,9 +288,17 @@ class ImuModel:
         if self._rate is None:
             by_rate, by_rate_dot = -1j * low(v), -1j * low(v, 1)
             columns["offset_yaw_rate"] = rows(
-                turned * (by_rate + _axiswise(gain, by_rate) + _axiswise(lag, by_rate_dot) + 2.0 * r_low * lever)
+                turned
+                * (
+                    by_rate
+                    + _axiswise(gain, by_rate)
+                    + _axiswise(lag, by_rate_dot)
+                    + 2.0 * r_low * lever
+                )
             )
-        prediction = rows(plane + at["offset_ax"] + 1j * at["offset_ay"], r_low + at["offset_yaw_rate"])
+        prediction = rows(
+            plane + at["offset_ax"] + 1j * at["offset_ay"], r_low + at["offset_yaw_rate"]
+        )
         return prediction, columns
 
 
@@ -256,12 +331,18 @@ class Fit:
     @property
     def gradient(self) -> FloatArray:
         """Half the decrease of the cost by each parameter, (P,)."""
-        return np.einsum("pct,ct,c->p", self.columns, self.error, self.weights) - self.prior @ self.point
+        return (
+            np.einsum("pct,ct,c->p", self.columns, self.error, self.weights)
+            - self.prior @ self.point
+        )
 
     @property
     def information(self) -> FloatArray:
         """Inverse of the covariance, were the errors white, (P, P)."""
-        return np.einsum("pct,qct,c->pq", self.columns, self.columns, self.weights, optimize=True) + self.prior
+        return (
+            np.einsum("pct,qct,c->pq", self.columns, self.columns, self.weights, optimize=True)
+            + self.prior
+        )
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
@@ -298,17 +379,23 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
     return Correlation(what, at_end, float(lags[top] + shift) / signals.rate_hz, float(value[top]))
 
 
-def _require_peak(recording: Recording, correlation: Correlation, settings: AlignmentSettings) -> None:
+def _require_peak(
+    recording: Recording, correlation: Correlation, settings: AlignmentSettings
+) -> None:
     """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that are searched."""
     if correlation.highest < LEAST_CORRELATION:
         what = f"{correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most"
         fix = f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
         raise DataError(f"recording '{recording.id}': {what}; {fix}")
     if correlation.at_end:
-        raise DataError(f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay")
+        raise DataError(
+            f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay"
+        )
 
 
-def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[str], asked: Sequence[str]) -> Fit:
+def _most_likely(
+    model: ImuModel, start: Mapping[str, float], names: Sequence[str], asked: Sequence[str]
+) -> Fit:
     """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the mean square of its own residuals."""
     prior = np.diag([TILT_PRIOR[name] ** -2 if name in TILT_PRIOR else 0.0 for name in names])
 
@@ -316,7 +403,9 @@ def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[st
         predicted, by_name = model(values)
         error = model.measured - predicted
         weights = 1.0 / np.maximum(np.mean(np.square(error), axis=1), SMALLEST_VARIANCE)
-        return Fit(names, dict(values), error, np.stack([by_name[name] for name in names]), weights, prior)
+        return Fit(
+            names, dict(values), error, np.stack([by_name[name] for name in names]), weights, prior
+        )
 
     fit, damping = fit_at(start), 1e-4
     for _ in range(N_ITERATIONS):
@@ -332,20 +421,30 @@ def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[st
         if settled:
             return fit
     fix = f"ask for fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
-    raise DataError(f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; {fix}")
+    raise DataError(
+        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; {fix}"
+    )
 
 
-def require_condition(recording: Recording, information: FloatArray, names: Sequence[str], asked: Sequence[str]) -> None:
+def require_condition(
+    recording: Recording, information: FloatArray, names: Sequence[str], asked: Sequence[str]
+) -> None:
     """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number of the scaled problem is too large."""
     scale = np.sqrt(np.diag(information))
     silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
     if silent:
-        raise DataError(f"recording '{recording.id}': nothing in it depends on {listed(silent)}; the drive needs turning and accelerating")
+        raise DataError(
+            f"recording '{recording.id}': nothing in it depends on {listed(silent)}; the drive needs turning and accelerating"
+        )
     condition = condition_of(information)
     if condition <= LARGEST_CONDITION:
         return
     weakest = np.linalg.eigh(information / scale / scale[:, None])[1][:, 0]
-    confused = [name if name in asked else "tilt of the body" for name, part in zip(names, weakest, strict=True) if abs(part) > 0.3]
+    confused = [
+        name if name in asked else "tilt of the body"
+        for name, part in zip(names, weakest, strict=True)
+        if abs(part) > 0.3
+    ]
     what = f"{listed(list(dict.fromkeys(confused)))} apart (condition number {condition:.2g}, at most {LARGEST_CONDITION:g})"
     fix = "ask for fewer quantities, or use a drive with varying speed and turns both ways"
     raise DataError(f"recording '{recording.id}': this drive cannot tell {what}; {fix}")
@@ -354,7 +453,9 @@ def require_condition(recording: Recording, information: FloatArray, names: Sequ
 def condition_of(information: FloatArray) -> float:
     """Condition number of a least-squares problem whose columns are scaled to length 1; infinite where one is zero."""
     scale = np.sqrt(np.diag(information))
-    values = np.linalg.eigvalsh(information / scale / scale[:, None]) if scale.all() else np.zeros(1)
+    values = (
+        np.linalg.eigvalsh(information / scale / scale[:, None]) if scale.all() else np.zeros(1)
+    )
     return math.sqrt(values[-1] / values[0]) if values[0] > 0 else math.inf
 
 
@@ -365,11 +466,17 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
     """
     speed_noise, side_noise = _noise(signals.velocity.real), _noise(signals.velocity.imag)
     rate_noise = _noise(signals.gyro if signals.reference_rate is None else signals.reference_rate)
-    level, slope, bend = (float(np.linalg.norm(signals.smoothing.kernel(order))) for order in range(3))
+    level, slope, bend = (
+        float(np.linalg.norm(signals.smoothing.kernel(order))) for order in range(3)
+    )
     speed, turning = rms(np.abs(signals.velocity)), rms(signals.gyro)
     ahead, aside = slope * speed_noise, math.hypot(slope * side_noise, level * speed * rate_noise)
     arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
-    by_offset = (level * side_noise, level * speed_noise, 0.0) if signals.reference_rate is None else (0.0, 0.0, 0.0)
+    by_offset = (
+        (level * side_noise, level * speed_noise, 0.0)
+        if signals.reference_rate is None
+        else (0.0, 0.0, 0.0)
+    )
     return dict.fromkeys(IMU_PARAMETERS, (0.0, 0.0, 0.0)) | {
         "lever_x": (arm, arm, 0.0),
         "lever_y": (arm, arm, 0.0),
@@ -388,15 +495,26 @@ def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
     return sum(size**2 for size in noise) <= LARGEST_NOISE_SHARE * float(column.var(axis=1).sum())
 
 
-def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise: Mapping[str, tuple[float, float, float]]) -> None:
+def _require_identified(
+    signals: Signals,
+    fit: Fit,
+    asked: Sequence[str],
+    noise: Mapping[str, tuple[float, float, float]],
+) -> None:
     """Refuse parameters whose column, without the share of the others, does not stand well above the noise of yaw rate and reference."""
     unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(asked), : len(asked)]))
     for index, name in enumerate(asked):
-        share = fit.error.shape[1] * float(fit.weights @ np.square(noise[name][: len(fit.weights)])) / unique[index]
+        share = (
+            fit.error.shape[1]
+            * float(fit.weights @ np.square(noise[name][: len(fit.weights)]))
+            / unique[index]
+        )
         if share > LARGEST_NOISE_SHARE:
             what = f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %)"
             fix = f"lower the cut-off, or use a drive with {MORE_MOTION}"
-            raise DataError(f"recording '{signals.recording.id}': {name} cannot be estimated: {what}; {fix}")
+            raise DataError(
+                f"recording '{signals.recording.id}': {name} cannot be estimated: {what}; {fix}"
+            )
 
 
 def _noise(samples: FloatArray) -> float:
@@ -438,7 +556,9 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     return (blocks - 1) / blocks * moved.T @ moved + inverse @ fit.prior @ inverse
 
 
-def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+def _uncertainties(
+    fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
     """Standard uncertainties of the parameters by scatter and by tilt, (P,) each.
 
     Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving, or following the accelerations where
@@ -448,13 +568,24 @@ def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blo
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
     if tilt == 0.0:
         return scatter, np.zeros(len(fit.names))
-    pull = np.linalg.solve(fit.information, (fit.columns[:, :2] * fit.weights[:2, None]).reshape(len(fit.names), -1))
-    pull = pull.reshape(len(fit.names), 2, -1)  # change of each parameter by an error of either axis at one time
+    pull = np.linalg.solve(
+        fit.information, (fit.columns[:, :2] * fit.weights[:2, None]).reshape(len(fit.names), -1)
+    )
+    pull = pull.reshape(
+        len(fit.names), 2, -1
+    )  # change of each parameter by an error of either axis at one time
     moving = pull - pull.mean(axis=2, keepdims=True)
     deviation = _deviation(ROAD_CUTOFF, rate_hz)
-    slow, road = (gaussian_filter1d(samples, deviation, axis=-1, mode="reflect") for samples in (moving, fit.error[:2]))
+    slow, road = (
+        gaussian_filter1d(samples, deviation, axis=-1, mode="reflect")
+        for samples in (moving, fit.error[:2])
+    )
     body = GRAVITY * tilt
-    variance = np.square(body * pull.sum(axis=2)) + _likened(moving, body) + _likened(slow, road.std(axis=1))
+    variance = (
+        np.square(body * pull.sum(axis=2))
+        + _likened(moving, body)
+        + _likened(slow, road.std(axis=1))
+    )
     total = variance.sum(axis=1)
     for name in [name for name in TILT_PRIOR if name not in fit.names]:
         total += np.square(TILT_PRIOR[name] * np.einsum("pct,ct->p", pull, columns[name][:2]))
@@ -462,13 +593,20 @@ def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blo
 
 
 def _suspects(
-    fit: Fit, columns: Mapping[str, FloatArray], uncertainties: Callable[[Fit], tuple[FloatArray, FloatArray]]
+    fit: Fit,
+    columns: Mapping[str, FloatArray],
+    uncertainties: Callable[[Fit], tuple[FloatArray, FloatArray]],
 ) -> dict[str, tuple[float, float]]:
     """Parameters that are no part of the fit and that one more step would move by more than three standard uncertainties."""
     suspects = {}
     for name in [name for name in IMU_PARAMETERS if name not in fit.names]:
         names = [*fit.names, name]
-        wider = replace(fit, names=names, columns=np.stack([columns[each] for each in names]), prior=np.pad(fit.prior, (0, 1)))
+        wider = replace(
+            fit,
+            names=names,
+            columns=np.stack([columns[each] for each in names]),
+            prior=np.pad(fit.prior, (0, 1)),
+        )
         if condition_of(wider.information) > LARGEST_CONDITION:
             continue
         step = np.linalg.solve(wider.information, wider.gradient)
@@ -501,15 +639,23 @@ class Smoothing:
         """Every how many samples one is kept."""
         return max(math.floor(self.deviation / SHORTEST_KERNEL), 1)
 
-    def __call__(self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0) -> NDArray[Any]:
+    def __call__(
+        self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0
+    ) -> NDArray[Any]:
         """A derivative of the low-passed samples (T,), real or complex, from ``margin`` (at least the reach) to as many before the end."""
         if np.iscomplexobj(samples):  # faster than a real kernel on complex samples
-            ahead, aside = (self(part, order, margin=margin, step=step) for part in (samples.real, samples.imag))
+            ahead, aside = (
+                self(part, order, margin=margin, step=step) for part in (samples.real, samples.imag)
+            )
             return ahead + 1j * aside
         step = step or self.step
         inside = samples[margin - self.reach : len(samples) - margin + self.reach]
-        padding = -2 * self.reach % step  # the first sample whose kernel is whole is to be the first of a step
-        smooth = signal.upfirdn(self.kernel(order), np.concatenate([np.zeros(padding), inside]), down=step)
+        padding = (
+            -2 * self.reach % step
+        )  # the first sample whose kernel is whole is to be the first of a step
+        smooth = signal.upfirdn(
+            self.kernel(order), np.concatenate([np.zeros(padding), inside]), down=step
+        )
         first, count = (padding + 2 * self.reach) // step, -(-(len(samples) - 2 * margin) // step)
         return smooth[first : first + count]
 
@@ -517,7 +663,9 @@ class Smoothing:
         """Impulse response of a derivative of the low-pass; its norm is the deviation that white noise of deviation 1 has after it."""
         impulse = np.zeros(2 * self.reach + 1)
         impulse[self.reach] = 1.0
-        kernel = gaussian_filter1d(impulse, self.deviation, order=order, mode="constant", truncate=KERNEL_REACH)
+        kernel = gaussian_filter1d(
+            impulse, self.deviation, order=order, mode="constant", truncate=KERNEL_REACH
+        )
         return np.asarray(kernel * self.rate_hz**order, dtype=np.float64)
 
 
@@ -539,7 +687,9 @@ def require_complete(recording: Recording, names: Sequence[str], asked: str) -> 
     """Refuse, by a `DataError`, channels that are not there or have gaps."""
     for name in names:
         if np.isnan(recording[name]).any():
-            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps; cut a range without them to estimate {asked}")
+            raise DataError(
+                f"recording '{recording.id}': channel '{name}' has gaps; cut a range without them to estimate {asked}"
+            )
 
 
 def _deviation(cutoff_hz: float, rate_hz: float) -> float:

@@ -8,11 +8,22 @@ import numpy as np
 import scipy
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.spectra import LARGEST_LAG, RATE_KEPT, ComplexArray, CrossSpectra, Measured, cross_spectra, jackknife, smoothed
+from vehest.alignment.spectra import (
+    LARGEST_LAG,
+    RATE_KEPT,
+    ComplexArray,
+    CrossSpectra,
+    Measured,
+    cross_spectra,
+    jackknife,
+    smoothed,
+)
 from vehest.constants import FloatArray
 
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
-LARGEST_GAIN = 2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
+LARGEST_GAIN = (
+    2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
+)
 LEAST_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
 N_SHIFTS = 6
 SETTLED = 1e-3  # s
@@ -36,7 +47,11 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
     Returns:
         None where a channel is missing, the drive is too short, or d(vy)/dt does not explain ay without vx·yaw_rate.
     """
-    if not motion.velocity or not {"ay", "yaw_rate"} <= set(motion.channels) or len(motion) < FEWEST_SAMPLES:
+    if (
+        not motion.velocity
+        or not {"ay", "yaw_rate"} <= set(motion.channels)
+        or len(motion) < FEWEST_SAMPLES
+    ):
         return None
     slower = motion.slower(max(int(motion.rate_hz / RATE_KEPT), 1))
     turning = sliding = 0.0
@@ -46,7 +61,10 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
         if found is None or weighted is None:
             return None
         spectra, (start, weight) = found, weighted
-        if max(map(abs, start)) < SETTLED or max(abs(turning + start[0]), abs(sliding + start[1])) > LARGEST_LAG:
+        if (
+            max(map(abs, start)) < SETTLED
+            or max(abs(turning + start[0]), abs(sliding + start[1])) > LARGEST_LAG
+        ):
             break
         turning, sliding = turning + start[0], sliding + start[1]
 
@@ -65,24 +83,41 @@ def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | N
     ay, yaw_rate = motion["ay"], motion["yaw_rate"]
     if turning or sliding:
         ay = scipy.interpolate.CubicSpline(clock, ay)(np.clip(clock - sliding, 0.0, clock[-1]))
-        yaw_rate = scipy.interpolate.CubicSpline(clock, yaw_rate)(np.clip(clock + turning - sliding, 0.0, clock[-1]))
-    shown = (ay, motion.vx * yaw_rate, motion.sliding, motion.derivative(yaw_rate), motion.derivative(motion.vx) * yaw_rate)
+        yaw_rate = scipy.interpolate.CubicSpline(clock, yaw_rate)(
+            np.clip(clock + turning - sliding, 0.0, clock[-1])
+        )
+    shown = (
+        ay,
+        motion.vx * yaw_rate,
+        motion.sliding,
+        motion.derivative(yaw_rate),
+        motion.derivative(motion.vx) * yaw_rate,
+    )
     if not all(0.0 < np.ptp(samples) < np.inf for samples in shown):
         return None
     return cross_spectra(dict(zip(SIGNALS, shown, strict=True)), motion.rate_hz, motion.moving)
 
 
-def _weighted(whole: ComplexArray, omega: FloatArray) -> tuple[tuple[float, float], FloatArray] | None:
+def _weighted(
+    whole: ComplexArray, omega: FloatArray
+) -> tuple[tuple[float, float], FloatArray] | None:
     """Both delays, and the weights that the residual leaves, (F,)."""
     floor = LOWEST_RESIDUAL * float(whole[:, 0, 0].real.max())
-    weight, start, explained = np.ones(len(omega)) / max(floor, np.finfo(float).tiny), (0.0, 0.0), 0.0
+    weight, start, explained = (
+        np.ones(len(omega)) / max(floor, np.finfo(float).tiny),
+        (0.0, 0.0),
+        0.0,
+    )
     for _ in range(N_WEIGHTINGS):
         fitted = _fit(whole, omega, weight, start)
         if fitted is None:
             return None
         start, residual, explained = fitted
         weight = 1.0 / np.maximum(smoothed(residual), max(floor, np.finfo(float).tiny))
-    if explained < LEAST_SLIDING_SHARE or not 1.0 / LARGEST_GAIN < _sliding_gain(whole, omega, weight, start) < LARGEST_GAIN:
+    if (
+        explained < LEAST_SLIDING_SHARE
+        or not 1.0 / LARGEST_GAIN < _sliding_gain(whole, omega, weight, start) < LARGEST_GAIN
+    ):
         return None
     return start, weight
 
@@ -94,7 +129,9 @@ def _fit(
     turning, sliding = start
     for _ in range(N_STEPS):
         p, d = np.exp(1j * omega * turning), np.exp(1j * omega * sliding)
-        columns = np.zeros((len(omega), 5, 5), dtype=np.complex128)  # (F, signals, parameters): g, g·τ₁, g·τ₂, x, y
+        columns = np.zeros(
+            (len(omega), 5, 5), dtype=np.complex128
+        )  # (F, signals, parameters): g, g·τ₁, g·τ₂, x, y
         columns[:, 1, 0], columns[:, 2, 0], columns[:, 3, 3], columns[:, 4, 4] = p, d, p, p
         columns[:, 1, 1], columns[:, 2, 2] = 1j * omega * p, 1j * omega * d
         left = columns.conj().transpose(0, 2, 1)
@@ -104,14 +141,19 @@ def _fit(
         if not (np.isfinite(scale).all() and (scale > 0.0).all()):
             return None
         try:
-            values = np.linalg.solve(normal / scale / scale[:, None] + 1e-9 * np.eye(5), right / scale) / scale
+            values = (
+                np.linalg.solve(normal / scale / scale[:, None] + 1e-9 * np.eye(5), right / scale)
+                / scale
+            )
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(values).all() or values[0] == 0.0:
             return None
         turning += float(np.clip(values[1] / values[0], -LARGEST_STEP, LARGEST_STEP))
         sliding += float(np.clip(values[2] / values[0], -LARGEST_STEP, LARGEST_STEP))
-        turning, sliding = (min(max(delay, -LARGEST_LAG), LARGEST_LAG) for delay in (turning, sliding))
+        turning, sliding = (
+            min(max(delay, -LARGEST_LAG), LARGEST_LAG) for delay in (turning, sliding)
+        )
         if np.abs(values[1:3]).max() < 1e-6 * abs(values[0]):
             break
     mix = -np.einsum("fsp,p->fs", columns, values)
@@ -119,12 +161,20 @@ def _fit(
     residual = np.einsum("fs,fst,ft->f", mix.conj(), spectrum, mix).real
     mix[:, 2] = 0.0
     before = float(weight @ np.einsum("fs,fst,ft->f", mix.conj(), spectrum, mix).real)
-    return (turning, sliding), residual, 1.0 - float(weight @ residual) / before if before > 0.0 else 0.0
+    return (
+        (turning, sliding),
+        residual,
+        1.0 - float(weight @ residual) / before if before > 0.0 else 0.0,
+    )
 
 
-def _sliding_gain(spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, delays: tuple[float, float]) -> float:
+def _sliding_gain(
+    spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, delays: tuple[float, float]
+) -> float:
     """The gain that d(vy)/dt would have, were it fitted apart from that of vx·yaw_rate."""
-    advance = np.exp(1j * np.multiply.outer(omega, [0.0, delays[0], delays[1], delays[0], delays[0]]))
+    advance = np.exp(
+        1j * np.multiply.outer(omega, [0.0, delays[0], delays[1], delays[0], delays[0]])
+    )
     own = np.einsum("fst,fs,ft,f->st", spectrum, advance.conj(), advance, weight).real
     gains = np.linalg.lstsq(own[1:, 1:], own[1:, 0], rcond=None)[0]
     return float(gains[1] / gains[0]) if gains[0] != 0.0 else 0.0

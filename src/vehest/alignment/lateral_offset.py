@@ -13,7 +13,9 @@ from vehest.alignment.spectra import MOST_GROUPS, Measured, jackknife
 from vehest.constants import GRAVITY, FloatArray
 
 NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
-DOUBTFUL_OFFSET = 0.5  # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
+DOUBTFUL_OFFSET = (
+    0.5  # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
+)
 LARGEST_GYRO_OFFSET = 0.05  # rad/s
 BLOCK_SECONDS = 2.0
 FEWEST_BLOCKS = 6
@@ -34,7 +36,12 @@ def lateral_offset(motion: Motion) -> Measured | None:
     if number < FEWEST_BLOCKS:
         return None
     starts = np.linspace(0, len(left), number + 1).astype(int)[:-1]
-    sums = np.stack([np.add.reduceat(values, starts) for values in (np.ones(len(left)), turning, left, turning * turning, turning * left)])
+    sums = np.stack(
+        [
+            np.add.reduceat(values, starts)
+            for values in (np.ones(len(left)), turning, left, turning * turning, turning * left)
+        ]
+    )
     (offset,) = jackknife(sums.T, _intercept)
     return offset if math.isfinite(offset.value) and math.isfinite(offset.half_width) else None
 
@@ -42,7 +49,9 @@ def lateral_offset(motion: Motion) -> Measured | None:
 def _intercept(sums: FloatArray) -> FloatArray:
     number, turning, left, squared, product = sums.tolist()
     determinant = number * squared - turning * turning
-    return np.array([(left * squared - turning * product) / determinant if determinant > 0.0 else math.nan])
+    return np.array(
+        [(left * squared - turning * product) / determinant if determinant > 0.0 else math.nan]
+    )
 
 
 def offset_findings(motion: Motion) -> list[Finding]:
@@ -53,8 +62,14 @@ def offset_findings(motion: Motion) -> list[Finding]:
     level: Level = "warning" if abs(offset.value) > DOUBTFUL_OFFSET else "note"
     degrees = np.degrees(np.arcsin(min(abs(offset.value) / GRAVITY, 1.0)))
     turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
-    gyro = f", or an offset of yaw_rate of {turning:.3f} rad/s" if abs(turning) < LARGEST_GYRO_OFFSET else ""
-    expected = f"{motion.speed}·yaw_rate" + (f" + d({motion.velocity})/dt" if motion.velocity else "")
+    gyro = (
+        f", or an offset of yaw_rate of {turning:.3f} rad/s"
+        if abs(turning) < LARGEST_GYRO_OFFSET
+        else ""
+    )
+    expected = f"{motion.speed}·yaw_rate" + (
+        f" + d({motion.velocity})/dt" if motion.velocity else ""
+    )
     message = (
         f"lies {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) beside {expected} over the whole drive: a unit or a "
         f"road tilted by {degrees:.1f} deg{gyro}; the transform offset_correction takes it off"

@@ -66,7 +66,9 @@ class Motion:
     def forward(self) -> FloatArray:
         """Expected ``ax``: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
         gained = self.derivative(self.vx)
-        return gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
+        return (
+            gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
+        )
 
     @property
     def wheels(self) -> FloatArray:
@@ -75,27 +77,45 @@ class Motion:
 
     def derivative(self, samples: FloatArray) -> FloatArray:
         """By time, with central differences, which delay nothing."""
-        return np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64) if len(samples) > 1 else np.zeros(len(samples))
+        return (
+            np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64)
+            if len(samples) > 1
+            else np.zeros(len(samples))
+        )
 
     def slower(self, factor: int) -> Motion:
         """Means of so many samples each, at a rate that is so many times slower."""
         if factor == 1:
             return self
         count = len(self) // factor
-        channels = {name: samples[: count * factor].reshape(count, factor).mean(axis=1) for name, samples in self.channels.items()}
-        moving = np.asarray(self.moving[: count * factor].reshape(count, factor).all(axis=1), dtype=bool)
+        channels = {
+            name: samples[: count * factor].reshape(count, factor).mean(axis=1)
+            for name, samples in self.channels.items()
+        }
+        moving = np.asarray(
+            self.moving[: count * factor].reshape(count, factor).all(axis=1), dtype=bool
+        )
         return replace(self, rate_hz=self.rate_hz / factor, channels=channels, moving=moving)
 
     def corrected(self, factors: dict[str, float]) -> Motion:
         """The same with some channels multiplied by factors."""
-        return replace(self, channels={name: samples * factors.get(name, 1.0) for name, samples in self.channels.items()})
+        return replace(
+            self,
+            channels={
+                name: samples * factors.get(name, 1.0) for name, samples in self.channels.items()
+            },
+        )
 
 
 def motion_of(recording: Recording, moving: BoolArray) -> Motion:
     """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``: where the car does not stand."""
-    channels = {name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None}
+    channels = {
+        name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None
+    }
     speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
-    velocity = next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""
+    velocity = (
+        next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""
+    )
     return Motion(recording.rate_hz, channels, speed, velocity, moving)
 
 

@@ -32,7 +32,9 @@ class AlignmentSettings:
     max_delay: float = 0.5  # largest delay that is looked for, either way [s]
     tilt: float = 0.001  # standard deviation of roll and pitch beside those that follow the accelerations [rad]; 0: levelled
     wheelbase: float | None = None  # needed for the steering ratio [m]
-    steering_channel: str | None = None  # of the steering ratio; by default ``handwheel``, or ``steer`` where there is none
+    steering_channel: str | None = (
+        None  # of the steering ratio; by default ``handwheel``, or ``steer`` where there is none
+    )
     max_ay: float = 3.0  # lateral acceleration up to which steering is taken as linear [m/s²]
     min_speed: float = 5.0  # speed from which the steering relation is used [m/s]
 
@@ -48,11 +50,15 @@ class AlignmentSettings:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ConfigurationError(f"alignment: {name} must be positive, not {value}")
         if not (math.isfinite(self.tilt) and self.tilt >= 0):
-            raise ConfigurationError(f"alignment: tilt must be zero or positive [rad], not {self.tilt}")
+            raise ConfigurationError(
+                f"alignment: tilt must be zero or positive [rad], not {self.tilt}"
+            )
         if "steering_ratio" in self.estimate and self.wheelbase is None:
             raise ConfigurationError("the steering ratio needs the wheelbase [m]")
 
     @property
     def kinematic(self) -> tuple[str, ...]:
         """Quantities that need a reference, in the order of `QUANTITIES`."""
-        return tuple(name for name in QUANTITIES if name in self.estimate and name != "steering_ratio")
+        return tuple(
+            name for name in QUANTITIES if name in self.estimate and name != "steering_ratio"
+        )

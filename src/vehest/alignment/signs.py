@@ -36,7 +36,10 @@ LONGITUDINAL_TOLERANCE = 3.0  # of ax, which pitch, grade and slip change; its w
 EXACTNESS = 1.25  # within which a wrong factor must explain a scale
 _KILOMETRES = ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h"))
 _STANDARD_GRAVITY = ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g"))
-_DEGREES_A_SECOND = ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s"))
+_DEGREES_A_SECOND = (
+    (DEGREES_PER_RADIAN, "deg/s"),
+    (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s"),
+)
 _DEGREES = ((DEGREES_PER_RADIAN, "deg"), (1.0 / DEGREES_PER_RADIAN, "rad taken for deg"))
 WRONG_FACTORS = {
     **dict.fromkeys(("vx", "vx_ref", "vy_ref"), _KILOMETRES),
@@ -45,7 +48,10 @@ WRONG_FACTORS = {
     "sideslip_ref": _DEGREES,
 }
 """Channel -> factor and unit of each mistake."""
-UNSAFE = {"yaw_rate": "deg/s", "sideslip_ref": "deg"}  # units that stop an ingest: no estimator survives them
+UNSAFE = {
+    "yaw_rate": "deg/s",
+    "sideslip_ref": "deg",
+}  # units that stop an ingest: no estimator survives them
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,9 @@ class Relation:
     powers: tuple[int, ...]  # of each channel in left over right, 1 or -1
     scale: float  # left over right
     correlation: float
-    tolerance: float = TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
+    tolerance: float = (
+        TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
+    )
     least_correlation: float = SCALE_CORRELATION  # below which the scale is unknown
 
     @property
@@ -68,7 +76,10 @@ class Relation:
 
     def holds(self, scale: float) -> bool:
         """Whether left over right could be such."""
-        return abs(self.correlation) < self.least_correlation or 1.0 / self.tolerance < abs(scale) < self.tolerance
+        return (
+            abs(self.correlation) < self.least_correlation
+            or 1.0 / self.tolerance < abs(scale) < self.tolerance
+        )
 
     def without(self, channel: str, factor: float) -> float:
         """Left over right, were a channel not that factor too large."""
@@ -79,7 +90,11 @@ class Relation:
 def relations_of(motion: Motion) -> list[Relation]:
     """All relations between the channels that the drive shows clearly."""
     found = [one for of in (_lateral, _steered, _longitudinal, _repeated) for one in of(motion)]
-    return [one for one in found if np.isfinite(one.scale) and np.isfinite(one.correlation) and one.scale != 0.0]
+    return [
+        one
+        for one in found
+        if np.isfinite(one.scale) and np.isfinite(one.correlation) and one.scale != 0.0
+    ]
 
 
 def _lateral(motion: Motion) -> Iterator[Relation]:
@@ -98,13 +113,23 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
     band = kinematic_band(motion)
     if not motion.velocity or band is None:
         return
-    a, p, d, steep = (band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning)))
+    a, p, d, steep = (
+        band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning))
+    )
     if d.std() < LEAST_SLIDING or p.std() == 0.0:
         return
     right, left = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
     known = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
     channels, powers = (motion.velocity, "ay", motion.speed)[:known], (1, -1, 1)[:known]
-    yield from _related(f"d({motion.velocity})/dt", f"ay - {product}", channels, powers, left, right, SIGN_CORRELATION)
+    yield from _related(
+        f"d({motion.velocity})/dt",
+        f"ay - {product}",
+        channels,
+        powers,
+        left,
+        right,
+        SIGN_CORRELATION,
+    )
 
 
 def _steered(motion: Motion) -> Iterator[Relation]:
@@ -116,8 +141,13 @@ def _steered(motion: Motion) -> Iterator[Relation]:
         rolling &= np.abs(motion.vy) < DRIFTING * np.abs(motion.vx)
     if np.count_nonzero(rolling) >= max(STEERED_SECONDS * motion.rate_hz, FEWEST_SAMPLES):
         names = (motion.steering, "yaw_rate", motion.speed)
-        steady = (samples[rolling] - samples[rolling].mean() for samples in (motion.vx * motion[motion.steering], motion["yaw_rate"]))
-        yield from _related(motion.steering, "yaw_rate", names, (1, -1, 1), *steady, tolerance=np.inf)
+        steady = (
+            samples[rolling] - samples[rolling].mean()
+            for samples in (motion.vx * motion[motion.steering], motion["yaw_rate"])
+        )
+        yield from _related(
+            motion.steering, "yaw_rate", names, (1, -1, 1), *steady, tolerance=np.inf
+        )
 
 
 def _longitudinal(motion: Motion) -> Iterator[Relation]:
@@ -127,8 +157,18 @@ def _longitudinal(motion: Motion) -> Iterator[Relation]:
         return
     left, right = band(motion["ax"]), band(motion.derivative(motion.vx))
     if motion.velocity and "yaw_rate" in motion:
-        left, right = _without(np.stack([band(motion.vy * motion["yaw_rate"])], axis=1), left, right)
-    yield from _related("ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1), left, right, tolerance=LONGITUDINAL_TOLERANCE)
+        left, right = _without(
+            np.stack([band(motion.vy * motion["yaw_rate"])], axis=1), left, right
+        )
+    yield from _related(
+        "ax",
+        f"d({motion.speed})/dt",
+        ("ax", motion.speed),
+        (1, -1),
+        left,
+        right,
+        tolerance=LONGITUDINAL_TOLERANCE,
+    )
 
 
 def _repeated(motion: Motion) -> Iterator[Relation]:
@@ -137,15 +177,30 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
         reference, moving = f"{name}_ref", motion.moving
         if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
             pair = (name, reference)
-            steady = (motion[one][moving] - motion[one][moving].mean() for one in pair)  # slip is no factor: means alone would agree
+            steady = (
+                motion[one][moving] - motion[one][moving].mean() for one in pair
+            )  # slip is no factor: means alone would agree
             yield from _related(*pair, pair, (1, -1), *steady)
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
-        forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
-        shown, expected = motion["sideslip_ref"][forwards], np.arctan2(motion.vy, motion.vx)[forwards]
+        forwards = motion.moving & (
+            motion.vx > 0.0
+        )  # the angle of a car that goes backwards is taken either way
+        shown, expected = (
+            motion["sideslip_ref"][forwards],
+            np.arctan2(motion.vy, motion.vx)[forwards],
+        )
         if len(expected) >= FEWEST_SAMPLES and np.std(expected) >= LEAST_SIDESLIP:
             names = ("sideslip_ref", "vy_ref", motion.speed)
             right = f"atan2(vy_ref, {motion.speed})"
-            yield from _related("sideslip_ref", right, names, (1, -1, 1), shown, expected, least_correlation=SAME_CORRELATION)
+            yield from _related(
+                "sideslip_ref",
+                right,
+                names,
+                (1, -1, 1),
+                shown,
+                expected,
+                least_correlation=SAME_CORRELATION,
+            )
 
 
 def _related(
@@ -163,7 +218,15 @@ def _related(
     if 0.0 < min(sizes) <= max(sizes) < np.inf:
         correlation = float(np.mean(shown / sizes[0] * (expected / sizes[1])))
         if abs(correlation) >= least:
-            yield Relation(left, right, channels, powers, float(np.copysign(sizes[0] / sizes[1], correlation)), correlation, **limits)
+            yield Relation(
+                left,
+                right,
+                channels,
+                powers,
+                float(np.copysign(sizes[0] / sizes[1], correlation)),
+                correlation,
+                **limits,
+            )
 
 
 def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
@@ -202,31 +265,57 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
     """
     if all(relation.correlation > 0.0 for relation in relations):
         return []
-    suspects = sorted({name for relation in relations for name in relation.channels if name != motion.speed or motion.vx.mean() < 0.0})
+    suspects = sorted(
+        {
+            name
+            for relation in relations
+            for name in relation.channels
+            if name != motion.speed or motion.vx.mean() < 0.0
+        }
+    )
     explaining: list[tuple[int, tuple[str, ...]]] = []
     for number in range(1, MOST_TURNED + 1):
         for turned in itertools.combinations(suspects, number):
-            if all((len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0) for relation in relations):
+            if all(
+                (len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0)
+                for relation in relations
+            ):
                 explaining.append((_number(turned), turned))
     explaining.sort()
     return [turned for cost, turned in explaining if cost <= explaining[0][0] + 1]
 
 
-def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]) -> list[Finding]:
+def sign_findings(
+    relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]
+) -> list[Finding]:
     """Contradictions in sign, with `turned_channels`, and the channel that points the other way where steering or heading decides."""
     against = [relation for relation in relations if relation.correlation < 0.0]
     if not against:
         return []
     agreeing = [relation.text for relation in relations if relation.correlation > 0.0]
-    figures = ", ".join(f"{relation.text} disagree in sign (correlation {relation.correlation:.2f})" for relation in against)
+    figures = ", ".join(
+        f"{relation.text} disagree in sign (correlation {relation.correlation:.2f})"
+        for relation in against
+    )
     evidence = figures + (f"; {listed(agreeing)} agree" if agreeing else "")
     if not explanations:
-        return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
-    if (motion.speed,) in explanations:  # only suspected where it is negative, where the check reverse warns
+        return [
+            Finding(
+                "warning",
+                "sign",
+                "",
+                f"{evidence}: no few channels explain it; check the signs of all",
+            )
+        ]
+    if (
+        motion.speed,
+    ) in explanations:  # only suspected where it is negative, where the check reverse warns
         return []
     best, others = explanations[0], explanations[1:]
     if _decided(relations, explanations):
-        alternative = f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
+        alternative = (
+            f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
+        )
         advice = f"{listed(best)} {'points' if len(best) == 1 else 'point'} the other way{alternative}; set sign: -1 for it"
         return [Finding("warning", "sign", name, f"{evidence}: {advice}") for name in best]
     either = " or ".join(_together(names) for names in explanations)
@@ -237,7 +326,9 @@ def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: S
 def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
     """One explanation is the smallest, or the only one, and steering or heading was asked."""
     smallest, *others = (_number(names) for names in explanations)
-    heading = any(set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations)
+    heading = any(
+        set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations
+    )
     return not others or (others[0] > smallest and heading)
 
 
@@ -254,7 +345,9 @@ class WrongUnit:
     """A factor by which channels disagree."""
 
     relations: tuple[Relation, ...]  # that are wrong by it
-    explanations: tuple[tuple[str, float, str], ...]  # channel, factor and unit that explain it equally well; empty if none does
+    explanations: tuple[
+        tuple[str, float, str], ...
+    ]  # channel, factor and unit that explain it equally well; empty if none does
 
     @property
     def factors(self) -> dict[str, float]:
@@ -274,9 +367,21 @@ class WrongUnit:
             return Finding(level, "unit", name, f"{figures}: {name} is in {unit}; set its unit")
         if self.explanations:
             either = " or ".join(f"{name} is in {unit}" for name, _, unit in self.explanations)
-            return Finding("warning", "unit", self.explanations[0][0], f"{figures}: either {either}; set the unit")
-        names = list(dict.fromkeys(name for relation in self.relations for name in relation.channels))
-        return Finding("warning", "unit", names[0], f"{figures}, about 1 is expected: check the units of {listed(names)}")
+            return Finding(
+                "warning",
+                "unit",
+                self.explanations[0][0],
+                f"{figures}: either {either}; set the unit",
+            )
+        names = list(
+            dict.fromkeys(name for relation in self.relations for name in relation.channels)
+        )
+        return Finding(
+            "warning",
+            "unit",
+            names[0],
+            f"{figures}, about 1 is expected: check the units of {listed(names)}",
+        )
 
 
 def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
@@ -287,8 +392,16 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
     explained: dict[tuple[str, float, str], list[Relation]] = {}
     for name, factors in WRONG_FACTORS.items():
         for factor, unit in factors:
-            put_right = [relation for relation in wrong if 1.0 / EXACTNESS < abs(relation.without(name, factor)) < EXACTNESS]
-            broken = [one for one in relations if one not in wrong and not one.holds(one.without(name, factor))]
+            put_right = [
+                relation
+                for relation in wrong
+                if 1.0 / EXACTNESS < abs(relation.without(name, factor)) < EXACTNESS
+            ]
+            broken = [
+                one
+                for one in relations
+                if one not in wrong and not one.holds(one.without(name, factor))
+            ]
             if put_right and not broken:
                 explained[name, factor, unit] = put_right
     if not explained:

@@ -57,11 +57,19 @@ class CrossSpectra:
 
     def combined(self, combinations: Mapping[str, Mapping[str, float]]) -> CrossSpectra:
         """Spectra of sums of the signals: name -> signal -> factor."""
-        rows = np.array([[factors.get(name, 0.0) for name in self.names] for factors in combinations.values()])
-        return CrossSpectra(tuple(combinations), self.frequency, np.asarray(rows @ self.groups @ rows.T, dtype=np.complex128))
+        rows = np.array(
+            [[factors.get(name, 0.0) for name in self.names] for factors in combinations.values()]
+        )
+        return CrossSpectra(
+            tuple(combinations),
+            self.frequency,
+            np.asarray(rows @ self.groups @ rows.T, dtype=np.complex128),
+        )
 
 
-def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None) -> CrossSpectra | None:
+def cross_spectra(
+    signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None
+) -> CrossSpectra | None:
     """Welch's cross-spectra in the band, from segments of ``used`` samples, (T,) as signals, under a Hann window; None where too short."""
     duration = len(next(iter(signals.values()), ())) / rate_hz
     if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
@@ -71,7 +79,9 @@ def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolA
     seconds = min(max(duration / SEGMENTS_IN_A_DRIVE, SEGMENT_SECONDS[0]), SEGMENT_SECONDS[1])
     length = round(seconds * rate)
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
-    inside = (frequency >= max(BAND_HZ[0], 1.5 / seconds)) & (frequency <= min(BAND_HZ[1], rate / SAMPLES_A_PERIOD))
+    inside = (frequency >= max(BAND_HZ[0], 1.5 / seconds)) & (
+        frequency <= min(BAND_HZ[1], rate / SAMPLES_A_PERIOD)
+    )
     if np.count_nonzero(inside) < FEWEST_BINS:
         return None
     window = np.hanning(length + 1)[:-1]
@@ -92,7 +102,9 @@ def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolA
     for first, last in itertools.pairwise(edges):
         across = spectrum[first:last].transpose(1, 2, 0)  # (F, N, segments)
         groups.append(across.conj() @ across.transpose(0, 2, 1))
-    return CrossSpectra(tuple(signals), np.asarray(frequency[inside], dtype=np.float64), np.stack(groups))
+    return CrossSpectra(
+        tuple(signals), np.asarray(frequency[inside], dtype=np.float64), np.stack(groups)
+    )
 
 
 def _pieces(samples: FloatArray, factor: int, length: int) -> FloatArray:
@@ -127,9 +139,14 @@ def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -
     """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after another (Student's)."""
     whole, number = groups.sum(axis=0), len(groups)
     left_out = np.stack([fit(whole - group) for group in groups])
-    spread = np.sqrt((number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0))
+    spread = np.sqrt(
+        (number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0)
+    )
     factor = student(number - 1)
-    return [Measured(value, factor * width) for value, width in zip(fit(whole).tolist(), spread.tolist(), strict=True)]
+    return [
+        Measured(value, factor * width)
+        for value, width in zip(fit(whole).tolist(), spread.tolist(), strict=True)
+    ]
 
 
 def student(freedom: float) -> float:
@@ -172,24 +189,34 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     start = _coarse(weight * whole[:, x, y], omega, low_pass=low_pass)
 
     def fitted(cross_spectra: ComplexArray) -> FloatArray:
-        delay, time_constant = _refined(weight * cross_spectra[:, x, y], omega, start, low_pass=low_pass)
+        delay, time_constant = _refined(
+            weight * cross_spectra[:, x, y], omega, start, low_pass=low_pass
+        )
         return np.array([delay, time_constant, delay + time_constant])
 
     delay, time_constant, together = jackknife(spectra.groups, fitted)
     phase = omega * delay.value + np.arctan(omega * time_constant.value)
-    explained = np.sum(weight * (whole[:, x, y] * np.exp(1j * phase)).real) / np.sum(weight * np.abs(whole[:, x, y]))
+    explained = np.sum(weight * (whole[:, x, y] * np.exp(1j * phase)).real) / np.sum(
+        weight * np.abs(whole[:, x, y])
+    )
     return Lag(delay, time_constant, together, float(explained))
 
 
 def smoothed(values: FloatArray) -> FloatArray:
     """Running mean over the bins, (F,)."""
     reach = SMOOTHED_BINS // 2
-    return np.convolve(np.pad(values, reach, mode="edge"), np.full(SMOOTHED_BINS, 1.0 / SMOOTHED_BINS), "valid")
+    return np.convolve(
+        np.pad(values, reach, mode="edge"), np.full(SMOOTHED_BINS, 1.0 / SMOOTHED_BINS), "valid"
+    )
 
 
 def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
     delays = np.linspace(-LARGEST_LAG, LARGEST_LAG, 41)
-    constants = np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)]) if low_pass else np.zeros(1)
+    constants = (
+        np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)])
+        if low_pass
+        else np.zeros(1)
+    )
     advance = np.exp(1j * np.multiply.outer(delays, omega)) * cross
     turn = np.exp(1j * np.arctan(np.multiply.outer(constants, omega)))
     score = advance.real @ turn.real.T - advance.imag @ turn.imag.T
@@ -197,7 +224,9 @@ def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[
     return float(delays[delay]), float(constants[constant])
 
 
-def _refined(cross: ComplexArray, omega: FloatArray, start: tuple[float, float], *, low_pass: bool) -> tuple[float, float]:
+def _refined(
+    cross: ComplexArray, omega: FloatArray, start: tuple[float, float], *, low_pass: bool
+) -> tuple[float, float]:
     """Gauss-Newton on the weighted phase; the time constant cannot be negative."""
     delay, constant = start
     size = np.abs(cross)
@@ -205,7 +234,11 @@ def _refined(cross: ComplexArray, omega: FloatArray, start: tuple[float, float],
         turned = cross * np.exp(1j * (omega * delay + np.arctan(omega * constant)))
         by_delay, by_constant = omega, omega / (1.0 + np.square(omega * constant))
         first, second = -(by_delay * turned.imag).sum(), -(by_constant * turned.imag).sum()
-        own, shared, other = (size * by_delay**2).sum(), (size * by_delay * by_constant).sum(), (size * by_constant**2).sum()
+        own, shared, other = (
+            (size * by_delay**2).sum(),
+            (size * by_delay * by_constant).sum(),
+            (size * by_constant**2).sum(),
+        )
         if own <= 0.0:
             break
         determinant = own * other * (1.0 + 1e-6) - shared * shared
@@ -215,7 +248,10 @@ def _refined(cross: ComplexArray, omega: FloatArray, start: tuple[float, float],
             if constant > 0.0 or moved > 0.0:
                 step, change = (other * first - shared * second) / determinant, moved
         step, change = min(max(step, -0.1), 0.1), min(max(change, -0.5), 0.5)
-        delay, constant = min(max(delay + step, -LARGEST_LAG), LARGEST_LAG), min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT)
+        delay, constant = (
+            min(max(delay + step, -LARGEST_LAG), LARGEST_LAG),
+            min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT),
+        )
         if abs(step) + abs(change) < 1e-7:
             break
     return float(delay), float(constant)

@@ -33,10 +33,14 @@ def standstill(recording: Recording) -> BoolArray:
     return np.repeat(still, lengths)
 
 
-def _spreads(samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> FloatArray:
+def _spreads(
+    samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]
+) -> FloatArray:
     """Standard deviation of the known samples of each run; 0 where none is known."""
     known = np.isfinite(samples)
     number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
     mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number
     deviation = np.where(known, samples - np.repeat(mean, lengths), 0.0)
-    return np.asarray(np.sqrt(np.add.reduceat(np.square(deviation), starts) / number), dtype=np.float64)
+    return np.asarray(
+        np.sqrt(np.add.reduceat(np.square(deviation), starts) / number), dtype=np.float64
+    )

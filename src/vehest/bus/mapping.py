@@ -15,7 +15,12 @@ from vehest.sources.can import CanSource, Wanted
 from vehest.sources.can.database import Database, read_dbc
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
-FOR_RECORDINGS = ("gappy", "transforms", "reference_point", "raster")  # options of a data set that say nothing of a bus; nor does the rate
+FOR_RECORDINGS = (
+    "gappy",
+    "transforms",
+    "reference_point",
+    "raster",
+)  # options of a data set that say nothing of a bus; nor does the rate
 
 
 @dataclass(frozen=True)
@@ -24,11 +29,18 @@ class BusSignals:
 
     database: Database  # messages that carry them
     wanted: Mapping[str, Wanted]  # channel -> its message and signal
-    factors: Mapping[str, float]  # channel -> factor from the unit of the DBC to SI units and ISO 8855 signs
+    factors: Mapping[
+        str, float
+    ]  # channel -> factor from the unit of the DBC to SI units and ISO 8855 signs
     bus: int | str | None = None  # number or name of the bus, where a log holds several
 
 
-def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Sequence[str] = (), dbc: Path | None = None) -> BusSignals:
+def from_dataset(
+    dataset: Mapping[str, Any],
+    needed: Sequence[str],
+    optional: Sequence[str] = (),
+    dbc: Path | None = None,
+) -> BusSignals:
     """Signals that a data set of the source ``can`` declares for the ``needed`` channels.
 
     ``optional`` are those of them that may be missing; ``dbc`` takes the place of the data set's.
@@ -38,10 +50,24 @@ def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Se
     """
     where, declared = f"data set '{dataset.get('name')}'", dataset.get("channels") or {}
     if dataset.get("source") != "can":
-        raise ConfigurationError(f"{where} is of source '{dataset.get('source')}'; a bus needs one of source 'can'")
-    _require_channels(needed, optional, declared, f"{where} declares none; channels that transforms make are not there online")
-    options = {name: value for name, value in dataset.items() if value is not None and name not in FOR_RECORDINGS}
-    options |= {"channels": {name: declared[name] for name in declared if name in needed}, "rate_hz": 100.0}
+        raise ConfigurationError(
+            f"{where} is of source '{dataset.get('source')}'; a bus needs one of source 'can'"
+        )
+    _require_channels(
+        needed,
+        optional,
+        declared,
+        f"{where} declares none; channels that transforms make are not there online",
+    )
+    options = {
+        name: value
+        for name, value in dataset.items()
+        if value is not None and name not in FOR_RECORDINGS
+    }
+    options |= {
+        "channels": {name: declared[name] for name in declared if name in needed},
+        "rate_hz": 100.0,
+    }
     source = open_source(options if dbc is None else {**options, "dbc": str(dbc)})
     assert isinstance(source, CanSource)
     database, wanted = source.wanted()
@@ -50,12 +76,16 @@ def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Se
         column, unit = source.channels[name], CHANNELS[name].unit
         if dataset.get("file_units") != "ignore":
             where = f"'{database.file}': signal '{own.signal}' for channel '{name}'"
-            require_unit(own.message.units[own.signal], column, unit, where, "give the unit that is true")
+            require_unit(
+                own.message.units[own.signal], column, unit, where, "give the unit that is true"
+            )
         factors[name] = column.sign * column.factor * factor_to_si(column.unit, unit)
     return BusSignals(database, wanted, factors, dataset.get("bus"))
 
 
-def from_names(dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()) -> BusSignals:
+def from_names(
+    dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()
+) -> BusSignals:
     """Signals that ``words`` name, such as ``ay=-IMU.AccLat:g``, and those that are called like channels, in the units of the DBC.
 
     Raises `ConfigurationError`: a word that cannot be understood, a unit that is not known, or a channel without a signal. Raises
@@ -63,20 +93,31 @@ def from_names(dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), w
     """
     entries = dict(map(_entry, words))
     if unknown := sorted(set(entries) - set(needed)):
-        raise ConfigurationError(f"--signals names '{unknown[0]}', which the model does not read; it reads {', '.join(needed)}")
+        raise ConfigurationError(
+            f"--signals names '{unknown[0]}', which the model does not read; it reads {', '.join(needed)}"
+        )
     units = {}
     for message in read_dbc(dbc):
         for signal in message.signals:
             units[signal.name] = units[f"{message.name}.{signal.name}"] = signal.unit or ""
     entries |= {name: {"column": name} for name in needed if name in units and name not in entries}
-    _require_channels(needed, optional, entries, f"no signal of '{dbc}' is called so; name one: --signals CHANNEL=MESSAGE.SIGNAL")
+    _require_channels(
+        needed,
+        optional,
+        entries,
+        f"no signal of '{dbc}' is called so; name one: --signals CHANNEL=MESSAGE.SIGNAL",
+    )
     for name, entry in entries.items():
         column, si_unit = entry["column"], CHANNELS[name].unit
         written = entry.get("unit") or units.get(column, si_unit)
         entry["unit"] = plain_unit(written)
         if entry["unit"] in (None, "another unit"):
-            raise ConfigurationError(f"'{written}' of signal '{column}' is no unit of '{name}'; write --signals {name}={column}:{si_unit}")
-    return from_dataset({"name": "signals", "source": "can", "dbc": str(dbc), "channels": entries}, needed, optional)
+            raise ConfigurationError(
+                f"'{written}' of signal '{column}' is no unit of '{name}'; write --signals {name}={column}:{si_unit}"
+            )
+    return from_dataset(
+        {"name": "signals", "source": "can", "dbc": str(dbc), "channels": entries}, needed, optional
+    )
 
 
 def _entry(word: str) -> tuple[str, dict[str, Any]]:
@@ -84,11 +125,15 @@ def _entry(word: str) -> tuple[str, dict[str, Any]]:
     name, _, rest = word.strip().partition("=")
     signal, _, unit = rest.removeprefix("-").partition(":")
     if not signal:
-        raise ConfigurationError(f"--signals takes CHANNEL=MESSAGE.SIGNAL, for example ay=-IMU.AccLat:m/s^2, not '{word}'")
+        raise ConfigurationError(
+            f"--signals takes CHANNEL=MESSAGE.SIGNAL, for example ay=-IMU.AccLat:m/s^2, not '{word}'"
+        )
     return name, {"column": signal, "unit": unit, "sign": -1 if rest.startswith("-") else 1}
 
 
-def _require_channels(needed: Sequence[str], optional: Sequence[str], there: Mapping[str, Any], fix: str) -> None:
+def _require_channels(
+    needed: Sequence[str], optional: Sequence[str], there: Mapping[str, Any], fix: str
+) -> None:
     for name in needed:
         if name not in there and name not in optional:
             raise ConfigurationError(f"the model reads channel '{name}', and {fix}")

@@ -56,7 +56,9 @@ def dbc_text(first_id: int = FIRST_ID) -> str:
     Raises `ConfigurationError`: they are no standard identifiers.
     """
     if not 0 < first_id <= LAST_STANDARD_ID:
-        raise ConfigurationError(f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not {first_id:#x}")
+        raise ConfigurationError(
+            f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not {first_id:#x}"
+        )
     return DBC.format(estimate=first_id, band=first_id + 1)
 
 
@@ -93,7 +95,12 @@ class EstimateFrames:
         self._count = (self._count + 1) % COUNTS
         frames = []
         for message in self._messages:
-            raw = {own.name: counters[own.name] if own.name in counters else raw_value(named[own.name], own) for own in message.signals}
+            raw = {
+                own.name: counters[own.name]
+                if own.name in counters
+                else raw_value(named[own.name], own)
+                for own in message.signals
+            }
             data = message.encode(raw, scaling=False, strict=False)
             frames.append(self._frame(stamp, message.frame_id, False, data=data))
         return frames
@@ -105,4 +112,6 @@ def raw_value(value: float, signal: Any) -> int:
     if math.isnan(value):
         return -largest - 1 if signal.is_signed else largest
     steps = round(min(max(value / signal.scale, -1e9), 1e9))
-    return min(max(steps, -largest), largest) if signal.is_signed else min(max(steps, 0), largest - 1)
+    return (
+        min(max(steps, -largest), largest) if signal.is_signed else min(max(steps, 0), largest - 1)
+    )

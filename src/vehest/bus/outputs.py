@@ -24,7 +24,13 @@ def output_files(path: Path | None) -> list[Path]:
     """
     if path is not None and path.suffix.lower() not in (".csv", ".asc"):
         raise ConfigurationError(f"'{path}' must end in .csv or .asc")
-    return [] if path is None else [path] if path.suffix.lower() == ".csv" else [path, path.with_suffix(".dbc")]
+    return (
+        []
+        if path is None
+        else [path]
+        if path.suffix.lower() == ".csv"
+        else [path, path.with_suffix(".dbc")]
+    )
 
 
 class Output:
@@ -35,7 +41,11 @@ class Output:
     """
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
-        self._names = [*FIRST, *(name for name in names if name not in FIRST + LAST), *(name for name in LAST[:2] if name in names)]
+        self._names = [
+            *FIRST,
+            *(name for name in names if name not in FIRST + LAST),
+            *(name for name in LAST[:2] if name in names),
+        ]
         self._path = path or Path()
         self._table: Any = None
         self._log: Any = None

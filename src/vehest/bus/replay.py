@@ -34,7 +34,9 @@ from vehest.trust.contract import GuardedStepper
 SURVEY_SECONDS = 20.0
 LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
-SWITCH_SECONDS = 2e-4  # that another thread of Python may go on when the receiver has something to do
+SWITCH_SECONDS = (
+    2e-4  # that another thread of Python may go on when the receiver has something to do
+)
 
 
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
@@ -48,7 +50,9 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Ti
         first = min(first, frame.timestamp)
         for name in values:
             stamps[name].append(frame.timestamp)
-        if frame.timestamp - first > SURVEY_SECONDS and all(len(times) > 1 for times in stamps.values()):
+        if frame.timestamp - first > SURVEY_SECONDS and all(
+            len(times) > 1 for times in stamps.values()
+        ):
             break
     for name, wanted in signals.wanted.items():
         if len(stamps[name]) < 2:
@@ -80,7 +84,10 @@ class Bus:
         if self.interface == "virtual":
             options |= {"preserve_timestamps": self.speed is None, "ignore_config": True}
         mask = {False: 0x7FF, True: 0x1FFFFFFF}
-        filters: Any = [{"can_id": identifier, "can_mask": mask[long], "extended": long} for identifier, long in messages]
+        filters: Any = [
+            {"can_id": identifier, "can_mask": mask[long], "extended": long}
+            for identifier, long in messages
+        ]
         opened: list[Any] = []
         try:
             try:
@@ -104,13 +111,32 @@ class Replay:
     """
 
     def __init__(
-        self, log: Frames, signals: BusSignals, timing: Timing, bus: Bus, frames: EstimateFrames, stopped: Callable[[], bool]
+        self,
+        log: Frames,
+        signals: BusSignals,
+        timing: Timing,
+        bus: Bus,
+        frames: EstimateFrames,
+        stopped: Callable[[], bool],
     ) -> None:
         for identifier in frames.identifiers:
             if (identifier, False) in signals.database.taken:
-                raise ConfigurationError(f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id")
-        self.log, self.signals, self.bus, self.frames, self.stopped = log, signals, bus, frames, stopped
-        self.timing, self.first, self.sampler, self.figures = timing, timing.first, Sampler(timing), Figures()
+                raise ConfigurationError(
+                    f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id"
+                )
+        self.log, self.signals, self.bus, self.frames, self.stopped = (
+            log,
+            signals,
+            bus,
+            frames,
+            stopped,
+        )
+        self.timing, self.first, self.sampler, self.figures = (
+            timing,
+            timing.first,
+            Sampler(timing),
+            Figures(),
+        )
         self.channels_of = channels_by_message(signals.wanted)
         self.speed = bus.speed or 1.0
         self.begin = 0.0  # time of the clock on the wall at the first frame [s]
@@ -118,7 +144,9 @@ class Replay:
         self.over = threading.Event()  # all frames were sent, or it was stopped
         self.failure: BaseException | None = None
 
-    def run(self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View) -> Figures:
+    def run(
+        self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View
+    ) -> Figures:
         """Estimate at the rate of the samples; the first stepper is for warming up.
 
         Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
@@ -132,7 +160,11 @@ class Replay:
             closing(Output(out, names, self.frames.identifiers[0])) as self.output,
             _undisturbed(),
         ):
-            frames = (frame for frame in self.log if frame.timestamp >= self.first and is_on(frame, self.signals.bus))
+            frames = (
+                frame
+                for frame in self.log
+                if frame.timestamp >= self.first and is_on(frame, self.signals.bus)
+            )
             if self.bus.speed is None:
                 self._as_fast_as_possible(frames)
             else:
@@ -153,11 +185,16 @@ class Replay:
         head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
         every = chain([head] if head else [], frames)
-        thread = threading.Thread(target=self._send_in_time, args=(every,), name="sender", daemon=True)
+        thread = threading.Thread(
+            target=self._send_in_time, args=(every,), name="sender", daemon=True
+        )
         thread.start()
         try:
             while not self.stopped():
-                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + self.sampler.cycle
+                ended = (
+                    self.over.is_set()
+                    and self._on_bus(time.time()) > self.last + self.sampler.cycle
+                )
                 wait = self.begin + (self.sampler.next_time - self.first) / self.speed - time.time()
                 heard = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
                 if heard is not None:
@@ -218,18 +255,26 @@ class Replay:
         self._advance(stamp)
         self.figures.frames_received += 1
         try:
-            values = channel_values(message.decode(frame.data), self.channels_of[message.name], self.signals.wanted)
+            values = channel_values(
+                message.decode(frame.data), self.channels_of[message.name], self.signals.wanted
+            )
         except DataError:
             self.figures.frames_too_short += 1
             return
-        self.sampler.take({name: value * self.signals.factors[name] for name, value in values.items()}, stamp)
+        self.sampler.take(
+            {name: value * self.signals.factors[name] for name, value in values.items()}, stamp
+        )
 
     def _advance(self, now: float) -> None:
         """Deal with the samples whose instant lies before now [s]."""
         while self.sampler.next_time < now:
             sample, started = self.sampler.sample(), time.perf_counter()
             self._estimate(sample)
-            took = time.perf_counter() - started if self.bus.speed is None else self._on_bus(time.time()) - sample.time
+            took = (
+                time.perf_counter() - started
+                if self.bus.speed is None
+                else self._on_bus(time.time()) - sample.time
+            )
             self._count(sample, took)
             self.view.show(self.figures, self.stepper.last, sample.time - self.first)
 
@@ -259,7 +304,11 @@ def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]
     names: dict[str, None] = {}
     for k in range(math.ceil((model.warm_up_steps / model.settings.rate_hz + 1.0) * rate_hz)):
         ripple = 0.01 * math.sin(0.7 * k)
-        sample = {name: (20.0 if name in ("vx", "motor_speed") or name.startswith("wheel_speed") else 0.0) + ripple for name in channels}
+        sample = {
+            name: (20.0 if name in ("vx", "motor_speed") or name.startswith("wheel_speed") else 0.0)
+            + ripple
+            for name in channels
+        }
         names |= dict.fromkeys(stepper.step(sample))
     return list(names)
 

@@ -45,13 +45,19 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     periods = {name: mean_step(np.diff(times)) for name, times in stamps.items()}
     clock = min(periods, key=lambda name: periods[name])
     if not all(period > 0 for period in periods.values()):
-        raise ConfigurationError("frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which")
+        raise ConfigurationError(
+            "frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which"
+        )
     if rate_hz is None:
         rate_hz = plain_rate(1.0 / periods[clock], PLAIN)
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigurationError(f"the rate of a bus must be a positive number [Hz], not {rate_hz}")
     cycle = 1.0 / rate_hz
-    phases = {name: phase for name, times in stamps.items() if (phase := _phase(times, periods[name], cycle)) is not None}
+    phases = {
+        name: phase
+        for name, times in stamps.items()
+        if (phase := _phase(times, periods[name], cycle)) is not None
+    }
     marks = sorted(phases.values())
     marks += [first + cycle for first in marks[:1]]
     pauses = [(after - before, before) for before, after in pairwise(marks)]
@@ -59,7 +65,9 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     middle = (begin + 0.5 * longest) % cycle
     offset = (middle - phases[clock]) % cycle if clock in phases else 0.5 * cycle
     begins = [float(times[0]) for times in stamps.values()]
-    return Timing(rate_hz, periods, clock, offset, max(begins) + (middle - max(begins)) % cycle, min(begins))
+    return Timing(
+        rate_hz, periods, clock, offset, max(begins) + (middle - max(begins)) % cycle, min(begins)
+    )
 
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
@@ -84,7 +92,9 @@ class Sampler:
     def __init__(self, timing: Timing) -> None:
         self.timing, self.cycle = timing, 1.0 / timing.rate_hz
         self.next_time = timing.start
-        self._limits = {name: max(period, self.cycle) + SLACK for name, period in timing.periods.items()}
+        self._limits = {
+            name: max(period, self.cycle) + SLACK for name, period in timing.periods.items()
+        }
         self._values = dict.fromkeys(timing.periods, math.nan)
         self._stamps = dict.fromkeys(timing.periods, -math.inf)
         self._deviation = 0.0
@@ -94,14 +104,18 @@ class Sampler:
         for name, value in values.items():
             self._values[name], self._stamps[name] = value, stamp
         if self.timing.clock in values:
-            early = (stamp - self.next_time + self.timing.offset + 0.5 * self.cycle) % self.cycle - 0.5 * self.cycle
+            early = (
+                stamp - self.next_time + self.timing.offset + 0.5 * self.cycle
+            ) % self.cycle - 0.5 * self.cycle
             self._deviation = min(max(early, -0.25 * self.cycle), 0.25 * self.cycle)
 
     def sample(self) -> Sample:
         """The sample at ``next_time``, which moves on by a cycle."""
         time = self.next_time
         fresh = {
-            name: value for name, value in self._values.items() if time - self._stamps[name] <= self._limits[name] and not math.isnan(value)
+            name: value
+            for name, value in self._values.items()
+            if time - self._stamps[name] <= self._limits[name] and not math.isnan(value)
         }
         self.next_time = time + self.cycle + GAIN * self._deviation
         self._deviation = 0.0

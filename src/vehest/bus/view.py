@@ -31,7 +31,10 @@ class Figures:
 
     def plain(self) -> dict[str, Any]:
         """Figures for people and scripts."""
-        return {name: round(value, 3) if isinstance(value, float) else value for name, value in vars(self).items()}
+        return {
+            name: round(value, 3) if isinstance(value, float) else value
+            for name, value in vars(self).items()
+        }
 
 
 class View:
@@ -46,9 +49,16 @@ class View:
             return
         self._due = time.monotonic() + LINE_SECONDS
         reason = reason_in_words(values.get("health_reason", 0.0))
-        health = HEALTH[int(values["health"])] + (f": {reason}" if reason else "") if "health" in values else "-"
+        health = (
+            HEALTH[int(values["health"])] + (f": {reason}" if reason else "")
+            if "health" in values
+            else "-"
+        )
         yaw_rate = f"yaw rate {values['yaw_rate']:+.3f} rad/s, " if "yaw_rate" in values else ""
-        vy, sideslip = _with_band(values, "vy", 1.0, "m/s", 3), _with_band(values, "sideslip", 180.0 / math.pi, "°", 2)
+        vy, sideslip = (
+            _with_band(values, "vy", 1.0, "m/s", 3),
+            _with_band(values, "sideslip", 180.0 / math.pi, "°", 2),
+        )
         self._stream.write(
             f"time {seconds:.1f} s, v {vy}, β {sideslip}, "
             f"{yaw_rate}health {health}, {figures.estimates} estimates, {figures.samples} samples, {figures.samples_lost} lost, "
@@ -57,8 +67,14 @@ class View:
         self._stream.flush()
 
 
-def _with_band(values: Mapping[str, float], name: str, factor: float, unit: str, digits: int) -> str:
+def _with_band(
+    values: Mapping[str, float], name: str, factor: float, unit: str, digits: int
+) -> str:
     value, band = values.get(name, math.nan), values.get(f"band_{name}", math.nan)
     if math.isnan(value):
         return "-"
-    return f"{factor * value:+.{digits}f}" + (f" ± {factor * band:.{digits}f}" if not math.isnan(band) else "") + f" {unit}"
+    return (
+        f"{factor * value:+.{digits}f}"
+        + (f" ± {factor * band:.{digits}f}" if not math.isnan(band) else "")
+        + f" {unit}"
+    )

@@ -33,7 +33,9 @@ class Channel:
     @property
     def is_angular(self) -> bool:
         """Whether the unit is an angle or angular rate, which files often give in degrees."""
-        return self.unit in {"rad", "rad/s"} and not self.name.startswith(("wheel_speed", "motor_speed"))
+        return self.unit in {"rad", "rad/s"} and not self.name.startswith(
+            ("wheel_speed", "motor_speed")
+        )
 
 
 def _table() -> dict[str, Channel]:
@@ -41,31 +43,82 @@ def _table() -> dict[str, Channel]:
     rows = [
         Channel("vx", "m/s", "measured forward velocity at the centre of gravity", -40.0, 140.0),
         Channel("yaw_rate", "rad/s", "measured yaw rate, positive in a left turn", -8.0, 8.0),
-        Channel("ax", "m/s²", "measured longitudinal acceleration at the centre of gravity", -80.0, 80.0),
-        Channel("ay", "m/s²", "measured lateral acceleration at the centre of gravity, positive to the left", -80.0, 80.0),
+        Channel(
+            "ax", "m/s²", "measured longitudinal acceleration at the centre of gravity", -80.0, 80.0
+        ),
+        Channel(
+            "ay",
+            "m/s²",
+            "measured lateral acceleration at the centre of gravity, positive to the left",
+            -80.0,
+            80.0,
+        ),
         Channel("steer", "rad", "mean road-wheel steering angle, positive to the left", -1.3, 1.3),
-        Channel("handwheel", "rad", "angle of the steering wheel, positive to the left", -25.0, 25.0),
+        Channel(
+            "handwheel", "rad", "angle of the steering wheel, positive to the left", -25.0, 25.0
+        ),
         Channel("roll", "rad", "measured roll angle, positive with the left side up", -1.6, 1.6),
         Channel("pitch", "rad", "measured pitch angle, positive with the nose down", -1.6, 1.6),
         Channel("roll_rate", "rad/s", "measured roll rate", -8.0, 8.0),
         Channel("pitch_rate", "rad/s", "measured pitch rate", -8.0, 8.0),
-        Channel("motor_speed", "rad/s", "speed of the drive motor, referred to the wheel", -3000.0, 3000.0),
-        Channel("motor_current", "A", "torque-producing motor current", -2000.0, 2000.0, rests=True),
-        Channel("brake_pressure_front", "Pa", "brake pressure of the front axle", -1e6, 4e7, rests=True),
-        Channel("brake_pressure_rear", "Pa", "brake pressure of the rear axle", -1e6, 4e7, rests=True),
+        Channel(
+            "motor_speed",
+            "rad/s",
+            "speed of the drive motor, referred to the wheel",
+            -3000.0,
+            3000.0,
+        ),
+        Channel(
+            "motor_current", "A", "torque-producing motor current", -2000.0, 2000.0, rests=True
+        ),
+        Channel(
+            "brake_pressure_front", "Pa", "brake pressure of the front axle", -1e6, 4e7, rests=True
+        ),
+        Channel(
+            "brake_pressure_rear", "Pa", "brake pressure of the rear axle", -1e6, 4e7, rests=True
+        ),
     ]
     for corner, place in corners.items():
-        rows.append(Channel(f"wheel_speed_{corner}", "rad/s", f"rotational speed of the {place} wheel", -500.0, 1000.0))
+        rows.append(
+            Channel(
+                f"wheel_speed_{corner}",
+                "rad/s",
+                f"rotational speed of the {place} wheel",
+                -500.0,
+                1000.0,
+            )
+        )
     for corner, place in corners.items():
-        rows.append(Channel(f"wheel_torque_{corner}", "N·m", f"driving torque at the {place} wheel", -2e4, 2e4, rests=True))
+        rows.append(
+            Channel(
+                f"wheel_torque_{corner}",
+                "N·m",
+                f"driving torque at the {place} wheel",
+                -2e4,
+                2e4,
+                rests=True,
+            )
+        )
     for axis, direction in {"x": "longitudinal", "y": "lateral", "z": "vertical"}.items():
         for corner, place in corners.items():
-            rows.append(Channel(f"f{axis}_{corner}", "N", f"{direction} tyre force, {place}", -2e5, 2e5))
+            rows.append(
+                Channel(f"f{axis}_{corner}", "N", f"{direction} tyre force, {place}", -2e5, 2e5)
+            )
     rows += [
-        Channel("vx_ref", "m/s", "reference forward velocity at the centre of gravity", -40.0, 140.0),
-        Channel("vy_ref", "m/s", "reference lateral velocity at the centre of gravity, positive to the left", -40.0, 40.0),
+        Channel(
+            "vx_ref", "m/s", "reference forward velocity at the centre of gravity", -40.0, 140.0
+        ),
+        Channel(
+            "vy_ref",
+            "m/s",
+            "reference lateral velocity at the centre of gravity, positive to the left",
+            -40.0,
+            40.0,
+        ),
         Channel("yaw_rate_ref", "rad/s", "reference yaw rate", -8.0, 8.0),
-        Channel("sideslip_ref", "rad", "reference sideslip angle, atan2(vy, vx)", -math.pi, math.pi),
+        Channel(
+            "sideslip_ref", "rad", "reference sideslip angle, atan2(vy, vx)", -math.pi, math.pi
+        ),
     ]
     return {channel.name: channel for channel in rows}
 
@@ -76,5 +129,7 @@ CHANNELS: dict[str, Channel] = _table()
 def channel(name: str) -> Channel:
     """Look up a channel. Raises `DataError`: the name is not in the table."""
     if name not in CHANNELS:
-        raise DataError(f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}")
+        raise DataError(
+            f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}"
+        )
     return CHANNELS[name]

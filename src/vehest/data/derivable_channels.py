@@ -10,7 +10,10 @@ from vehest.data.derived import WHEELS, AccelerationFromSpeed
 
 SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate
 
-UNKNOWN = {"wheel_radius": "rolling radius of the tyres [m]", "ratio": "of the handwheel's angle to the road wheels'"}
+UNKNOWN = {
+    "wheel_radius": "rolling radius of the tyres [m]",
+    "ratio": "of the handwheel's angle to the road wheels'",
+}
 """Options that only the user knows, with their meaning."""
 
 MAKES = {
@@ -28,23 +31,35 @@ class Derivation:
     """How a channel is made of others."""
 
     of: tuple[str, ...]  # channels of the log that it is made of, in the end
-    transforms: tuple[Mapping[str, Any], ...]  # entries of a data set's ``transforms``, in order; None: a value that only the user knows
+    transforms: tuple[
+        Mapping[str, Any], ...
+    ]  # entries of a data set's ``transforms``, in order; None: a value that only the user knows
 
     @property
     def meanings(self) -> dict[str, str]:
         """Option that is None -> its meaning, with its unit."""
-        return {option: UNKNOWN[option] for entry in self.transforms for option, value in entry.items() if value is None}
+        return {
+            option: UNKNOWN[option]
+            for entry in self.transforms
+            for option, value in entry.items()
+            if value is None
+        }
 
     def in_words(self) -> str:
         """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel (ratio: of …)``."""
-        entries = ", ".join("{" + ", ".join(f"{key}: {_shown(value)}" for key, value in entry.items()) + "}" for entry in self.transforms)
+        entries = ", ".join(
+            "{" + ", ".join(f"{key}: {_shown(value)}" for key, value in entry.items()) + "}"
+            for entry in self.transforms
+        )
         *first, last = self.of
         meanings = "; ".join(f"{name}: {meaning}" for name, meaning in self.meanings.items())
         made_of = f"{', '.join(first)} and {last}" if first else last
         return f"transforms: [{entries}] of {made_of}" + (f" ({meanings})" if meanings else "")
 
 
-def derivation_of(channel: str, channels: Collection[str], gappy: Collection[str], rate_hz: float) -> Derivation | None:
+def derivation_of(
+    channel: str, channels: Collection[str], gappy: Collection[str], rate_hz: float
+) -> Derivation | None:
     """Derivation of a missing channel from those that are there, some with gaps; None where nothing makes it."""
     wheels = tuple(name for wheel in WHEELS if (name := f"wheel_speed_{wheel}") in channels)
     if channel == "vx" and wheels:
@@ -69,7 +84,9 @@ def derivation_of(channel: str, channels: Collection[str], gappy: Collection[str
 
 def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
     """Channels that transforms make of others, as far as their names tell."""
-    return frozenset(MAKES[name] for entry in transforms if (name := str(entry.get("name"))) in MAKES)
+    return frozenset(
+        MAKES[name] for entry in transforms if (name := str(entry.get("name"))) in MAKES
+    )
 
 
 def _shown(value: Any) -> str:

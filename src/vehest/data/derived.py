@@ -57,12 +57,20 @@ class SteeringCurve:
     """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear."""
 
     inputs: tuple[float, ...]  # values of the channel at the corners, increasing
-    angles: tuple[float, ...]  # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
+    angles: tuple[
+        float, ...
+    ]  # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
     channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
 
     def __post_init__(self) -> None:
-        if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
-            raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
+        if (
+            len(self.inputs) != len(self.angles)
+            or len(self.inputs) < 2
+            or not np.all(np.diff(self.inputs) > 0)
+        ):
+            raise ConfigurationError(
+                "a steering curve needs two corners or more: inputs that increase, and as many angles"
+            )
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``; it has gaps where the channel has them. Raises `DataError`: the channel is missing."""
@@ -99,30 +107,47 @@ class SpeedFromWheels:
         """
         names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
         if not set(names) & set(recording.channels):
-            raise DataError(f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}")
+            raise DataError(
+                f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}"
+            )
         missing = np.full(len(recording), np.nan)
-        wheels = self.wheel_radius * np.stack([recording.channels.get(name, missing) for name in names])
+        wheels = self.wheel_radius * np.stack(
+            [recording.channels.get(name, missing) for name in names]
+        )
         if "steer" in recording:
             wheels[:2] *= np.cos(recording["steer"])
         if not (self.track_front or self.track_rear):
             return wheels
-        sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
+        sides = 0.5 * np.array(
+            [self.track_front, -self.track_front, self.track_rear, -self.track_rear]
+        )
         return wheels + sides[:, None] * recording["yaw_rate"]
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vx``, without gaps, since wheels that were not measured do not count; `DataError` if none ever was."""
         speeds = self.corrected(recording)
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where no wheel was measured the median is NaN
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # where no wheel was measured the median is NaN
             medians = np.nanmedian(speeds, axis=0)
-        counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(medians)
+        counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(
+            medians
+        )
         if not np.isfinite(speeds).any():
-            raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
+            raise DataError(
+                f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made"
+            )
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
         step = 1.0 / recording.rate_hz
-        most, patience = self.most_acceleration * step, round(min(self.hold_seconds * recording.rate_hz, len(recording)))
+        most, patience = (
+            self.most_acceleration * step,
+            round(min(self.hold_seconds * recording.rate_hz, len(recording))),
+        )
         number = counts.sum(0)
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
-        ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
+        ahead = (
+            np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
+        )
         vx, held, now = np.empty(len(recording)), 0, math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
@@ -136,8 +161,12 @@ class SpeedFromWheels:
                 now += min(max(wanted - now, -most), most)
             vx[k] = now
         if not np.isfinite(vx).any():
-            raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
-        vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
+            raise DataError(
+                f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks"
+            )
+        vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][
+            0
+        ]  # before the first wheel was measured
         return recording.with_channels({"vx": vx}, made_of=())
 
 
@@ -153,20 +182,28 @@ class AccelerationFromSpeed:
 
     channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
     cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
-    direction: Literal["causal", "zero_phase"] = "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
+    direction: Literal["causal", "zero_phase"] = (
+        "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
+    )
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``. Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate."""
         speed, rate = recording[self.channel], recording.rate_hz
         if np.isnan(speed).any():
-            raise DataError(f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it")
+            raise DataError(
+                f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it"
+            )
         if not self.cutoff_hz < rate / 2:
-            raise DataError(f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at {self.cutoff_hz:g}")
+            raise DataError(
+                f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at {self.cutoff_hz:g}"
+            )
         sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate, output="sos")
         if self.direction == "causal":
             ax = scipy.signal.sosfilt(sections, np.diff(speed, prepend=speed[0]) * rate)
         else:
-            ax = scipy.signal.sosfiltfilt(sections, derivative(speed, rate), padlen=min(9, len(speed) - 1))
+            ax = scipy.signal.sosfiltfilt(
+                sections, derivative(speed, rate), padlen=min(9, len(speed) - 1)
+            )
         return recording.with_channels({"ax": ax}, made_of=())
 
 
@@ -188,8 +225,13 @@ class VelocityFromSideslip:
         if moving.any():
             worst = int(np.argmax(np.where(moving, np.abs(angle), 0.0)))
             what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
-            raise DataError(f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only")
-        return recording.with_channels({"vy_ref": recording[speed] * np.tan(np.where(beyond, 0.0, angle))}, made_of=("sideslip_ref", speed))
+            raise DataError(
+                f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only"
+            )
+        return recording.with_channels(
+            {"vy_ref": recording[speed] * np.tan(np.where(beyond, 0.0, angle))},
+            made_of=("sideslip_ref", speed),
+        )
 
 
 @dataclass(frozen=True)
@@ -199,7 +241,10 @@ class SideslipFromVelocity:
     def __call__(self, recording: Recording) -> Recording:
         """Set ``sideslip_ref``, by ``vx_ref`` or else ``vx``; gaps where they have them; `DataError` where one is missing."""
         speed = speed_of_reference(recording)
-        return recording.with_channels({"sideslip_ref": np.arctan2(recording["vy_ref"], recording[speed])}, made_of=("vy_ref", speed))
+        return recording.with_channels(
+            {"sideslip_ref": np.arctan2(recording["vy_ref"], recording[speed])},
+            made_of=("vy_ref", speed),
+        )
 
 
 def speed_of_reference(recording: Recording) -> str:
@@ -227,6 +272,13 @@ class ScaleToWheelbase:
         stretch = math.sqrt(self.to / self.wheelbase)
         factors = {"m/s": stretch, "rad/s": 1.0 / stretch, "m/s²": 1.0, "rad": 1.0}
         channels = {
-            name: samples * factors[unit] for name, samples in recording.channels.items() if (unit := CHANNELS[name].unit) in factors
+            name: samples * factors[unit]
+            for name, samples in recording.channels.items()
+            if (unit := CHANNELS[name].unit) in factors
         }
-        return replace(recording, rate_hz=recording.rate_hz / stretch, start_time=recording.start_time * stretch, channels=channels)
+        return replace(
+            recording,
+            rate_hz=recording.rate_hz / stretch,
+            start_time=recording.start_time * stretch,
+            channels=channels,
+        )

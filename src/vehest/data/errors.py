@@ -52,7 +52,10 @@ def listed(words: Sequence[str]) -> str:
 def printable(text: str, keep: str = "") -> str:
     """Text from a file as it can be shown: control characters but those to keep, and bytes that are no UTF-8, as escapes."""
     return "".join(
-        character if is_printable(character) or character in keep else character.encode("unicode_escape").decode() for character in text
+        character
+        if is_printable(character) or character in keep
+        else character.encode("unicode_escape").decode()
+        for character in text
     )
 
 

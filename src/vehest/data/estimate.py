@@ -52,21 +52,38 @@ class Estimate:
     estimator: str  # name of the estimator
     rate_hz: float  # rate of the estimate [Hz]
     start_time: float  # time of the first sample [s]
-    channels: Mapping[str, FloatArray]  # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    channels: Mapping[
+        str, FloatArray
+    ]  # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
     mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
-    covariance: FloatArray | None = None  # of the errors of some of the quantities, (T, n, n), where the method has one
+    covariance: FloatArray | None = (
+        None  # of the errors of some of the quantities, (T, n, n), where the method has one
+    )
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
-        where, lengths = f"estimate of '{self.recording_id}'", {len(values) for values in self.channels.values()}
+        where, lengths = (
+            f"estimate of '{self.recording_id}'",
+            {len(values) for values in self.channels.values()},
+        )
         for name in self.channels.keys() - QUANTITIES.keys():
             raise DataError(f"{where}: unknown quantity '{name}'")
         if len(lengths) != 1:
-            raise DataError(f"{where}: quantities must have one common length, not {sorted(lengths)}")
-        n_rows, shape = len(self.covariance_of), None if self.covariance is None else self.covariance.shape
-        if shape != ((len(self), n_rows, n_rows) if n_rows else None) or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows:
+            raise DataError(
+                f"{where}: quantities must have one common length, not {sorted(lengths)}"
+            )
+        n_rows, shape = (
+            len(self.covariance_of),
+            None if self.covariance is None else self.covariance.shape,
+        )
+        if (
+            shape != ((len(self), n_rows, n_rows) if n_rows else None)
+            or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows
+        ):
             what = f"not {shape} and ({', '.join(self.covariance_of)})"
-            raise DataError(f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}")
+            raise DataError(
+                f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}"
+            )
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))
@@ -94,12 +111,20 @@ class Estimate:
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"
-            raise DataError(f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}")
+            raise DataError(
+                f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}"
+            )
         index, rows = self._held_index(times), [self.covariance_of.index(name) for name in names]
-        return np.where(index[:, None, None] < 0, np.nan, self.covariance[index][:, rows][:, :, rows])
+        return np.where(
+            index[:, None, None] < 0, np.nan, self.covariance[index][:, rows][:, :, rows]
+        )
 
     def _held_index(self, times: FloatArray) -> NDArray[np.int64]:
         """Sample that is held at each time; -1 outside the estimate."""
-        tolerance = clock_tolerance(self.start_time, self.start_time + len(self) / self.rate_hz, self.rate_hz)
-        index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(np.int64)
+        tolerance = clock_tolerance(
+            self.start_time, self.start_time + len(self) / self.rate_hz, self.rate_hz
+        )
+        index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(
+            np.int64
+        )
         return np.where((index >= 0) & (index < len(self)), index, -1)

@@ -19,8 +19,12 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError, VehestError
 
 ASIDE_PREFIX = ".writing-"
-_ASIDE = re.compile(rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?")  # process and host before the name
-FOREIGN_SECONDS = 24 * 3600.0  # after which files of another host count as left over, whose processes cannot be seen from here
+_ASIDE = re.compile(
+    rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?"
+)  # process and host before the name
+FOREIGN_SECONDS = (
+    24 * 3600.0
+)  # after which files of another host count as left over, whose processes cannot be seen from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.fromkeys(
     ("os error 28", "database or disk is full"), errno.ENOSPC
@@ -48,7 +52,9 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
             os.replace(aside, path)
     except OSError as error:
         named = Path(error.filename) if isinstance(error.filename, str) else aside
-        raise writing_error(path if named.is_relative_to(aside) or ASIDE_PREFIX in str(named) else named, error) from error
+        raise writing_error(
+            path if named.is_relative_to(aside) or ASIDE_PREFIX in str(named) else named, error
+        ) from error
     except Exception as error:
         full = None if isinstance(error, VehestError) else no_room(error)
         if full is None:
@@ -69,9 +75,13 @@ def regular_file(path: Path) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         raise MissingError(f"there is no file '{path}'") from None
     except (OSError, ValueError) as error:  # a name may be too long, or hold a null character
-        raise DataError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+        raise DataError(
+            f"cannot read '{path}': {getattr(error, 'strerror', None) or error}"
+        ) from None
     if not stat.S_ISREG(mode):
-        kind = {"d": "a folder", "p": "a pipe", "s": "a socket"}.get(stat.filemode(mode)[0], "a device")
+        kind = {"d": "a folder", "p": "a pipe", "s": "a socket"}.get(
+            stat.filemode(mode)[0], "a device"
+        )
         raise DataError(f"'{path}' is {kind}, not a file")
     return path
 
@@ -93,7 +103,9 @@ def no_room(error: BaseException) -> OSError | None:
         if isinstance(cause, OSError) and cause.errno in NO_ROOM:
             return cause
         if not isinstance(cause, VehestError):
-            number = next((number for words, number in _NO_ROOM_WORDS.items() if words in str(cause)), None)
+            number = next(
+                (number for words, number in _NO_ROOM_WORDS.items() if words in str(cause)), None
+            )
             if number is not None:
                 return OSError(number, os.strerror(number))
         cause = cause.__cause__ or cause.__context__
@@ -102,10 +114,17 @@ def no_room(error: BaseException) -> OSError | None:
 
 def writing_error(path: Path, error: OSError) -> VehestError:
     """The one-line error for a failure to write to ``path``."""
-    path, full = Path(*(_ASIDE.sub("", part) for part in path.parts)), no_room(error)  # as it is called in the end
+    path, full = (
+        Path(*(_ASIDE.sub("", part) for part in path.parts)),
+        no_room(error),
+    )  # as it is called in the end
     if full is not None:
-        return MissingError(f"no room left to write '{path}' ({full.strerror}); free some space and run again")
-    return MissingError(f"cannot write '{path}': {error.strerror or error}; check the folder and its permissions")
+        return MissingError(
+            f"no room left to write '{path}' ({full.strerror}); free some space and run again"
+        )
+    return MissingError(
+        f"cannot write '{path}': {error.strerror or error}; check the folder and its permissions"
+    )
 
 
 def as_os_error(error: Exception) -> OSError:
@@ -124,7 +143,11 @@ def remove(path: Path) -> None:
 
 def remove_leftovers(folder: Path) -> int:
     """Remove files of ended writers in ``folder``; those of running processes stay. Returns their number."""
-    leftovers = [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)] if folder.is_dir() else []
+    leftovers = (
+        [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)]
+        if folder.is_dir()
+        else []
+    )
     for leftover in leftovers:
         remove(leftover)
     return len(leftovers)
@@ -135,7 +158,9 @@ def is_left_over(path: Path) -> bool:
     if not path.name.startswith(ASIDE_PREFIX):
         return False
     process, host = found.groups() if (found := _ASIDE.match(path.name)) else ("0", None)
-    if host in (None, _host()) and os.name == "posix":  # elsewhere os.kill would end what it asks for
+    if (
+        host in (None, _host()) and os.name == "posix"
+    ):  # elsewhere os.kill would end what it asks for
         return not _is_alive(int(process))
     try:
         return time.time() - path.lstat().st_mtime > FOREIGN_SECONDS
@@ -145,7 +170,9 @@ def is_left_over(path: Path) -> bool:
 
 def aside_of(path: Path, name: str = "") -> Path:
     """A free place beside ``path`` for this process, for ``path`` itself or another name; files that stay there are removed later."""
-    return path.with_name(f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}")
+    return path.with_name(
+        f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}"
+    )
 
 
 def sha256_of(path: Path) -> str:
@@ -177,7 +204,9 @@ def _is_alive(process: int) -> bool:
 
 def _flush(path: Path) -> None:
     for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
-        descriptor = os.open(file, os.O_RDWR)  # Windows flushes no file that is open for reading alone
+        descriptor = os.open(
+            file, os.O_RDWR
+        )  # Windows flushes no file that is open for reading alone
         try:
             os.fsync(descriptor)
         finally:

@@ -24,10 +24,14 @@ class FoldsFile:
     """How a split is cross-validated."""
 
     number: Annotated[int, Field(ge=FEWEST)] = 5  # of folds, three or more
-    of: Literal["recordings", "laps", "seconds"] = "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
+    of: Literal["recordings", "laps", "seconds"] = (
+        "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
+    )
     recordings: str = "*"  # pattern of those that take part
     block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
-    gap_seconds: NonNegativeFloat = 2.0  # taken off training and validation where they border on another fold [s]
+    gap_seconds: NonNegativeFloat = (
+        2.0  # taken off training and validation where they border on another fold [s]
+    )
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
@@ -39,13 +43,17 @@ def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) ->
             bounds += [stop for _, stop in laps_of(recording)[:-1]]
         elif folds.of == "seconds":  # a rest of less than half a block belongs to the one before
             number = max(round(recording.duration / folds.block_seconds), 1)
-            bounds += [recording.start_time + block * folds.block_seconds for block in range(1, number)]
+            bounds += [
+                recording.start_time + block * folds.block_seconds for block in range(1, number)
+            ]
         edges = sorted(set(bounds))
         blocks += [replace(whole, start=start, stop=stop) for start, stop in pairwise(edges)]
     return blocks
 
 
-def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
+def fold_of(
+    blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str
+) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
     """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
@@ -59,16 +67,22 @@ def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> 
     empty = sorted(set(range(folds.number)) - set(dealt.tolist()))
     if empty:
         what = f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number {empty[0]} stays empty"
-        raise ConfigurationError(f"{where}: {what}; take fewer folds, or of: seconds with a shorter block_seconds")
+        raise ConfigurationError(
+            f"{where}: {what}; take fewer folds, or of: seconds with a shorter block_seconds"
+        )
     roles = np.where(dealt == fold, 2, np.where(dealt == (fold + 1) % folds.number, 1, 0)).tolist()
-    train, validation, test = (_joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3))
+    train, validation, test = (
+        _joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3)
+    )
     if not (train and validation):
         what = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from"
         raise ConfigurationError(f"{where}: {what}; set folds.gap_seconds lower")
     return train, validation, test
 
 
-def _joined(blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float) -> tuple[Span, ...]:
+def _joined(
+    blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float
+) -> tuple[Span, ...]:
     """Blocks of a role, neighbours as one, shortened by the gap where they border on what has another role; dropped where that is all."""
     joined: list[tuple[Span, int]] = []
     for block, own in zip(blocks, roles, strict=True):
@@ -87,4 +101,6 @@ def _joined(blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float)
 
 
 def _touch(one: Span, other: Span) -> bool:
-    return (one.dataset, one.recording) == (other.dataset, other.recording) and math.isclose(one.stop, other.start)
+    return (one.dataset, one.recording) == (other.dataset, other.recording) and math.isclose(
+        one.stop, other.start
+    )

@@ -29,7 +29,10 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     Args:
         recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks them.
     """
-    speed, turning = _first_of(recording, "vx", "vx_ref"), _first_of(recording, "yaw_rate", "yaw_rate_ref")
+    speed, turning = (
+        _first_of(recording, "vx", "vx_ref"),
+        _first_of(recording, "yaw_rate", "yaw_rate_ref"),
+    )
     distance = np.cumsum(np.maximum(speed, 0.0)) / recording.rate_hz
     heading = np.cumsum(np.where(speed > 0.0, turning, 0.0)) / recording.rate_hz
     if len(recording) < 16 or not distance[-1] > 0.0:
@@ -50,7 +53,9 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
 def _first_of(recording: Recording, *names: str) -> FloatArray:
     name = next((name for name in names if name in recording), None)
     if name is None:
-        raise DataError(f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps can be found")
+        raise DataError(
+            f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps can be found"
+        )
     return np.nan_to_num(recording[name])
 
 
@@ -69,7 +74,9 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
     off = np.abs(mean_turn - 2.0 * math.pi * np.rint(mean_turn / (2.0 * math.pi)))
     peak = np.zeros(len(correlation), dtype=bool)
     peak[1:-1] = (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
-    found = np.flatnonzero(peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8))
+    found = np.flatnonzero(
+        peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8)
+    )
     if not len(found):
         return None
     best = correlation[found].max()
@@ -82,14 +89,21 @@ def _correlations(samples: FloatArray) -> FloatArray:
     size = 1 << (2 * number - 1).bit_length()
     spectrum = np.fft.rfft(samples, size)
     products = np.fft.irfft(spectrum * spectrum.conj(), size)[:number]
-    sums, squares = (np.concatenate([[0.0], np.cumsum(power)]) for power in (samples, np.square(samples)))
+    sums, squares = (
+        np.concatenate([[0.0], np.cumsum(power)]) for power in (samples, np.square(samples))
+    )
     lags = np.arange(number // 2 + 1)
     left = number - lags
     first_sum, second_sum = sums[left], sums[number] - sums[lags]
-    first_square, second_square = squares[left] - first_sum**2 / left, squares[number] - squares[lags] - second_sum**2 / left
+    first_square, second_square = (
+        squares[left] - first_sum**2 / left,
+        squares[number] - squares[lags] - second_sum**2 / left,
+    )
     scatter = np.sqrt(np.maximum(first_square * second_square, 0.0))
     together = products[: len(lags)] - first_sum * second_sum / left
-    return np.divide(together, scatter, out=np.zeros(len(lags)), where=scatter > 1e-12 * squares[number])
+    return np.divide(
+        together, scatter, out=np.zeros(len(lags)), where=scatter > 1e-12 * squares[number]
+    )
 
 
 def _boundaries(curvature: FloatArray, period: int) -> list[int]:
@@ -97,14 +111,21 @@ def _boundaries(curvature: FloatArray, period: int) -> list[int]:
     bounds, reach = [0], max(round(SEARCH * period), 1)
     while bounds[-1] + period < len(curvature):
         last = bounds[-1]
-        length = min(period, len(curvature) - last - period - reach)  # so that every move has as many points to fit
+        length = min(
+            period, len(curvature) - last - period - reach
+        )  # so that every move has as many points to fit
         if length < period // 4:
             bounds.append(last + period)
             continue
         template = curvature[last : last + length]
         starts = last + period + np.arange(-reach, reach + 1)
-        misfits = [float(np.sum(np.square(template - curvature[start : start + length]))) for start in starts]
+        misfits = [
+            float(np.sum(np.square(template - curvature[start : start + length])))
+            for start in starts
+        ]
         bounds.append(int(starts[int(np.argmin(misfits))]))
-    if len(bounds) > 1 and len(curvature) - bounds[-1] >= period - max(round(INCOMPLETE * period), 2):
+    if len(bounds) > 1 and len(curvature) - bounds[-1] >= period - max(
+        round(INCOMPLETE * period), 2
+    ):
         bounds.append(len(curvature))
     return bounds

@@ -20,10 +20,16 @@ class Limits:
 
     samples: PositiveInt = 20_000_000  # samples of one channel of a recording, also after its clock has been made even and after resampling
     columns: PositiveInt = 10_000  # columns that the header of a table may name
-    memory: PositiveInt = 1_600_000_000  # what reading one file may take beyond ten times its size [bytes]
-    filter_samples: PositiveInt = 1_000_000  # reach of a filter, or length of an estimator's window, in samples
+    memory: PositiveInt = (
+        1_600_000_000  # what reading one file may take beyond ten times its size [bytes]
+    )
+    filter_samples: PositiveInt = (
+        1_000_000  # reach of a filter, or length of an estimator's window, in samples
+    )
     jobs: PositiveInt = 10_000  # trainings of one sweep or study
-    text_bytes: PositiveInt = 16 * 2**20  # length of a configuration, manifest or other text that describes something [bytes]
+    text_bytes: PositiveInt = (
+        16 * 2**20
+    )  # length of a configuration, manifest or other text that describes something [bytes]
 
 
 _DEFAULTS = Limits()
@@ -50,17 +56,25 @@ def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
     return validated(Limits, config or {}, "", error=ConfigurationError, group="limits")
 
 
-def check_limit(name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError) -> None:
+def check_limit(
+    name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError
+) -> None:
     """Refuse a number above the limit ``name``, a field of `Limits`.
 
     Raises `DataError`: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:
-        raise error(f"{what}, more than the limit of {limit}; if that is meant, raise it: limits.{name}=NUMBER")
+        raise error(
+            f"{what}, more than the limit of {limit}; if that is meant, raise it: limits.{name}=NUMBER"
+        )
 
 
 def check_unpacked(file: object, packed: float, unpacked: float) -> None:
     """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times its packed size [bytes]."""
     beyond = unpacked - 10.0 * packed
-    check_limit("memory", beyond, f"'{file}' unpacks to {unpacked:.0f} bytes, {beyond:.0f} beyond ten times its size")
+    check_limit(
+        "memory",
+        beyond,
+        f"'{file}' unpacks to {unpacked:.0f} bytes, {beyond:.0f} beyond ten times its size",
+    )

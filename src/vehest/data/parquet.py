@@ -17,7 +17,16 @@ from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked
 from vehest.data.text_files import first_line
 
-DAMAGE = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, RecursionError)
+DAMAGE = (
+    pa.ArrowException,
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+)
 """What pyarrow and NumPy raise where a file is not what it says; an ArrowInvalid is a ValueError, too."""
 
 ROWS_AT_A_TIME = 1 << 15
@@ -34,23 +43,33 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
             footer = int.from_bytes(stream.read(4), "little")
             if footer < size:
                 check_limit("text_bytes", footer, f"'{path}' holds a description of {footer} bytes")
-            with pq.ParquetFile(stream, page_checksum_verification=True, pre_buffer=False, buffer_size=BUFFER) as file:
+            with pq.ParquetFile(
+                stream, page_checksum_verification=True, pre_buffer=False, buffer_size=BUFFER
+            ) as file:
                 yield file
     except VehestError:
         raise
     except DAMAGE as error:
-        raise DataError(f"'{path}' is truncated or damaged ({first_line(error)}); make it again") from None
+        raise DataError(
+            f"'{path}' is truncated or damaged ({first_line(error)}); make it again"
+        ) from None
 
 
-def number_batches(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> Iterator[pa.RecordBatch]:
+def number_batches(
+    path: Path, file: pq.ParquetFile, names: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
     """Columns of numbers or dates that are there once each, some rows at a time; `DataError` for anything else.
 
     Dates with times count from 1970 in the file's unit, ``unit`` of their type.
     """
     for name in names:
         kind = file.schema_arrow.field(name).type
-        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_timestamp(kind)):
-            raise DataError(f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed")
+        if not (
+            pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_timestamp(kind)
+        ):
+            raise DataError(
+                f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed"
+            )
     n_rows, done = file.metadata.num_rows, 0
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
     check_unpacked(path, path.stat().st_size, 8 * n_rows * len(names))
@@ -58,10 +77,14 @@ def number_batches(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> It
         done += batch.num_rows
         yield batch
     if done != n_rows:
-        raise DataError(f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again")
+        raise DataError(
+            f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again"
+        )
 
 
-def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def read_numbers(
+    path: Path, file: pq.ParquetFile, names: Sequence[str]
+) -> dict[str, NDArray[np.float64]]:
     """Columns of `number_batches`, float64 of shape (T,), missing values NaN."""
     values, done = {name: np.empty(0) for name in names}, 0
     for batch in number_batches(path, file, names):
@@ -78,7 +101,17 @@ def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
     found = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
         counted = chunk.cast(pa.int64()) if pa.types.is_timestamp(chunk.type) else chunk
-        numbers = counted if counted.type == pa.float64() else counted.cast(pa.float64(), safe=False)
-        values = np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset) if len(numbers) else np.empty(0)
-        found.append(np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values) if numbers.null_count else values)
+        numbers = (
+            counted if counted.type == pa.float64() else counted.cast(pa.float64(), safe=False)
+        )
+        values = (
+            np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset)
+            if len(numbers)
+            else np.empty(0)
+        )
+        found.append(
+            np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values)
+            if numbers.null_count
+            else values
+        )
     return np.concatenate(found)

@@ -34,24 +34,36 @@ class Recording:
     start_time: float  # time of the first sample [s]
     channels: Mapping[str, FloatArray]  # canonical name -> samples, float64 of shape (T,), SI units
     kind: Kind = "real"  # ``real`` or ``simulated``
-    gappy: frozenset[str] = frozenset()  # channels in which NaN means "not measured"; everywhere else NaN is an error
-    provenance: Mapping[str, Any] = field(default_factory=dict)  # where samples come from (JSON values only); not part of the data
+    gappy: frozenset[str] = (
+        frozenset()
+    )  # channels in which NaN means "not measured"; everywhere else NaN is an error
+    provenance: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # where samples come from (JSON values only); not part of the data
 
     def __post_init__(self) -> None:
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
             where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
-            raise DataError(f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz")
+            raise DataError(
+                f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz"
+            )
         if not math.isfinite(self.start_time):
-            raise DataError(f"recording '{self.id}': the start time must be finite, not {self.start_time}")
+            raise DataError(
+                f"recording '{self.id}': the start time must be finite, not {self.start_time}"
+            )
         if self.kind not in ("real", "simulated"):
-            raise DataError(f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'")
+            raise DataError(
+                f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'"
+            )
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
         frozen = {channel(name).name: _own(samples) for name, samples in self.channels.items()}
         n_samples = max((samples.size for samples in frozen.values()), default=0)
         if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
             shapes = {name: samples.shape for name, samples in frozen.items()}
-            raise DataError(f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}")
+            raise DataError(
+                f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}"
+            )
         object.__setattr__(self, "channels", frozen)
         object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
         for name, samples in frozen.items():
@@ -69,7 +81,9 @@ class Recording:
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of one channel, shape (T,). Raises `DataError`: the recording does not have it."""
         if name not in self.channels:
-            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})")
+            raise DataError(
+                f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})"
+            )
         return self.channels[name]
 
     def __contains__(self, name: object) -> bool:
@@ -98,7 +112,9 @@ class Recording:
         """The same drive with these channels only."""
         return replace(self, channels={name: self[name] for name in names})
 
-    def with_channels(self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None) -> Recording:
+    def with_channels(
+        self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None
+    ) -> Recording:
         """The same drive with channels (T,) replaced or added: gappy where one that they were made of is; None: as they were."""
         gappy = self.gappy
         if made_of is not None:
@@ -117,7 +133,9 @@ class Recording:
         first, last = self.index_range(start, stop)
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
-            raise DataError(f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s")
+            raise DataError(
+                f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s"
+            )
         return self.part(slice(first, last))
 
     def part(self, samples: slice) -> Recording:
@@ -125,7 +143,9 @@ class Recording:
         if samples == slice(0, len(self)):
             return self
         channels = {name: values[samples] for name, values in self.channels.items()}
-        return replace(self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels)
+        return replace(
+            self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels
+        )
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""
@@ -138,7 +158,11 @@ def joined(parts: Sequence[Recording]) -> Recording:
     """The recording of parts that follow one another."""
     first = parts[0]
     channels = {name: np.concatenate([part[name] for part in parts]) for name in first.channels}
-    return replace(first, channels=channels, provenance={key: value for key, value in first.provenance.items() if key != PART})
+    return replace(
+        first,
+        channels=channels,
+        provenance={key: value for key, value in first.provenance.items() if key != PART},
+    )
 
 
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
@@ -152,11 +176,20 @@ def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float
 
 def _own(samples: FloatArray) -> FloatArray:
     """Samples that nobody else can change: a copy, unless they are those of a recording."""
-    shared = isinstance(samples, np.ndarray) and samples.base is None and not samples.flags.writeable and samples.dtype == np.float64
+    shared = (
+        isinstance(samples, np.ndarray)
+        and samples.base is None
+        and not samples.flags.writeable
+        and samples.dtype == np.float64
+    )
     return samples if shared else np.array(samples, dtype=np.float64, copy=True)
 
 
 def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
     """Ranges of indices that divide so many samples into parts of about one length, none longer than `LONGEST_PART`."""
-    edges = np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1).astype(int).tolist()
+    edges = (
+        np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1)
+        .astype(int)
+        .tolist()
+    )
     return [slice(first, end) for first, end in pairwise(edges)]

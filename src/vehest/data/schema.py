@@ -21,12 +21,21 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 
 Schema = TypeVar("Schema")
 
-FURTHER_KEYS = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+FURTHER_KEYS = ConfigDict(
+    extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
+)
 DEEPEST = 60  # levels that plain values may nest
 LARGEST = 10**300  # whole number
 
 
-def validated(kind: type[Schema], content: Any, where: str, *, error: type[VehestError] = DataError, group: str = "") -> Schema:
+def validated(
+    kind: type[Schema],
+    content: Any,
+    where: str,
+    *,
+    error: type[VehestError] = DataError,
+    group: str = "",
+) -> Schema:
     """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
     Args:
@@ -57,7 +66,11 @@ def _without_names(content: Any, kind: Any) -> Any:
     if not (isinstance(content, dict) and is_dataclass(kind)):
         return content
     hints = get_type_hints(kind)
-    return {key: _without_names(inner, hints.get(str(key))) for key, inner in content.items() if key != "name" or "name" in hints}
+    return {
+        key: _without_names(inner, hints.get(str(key)))
+        for key, inner in content.items()
+        if key != "name" or "name" in hints
+    }
 
 
 def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int:
@@ -65,9 +78,13 @@ def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
         raise DataError(f"{where}: format must be a whole number, not {str(found)[:40]!r}")
     if found > newest:
-        raise DataError(f"{where} was written by a newer vehest (format {str(found)[:20]}, this one knows {newest}); update vehest")
+        raise DataError(
+            f"{where} was written by a newer vehest (format {str(found)[:20]}, this one knows {newest}); update vehest"
+        )
     if found < oldest:
-        raise DataError(f"{where} was written by an older vehest (format {found}, this one reads {oldest} to {newest}); make it again")
+        raise DataError(
+            f"{where} was written by an older vehest (format {found}, this one reads {oldest} to {newest}); make it again"
+        )
     return found
 
 
@@ -85,10 +102,20 @@ def _plain(value: Any, path: list[str]) -> Any:
         return {str(key): _plain(inner, [*path, str(key)]) for key, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(inner, [*path, str(position)]) for position, inner in enumerate(value)]
-    if value is None or isinstance(value, str | bool | float) or (isinstance(value, int) and abs(value) < LARGEST):
+    if (
+        value is None
+        or isinstance(value, str | bool | float)
+        or (isinstance(value, int) and abs(value) < LARGEST)
+    ):
         return value
-    shown = "a whole number of more than 300 digits" if isinstance(value, int) else f"no plain value but a {type(value).__name__}"
-    raise ValueError(f"{'.'.join(path) or 'it'} is {shown}, {_shown(value)}; put it in quotes if it is text")
+    shown = (
+        "a whole number of more than 300 digits"
+        if isinstance(value, int)
+        else f"no plain value but a {type(value).__name__}"
+    )
+    raise ValueError(
+        f"{'.'.join(path) or 'it'} is {shown}, {_shown(value)}; put it in quotes if it is text"
+    )
 
 
 # Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot hold: characters of plane 16,
@@ -144,7 +171,11 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
             return f"{name} is missing"
         case "unexpected_keyword_argument":
             beside, known = name.rpartition(".")[0], _keys_of(_type_at(kind, path[:-1]))
-            return f"{name} is not an option of {beside}; options: {known}" if beside else f"unknown key '{name}'; there are: {known}"
+            return (
+                f"{name} is not an option of {beside}; options: {known}"
+                if beside
+                else f"unknown key '{name}'; there are: {known}"
+            )
         case "literal_error":
             choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
             return f"{name} '{error['input']}' is not one of: {choices}"
@@ -153,8 +184,14 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
         case other if other not in _WANTED:
             return f"{name}: {error['msg'][:1].lower()}{error['msg'][1:]}, not {shown}"
     here, is_choice = _type_at(kind, path), len(loc) > len(path) + 1
-    kinds = [own["type"] for own in errors if own["loc"][:-1] == loc[:-1]] if is_choice else [error["type"]]
-    wanted = _bare(here)[1] or " or ".join(dict.fromkeys(_WANTED[own] for own in kinds if own in _WANTED))
+    kinds = (
+        [own["type"] for own in errors if own["loc"][:-1] == loc[:-1]]
+        if is_choice
+        else [error["type"]]
+    )
+    wanted = _bare(here)[1] or " or ".join(
+        dict.fromkeys(_WANTED[own] for own in kinds if own in _WANTED)
+    )
     options = f"; options: {keys}" if (keys := _keys_of(here)) else ""
     return f"{name} must be {wanted}, not {shown}{options}"
 
@@ -177,7 +214,9 @@ def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
 
 def _keys_of(kind: Any) -> str:
     bare, _ = _bare(kind)
-    return ", ".join(field.name for field in fields(bare) if field.init) if is_dataclass(bare) else ""
+    return (
+        ", ".join(field.name for field in fields(bare) if field.init) if is_dataclass(bare) else ""
+    )
 
 
 def _type_at(kind: Any, path: Sequence[str | int]) -> Any:
@@ -187,7 +226,9 @@ def _type_at(kind: Any, path: Sequence[str | int]) -> Any:
         if is_dataclass(bare):
             kind = get_type_hints(bare, include_extras=True).get(str(part))
         else:
-            kind = next((inner for inner in reversed(get_args(bare)) if inner is not Ellipsis), None)
+            kind = next(
+                (inner for inner in reversed(get_args(bare)) if inner is not Ellipsis), None
+            )
     return kind
 
 

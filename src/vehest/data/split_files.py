@@ -19,8 +19,12 @@ from vehest.data.schema import validated
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
-Reader = Callable[[Iterable[str] | None], Recording]  # reads the named channels of one recording, or all
-Catalogue = Callable[[str], Mapping[str, Reader]]  # of the name of a data set: its recordings as ingested, by id
+Reader = Callable[
+    [Iterable[str] | None], Recording
+]  # reads the named channels of one recording, or all
+Catalogue = Callable[
+    [str], Mapping[str, Reader]
+]  # of the name of a data set: its recordings as ingested, by id
 
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
@@ -67,7 +71,9 @@ class SplitFile:
         """Data set of a range, or of the folds."""
         dataset = (entry.dataset if entry else None) or self.dataset
         if dataset is None:
-            raise ConfigurationError(f"split '{self.name}': each range needs a dataset, or the split has one for all")
+            raise ConfigurationError(
+                f"split '{self.name}': each range needs a dataset, or the split has one for all"
+            )
         return dataset
 
 
@@ -89,7 +95,9 @@ def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
         if (share := PERCENT.fullmatch(entries)) is not None:
             begin, done = done, done + float(share[1])
             if done > 100.0 + 1e-9:
-                raise ConfigurationError(f"{where}: the percentages come to {done:g} %, more than there is")
+                raise ConfigurationError(
+                    f"{where}: the percentages come to {done:g} %, more than there is"
+                )
             return [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
         if LAPS.fullmatch(entries) is not None:
             return [{"recordings": "*", "laps": entries}]
@@ -118,8 +126,14 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
     """Names of the data sets that a split's plain values draw on, sorted; raises `ConfigurationError` where a range names none."""
     file = _read(config)
-    entries = [entry for entries in (file.train, file.validation, *file.tests.values()) for entry in entries]
-    return [file.dataset_of()] if file.folds else sorted({file.dataset_of(entry) for entry in entries})
+    entries = [
+        entry
+        for entries in (file.train, file.validation, *file.tests.values())
+        for entry in entries
+    ]
+    return (
+        [file.dataset_of()] if file.folds else sorted({file.dataset_of(entry) for entry in entries})
+    )
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
@@ -156,14 +170,24 @@ class _Ranges:
         """The split of the ranges, or of one fold of a cross-validation."""
         file, folds = self._file, self._file.folds
         if folds is None:
-            train, validation = self._spans("train", file.train), self._spans(VALIDATION, file.validation)
+            train, validation = (
+                self._spans("train", file.train),
+                self._spans(VALIDATION, file.validation),
+            )
             tests = {test: self._spans(test, entries) for test, entries in file.tests.items()}
             return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
-            raise ConfigurationError(f"{self._where}: folds make training, validation and test; leave train, validation and tests out")
+            raise ConfigurationError(
+                f"{self._where}: folds make training, validation and test; leave train, validation and tests out"
+            )
         dataset = file.dataset_of()
-        recordings = ((Span(dataset, name), self._recording(dataset, name)) for name in self._matching(dataset, folds.recordings))
-        train, validation, test = fold_of(blocks_of(folds, recordings), folds, file.fold, self._where)
+        recordings = (
+            (Span(dataset, name), self._recording(dataset, name))
+            for name in self._matching(dataset, folds.recordings)
+        )
+        train, validation, test = fold_of(
+            blocks_of(folds, recordings), folds, file.fold, self._where
+        )
         return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
 
     def limited(self, split: Split) -> Split:
@@ -171,23 +195,36 @@ class _Ranges:
         minutes, at = self._file.minutes, self._file.minutes_at
         if minutes is None:
             return split
-        train, validation = (tuple(self._with_ends(span) for span in spans) for spans in (split.train, split.validation))
+        train, validation = (
+            tuple(self._with_ends(span) for span in spans)
+            for spans in (split.train, split.validation)
+        )
         share = 60.0 * minutes / (_seconds_of(train) + _seconds_of(validation))
         named = replace(split, name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""))
         if share >= 1.0:
             return named
-        train, validation = (limit_minutes(spans, share * _seconds_of(spans), at) for spans in (train, validation))
+        train, validation = (
+            limit_minutes(spans, share * _seconds_of(spans), at) for spans in (train, validation)
+        )
         return replace(named, train=train, validation=validation)
 
     def _with_ends(self, span: Span) -> Span:
         recording = self._recording(span.dataset, span.recording)
-        return replace(span, start=max(span.start, recording.start_time), stop=min(span.stop, recording.end_time))
+        return replace(
+            span,
+            start=max(span.start, recording.start_time),
+            stop=min(span.stop, recording.end_time),
+        )
 
     def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
         spans: list[Span] = []
         for entry in entries:
             dataset = self._file.dataset_of(entry)
-            names = [entry.recording] if entry.recording is not None else self._matching(dataset, str(entry.recordings))
+            names = (
+                [entry.recording]
+                if entry.recording is not None
+                else self._matching(dataset, str(entry.recordings))
+            )
             whole = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
             spans += whole if entry.keep is None else self._cut(role, whole, entry.keep)
         return tuple(spans)
@@ -203,7 +240,9 @@ class _Ranges:
         found = PERCENT.fullmatch(bound)
         share = float(found[1]) if found else math.inf
         if share > 100.0:
-            raise ConfigurationError(f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'")
+            raise ConfigurationError(
+                f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
+            )
         if share in (0.0, 100.0):
             return -math.inf if share == 0.0 else math.inf
         recording = self._recording(dataset, name)
@@ -212,21 +251,31 @@ class _Ranges:
     def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
         found = LAPS.fullmatch(words)
         if found is None:
-            raise ConfigurationError(f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'")
+            raise ConfigurationError(
+                f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'"
+            )
         end, number, first, last = found.groups()
         laps = laps_of(self._recording(dataset, name))
         count = int(number or 1)
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
-            there = f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
-            raise ConfigurationError(f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead")
+            there = (
+                f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
+            )
+            raise ConfigurationError(
+                f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead"
+            )
         return laps[begin - 1][0], laps[stop - 1][1]
 
-    def _recording(self, dataset: str, name: str, channels: Iterable[str] | None = None) -> Recording:
+    def _recording(
+        self, dataset: str, name: str, channels: Iterable[str] | None = None
+    ) -> Recording:
         recordings = self._recordings(dataset)
         if name not in recordings:
-            raise ConfigurationError(f"{self._where}: data set '{dataset}' has no recording '{name}'")
+            raise ConfigurationError(
+                f"{self._where}: data set '{dataset}' has no recording '{name}'"
+            )
         return recordings[name](channels)
 
     def _matching(self, dataset: str, pattern: str) -> list[str]:
@@ -235,13 +284,17 @@ class _Ranges:
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
             known = ", ".join([*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])])
-            raise ConfigurationError(f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {known})")
+            raise ConfigurationError(
+                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {known})"
+            )
         return names
 
     def _recordings(self, dataset: str) -> Mapping[str, Reader]:
         if dataset not in self._known:
             if self._catalogue is None:
-                raise ConfigurationError(f"{self._where}: its patterns and the like need the recordings of data set '{dataset}'")
+                raise ConfigurationError(
+                    f"{self._where}: its patterns and the like need the recordings of data set '{dataset}'"
+                )
             self._known[dataset] = self._catalogue(dataset)
         return self._known[dataset]
 
@@ -252,9 +305,17 @@ class _Ranges:
             recording = self._recording(span.dataset, span.recording, condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
             for begin, after in stretches_where(recording, condition, first, end):
-                start = span.start if begin == first else recording.start_time + begin / recording.rate_hz
-                stop = span.stop if after == end else recording.start_time + after / recording.rate_hz
+                start = (
+                    span.start
+                    if begin == first
+                    else recording.start_time + begin / recording.rate_hz
+                )
+                stop = (
+                    span.stop if after == end else recording.start_time + after / recording.rate_hz
+                )
                 spans.append(replace(span, start=start, stop=stop))
         if not spans:
-            raise ConfigurationError(f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})")
+            raise ConfigurationError(
+                f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})"
+            )
         return spans

@@ -17,7 +17,9 @@ TRAINING = "training"
 def check_name(name: str, what: str) -> None:
     """Refuse, by a `ConfigurationError`, a name that holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot."""
     if not re.fullmatch(r"[\w-][\w.-]*", name):
-        raise ConfigurationError(f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names")
+        raise ConfigurationError(
+            f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names"
+        )
 
 
 @dataclass(frozen=True, order=True)
@@ -31,7 +33,9 @@ class Span:
 
     def __post_init__(self) -> None:
         if not self.start < self.stop:
-            raise ConfigurationError(f"span of recording '{self.recording}': start {self.start} s is not before stop {self.stop} s")
+            raise ConfigurationError(
+                f"span of recording '{self.recording}': start {self.start} s is not before stop {self.stop} s"
+            )
 
     def overlaps(self, other: Span) -> bool:
         """Whether both stretches share samples."""
@@ -64,21 +68,30 @@ class Split:
         if not (self.train or self.validation or self.tests):
             raise ConfigurationError(f"split '{self.name}' has no ranges at all")
         if bool(self.train) != bool(self.validation):
-            raise ConfigurationError(f"split '{self.name}' has nothing to {'validate' if self.train else 'train'} on")
+            raise ConfigurationError(
+                f"split '{self.name}' has nothing to {'validate' if self.train else 'train'} on"
+            )
         check_name(self.name, "split")
         for name, spans in self.tests.items():
             check_name(name, f"split '{self.name}': test set")
             if name in (VALIDATION, TRAINING):
-                raise ConfigurationError(f"split '{self.name}': a test set cannot be called '{name}', as the {name} range is in metrics")
+                raise ConfigurationError(
+                    f"split '{self.name}': a test set cannot be called '{name}', as the {name} range is in metrics"
+                )
             if not spans:
                 raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
         learnt = [("train", self.train), ("validation", self.validation)]
         tests = [(f"test '{name}'", spans) for name, spans in self.tests.items()]
-        for (role, spans), (other_role, other_spans) in [*pairwise(learnt), *product(learnt, tests)]:
+        for (role, spans), (other_role, other_spans) in [
+            *pairwise(learnt),
+            *product(learnt, tests),
+        ]:
             for span, other in product(spans, other_spans):
                 if span.overlaps(other):
                     what = f"{role} and {other_role} share samples of recording '{span.recording}'"
-                    raise ConfigurationError(f"split '{self.name}': {what} ({span.describe()} and {other.describe()}); separate the ranges")
+                    raise ConfigurationError(
+                        f"split '{self.name}': {what} ({span.describe()} and {other.describe()}); separate the ranges"
+                    )
 
     @property
     def datasets(self) -> tuple[str, ...]:

@@ -72,7 +72,10 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 
 def write_recording(recording: Recording, path: Path) -> None:
     """Store one recording; the file appears complete or not at all. Raises `MissingError`: the file cannot be written."""
-    about = _attributes(recording, _OF_RECORDING) | {"gappy": sorted(recording.gappy), "provenance": dict(recording.provenance)}
+    about = _attributes(recording, _OF_RECORDING) | {
+        "gappy": sorted(recording.gappy),
+        "provenance": dict(recording.provenance),
+    }
     _write(path, [recording.channels], "recording", about)
 
 
@@ -81,7 +84,9 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 
     Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged, not a recording, or lacks a channel.
     """
-    columns, described = _read(path, RecordingDescription, None if channels is None else list(channels))
+    columns, described = _read(
+        path, RecordingDescription, None if channels is None else list(channels)
+    )
     gappy, about = described.gappy & columns.keys(), _attributes(described, _OF_RECORDING)
     try:
         return Recording(channels=columns, gappy=gappy, provenance=described.provenance, **about)
@@ -119,10 +124,16 @@ def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray
     done, start = 0, None
     for part in parts:
         start = part.start_time if start is None else start
-        columns = {"time": start + np.arange(done, done + len(part)) / part.rate_hz, **part.channels}
+        columns = {
+            "time": start + np.arange(done, done + len(part)) / part.rate_hz,
+            **part.channels,
+        }
         done += len(part)
         if part.covariance is not None:
-            columns |= {f"{_COVARIANCE}_{i}_{j}": part.covariance[:, i, j] for i, j in np.ndindex(part.covariance.shape[1:])}
+            columns |= {
+                f"{_COVARIANCE}_{i}_{j}": part.covariance[:, i, j]
+                for i, j in np.ndindex(part.covariance.shape[1:])
+            }
         yield columns
 
 
@@ -138,11 +149,21 @@ def read_estimate(path: Path) -> Estimate:
         if n_states is not None:
             here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
             if n_states < 1 or n_states**2 != here:
-                raise DataError(f"n_states is {n_states}, and there are {here} columns of the covariance; make it again")
-            entries = [columns.pop(f"{_COVARIANCE}_{row}_{column}") for row, column in np.ndindex(n_states, n_states)]
+                raise DataError(
+                    f"n_states is {n_states}, and there are {here} columns of the covariance; make it again"
+                )
+            entries = [
+                columns.pop(f"{_COVARIANCE}_{row}_{column}")
+                for row, column in np.ndindex(n_states, n_states)
+            ]
             covariance = np.stack(entries, axis=1).reshape(-1, n_states, n_states)
         covariance_of = () if covariance is None else described.covariance_of
-        return Estimate(channels=columns, covariance=covariance, covariance_of=covariance_of, **_attributes(described, _OF_ESTIMATE))
+        return Estimate(
+            channels=columns,
+            covariance=covariance,
+            covariance_of=covariance_of,
+            **_attributes(described, _OF_ESTIMATE),
+        )
     except KeyError as error:
         raise DataError(f"'{path}' has no column {error}; make it again") from None
     except DataError as error:
@@ -154,7 +175,9 @@ def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _
     content = "recording" if kind is RecordingDescription else "estimate"
     found = _metadata(schema, path)
     if found.get("content") != content:
-        raise DataError(f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} {content} that vehest wrote")
+        raise DataError(
+            f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} {content} that vehest wrote"
+        )
     check_format(found.get("format", 0), _FORMAT, f"'{path}'")
     return validated(kind, found, f"'{path}'")
 
@@ -163,14 +186,23 @@ def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
     return {name: getattr(of, name) for name in names}
 
 
-def _write(path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, about: Mapping[str, Any]) -> None:
+def _write(
+    path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, about: Mapping[str, Any]
+) -> None:
     try:
         described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
-        raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})") from None
-    tables = (_table(columns).replace_schema_metadata({_METADATA_KEY: described}) for columns in parts)
+        raise DataError(
+            f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})"
+        ) from None
+    tables = (
+        _table(columns).replace_schema_metadata({_METADATA_KEY: described}) for columns in parts
+    )
     first = next(tables)
-    with written_aside(path) as aside, open(aside, "wb") as stream:  # pyarrow itself takes no names that are not UTF-8
+    with (
+        written_aside(path) as aside,
+        open(aside, "wb") as stream,
+    ):  # pyarrow itself takes no names that are not UTF-8
         try:
             with pq.ParquetWriter(stream, first.schema, **_LAYOUT) as writer:
                 for table in chain([first], tables):
@@ -180,24 +212,41 @@ def _write(path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, 
 
 
 def _table(columns: Mapping[str, FloatArray]) -> pa.Table:
-    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}  # without pandas
-    return pa.table({name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()})
+    buffers = {
+        name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64))
+        for name, values in columns.items()
+    }  # without pandas
+    return pa.table(
+        {
+            name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own])
+            for name, own in buffers.items()
+        }
+    )
 
 
-def _read(path: Path, kind: type[_Description], names: list[str] | None = None) -> tuple[dict[str, FloatArray], _Description]:
+def _read(
+    path: Path, kind: type[_Description], names: list[str] | None = None
+) -> tuple[dict[str, FloatArray], _Description]:
     with parquet_file(path) as file:
         schema = file.schema_arrow
         described = description_of(schema, path, kind)
         for name, column in zip(schema.names, schema.types, strict=True):
             if column != pa.float64() or schema.names.count(name) > 1:
-                raise DataError(f"'{path}': column '{name}' is there twice, or of type {column}, not double; make it again")
+                raise DataError(
+                    f"'{path}': column '{name}' is there twice, or of type {column}, not double; make it again"
+                )
         missing = [name for name in names or [] if name not in schema.names]
         if missing:
-            raise DataError(f"'{path}' has no channel '{missing[0]}' (it has {', '.join(schema.names)})")
+            raise DataError(
+                f"'{path}' has no channel '{missing[0]}' (it has {', '.join(schema.names)})"
+            )
         return read_numbers(path, file, schema.names if names is None else names), described
 
 
 def _metadata(schema: pa.Schema, path: Path) -> dict[str, Any]:
     """The description of vehest beside a table; empty for a table of someone else's."""
-    described = parse_json((schema.metadata or {}).get(_METADATA_KEY, b"{}"), f"'{path}': the description beside the table")
+    described = parse_json(
+        (schema.metadata or {}).get(_METADATA_KEY, b"{}"),
+        f"'{path}': the description beside the table",
+    )
     return described if isinstance(described, dict) else {}

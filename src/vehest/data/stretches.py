@@ -40,11 +40,16 @@ class Condition:
 
     def describe(self) -> str:
         """For messages, for example ``0 <= |ay| <= 7, 2 s or longer``."""
-        bounds = [f"{bounds.at_least:g} <= |{channel}| <= {bounds.at_most:g}" for channel, bounds in self.magnitude.items()]
+        bounds = [
+            f"{bounds.at_least:g} <= |{channel}| <= {bounds.at_most:g}"
+            for channel, bounds in self.magnitude.items()
+        ]
         return ", ".join([*bounds, f"{self.at_least_seconds:g} s or longer"])
 
 
-def stretches_where(recording: Recording, condition: Condition, first: int, end: int) -> list[tuple[int, int]]:
+def stretches_where(
+    recording: Recording, condition: Condition, first: int, end: int
+) -> list[tuple[int, int]]:
     """Longest runs [first, end) of sample indices that meet a condition; unmeasured ones do not; raises `DataError` without a channel."""
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():

@@ -27,7 +27,9 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise DataError(f"'{path}' is not UTF-8 text (byte {error.start}); save it as UTF-8") from None
+        raise DataError(
+            f"'{path}' is not UTF-8 text (byte {error.start}); save it as UTF-8"
+        ) from None
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from None
 
@@ -44,8 +46,13 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
-    except (AttributeError, LookupError):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
-        raise DataError(f"{where} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)") from None
+    except (
+        AttributeError,
+        LookupError,
+    ):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
+        raise DataError(
+            f"{where} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)"
+        ) from None
 
 
 def _check_size(text: str, where: str) -> None:
@@ -63,7 +70,9 @@ def _check_size(text: str, where: str) -> None:
                 begun.append((event.anchor, count))
                 sizes[event.anchor] = MOST_VALUES  # until its end: it cannot hold itself
         if count > MOST_VALUES or len(begun) > DEEPEST:
-            raise DataError(f"{where} nests deeper than {DEEPEST} levels or holds more than {MOST_VALUES} values, repeated ones included")
+            raise DataError(
+                f"{where} nests deeper than {DEEPEST} levels or holds more than {MOST_VALUES} values, repeated ones included"
+            )
 
 
 def read_json(path: Path) -> Any:
@@ -92,7 +101,9 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
             raise DataError(f"'{path}' has no column '{name}'")
     for number, row in enumerate(rows, start=1):
         if None in row or None in row.values():
-            raise DataError(f"'{path}': data row {number} has not {len(header)} columns, as the first line has")
+            raise DataError(
+                f"'{path}': data row {number} has not {len(header)} columns, as the first line has"
+            )
     return rows
 
 
@@ -101,7 +112,9 @@ def number_in(row: Mapping[str, str], column: str, path: Path) -> float:
     try:
         return float(row[column])
     except ValueError:
-        raise DataError(f"'{path}': column '{column}' holds {row[column][:40]!r}, which is no number") from None
+        raise DataError(
+            f"'{path}': column '{column}' holds {row[column][:40]!r}, which is no number"
+        ) from None
 
 
 def first_line(error: BaseException) -> str:

@@ -32,7 +32,9 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = 8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
+LONGEST_DIRECT = (
+    8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
+)
 OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
 MOST_BRIDGED = 0.1  # of a channel's samples
 VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
@@ -56,18 +58,28 @@ class Resample:
     method: Literal["polyphase", "decimate"] = "polyphase"  # ``polyphase`` or ``decimate``
     zero_crossings: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
-    cutoff: ClassVar[float] = 0.86  # of the slower Nyquist frequency, where the stop band has then begun
+    cutoff: ClassVar[float] = (
+        0.86  # of the slower Nyquist frequency, where the stop band has then begun
+    )
 
     def __post_init__(self) -> None:
         if not 0.0 < self.rate_hz < math.inf:
-            raise ConfigurationError(f"resampling: rate_hz must be a positive number, not {self.rate_hz:g}")
+            raise ConfigurationError(
+                f"resampling: rate_hz must be a positive number, not {self.rate_hz:g}"
+            )
 
     def __call__(self, recording: Recording) -> Recording:
         """Resample every channel; errors where the outcome or the filter is more than the limits, or a gappy channel needs filtering."""
         expected = len(recording) * (self.rate_hz / recording.rate_hz)
-        what = f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
+        what = (
+            f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
+        )
         check_limit("samples", expected, what)
-        check_limit("memory", 8 * expected * len(recording.channels), f"{what} in each of {len(recording.channels)} channels")
+        check_limit(
+            "memory",
+            8 * expected * len(recording.channels),
+            f"{what} in each of {len(recording.channels)} channels",
+        )
         exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
         ratio = exact.limit_denominator(1000)
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
@@ -79,12 +91,16 @@ class Resample:
         if self.method == "decimate":
             if up != 1:
                 what = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
-                raise ConfigurationError(f"recording '{recording.id}': {what}; use method=polyphase")
+                raise ConfigurationError(
+                    f"recording '{recording.id}': {what}; use method=polyphase"
+                )
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:
             length = 2 * self.zero_crossings * max(up, down) + 1
             check_limit(
-                "filter_samples", length, f"recording '{recording.id}': resampling by {up}/{down} needs a filter of {length} samples"
+                "filter_samples",
+                length,
+                f"recording '{recording.id}': resampling by {up}/{down} needs a filter of {length} samples",
             )
             names, taps = _without_gaps(recording, tuple(recording.channels)), self._taps(up, down)
             n_out = -(-len(recording) * up // down)
@@ -102,7 +118,9 @@ class Resample:
         half = self.zero_crossings * slower
         taps, window = windowed_sinc(half, self.cutoff / slower, self.kaiser_beta)
         lag = np.arange(-half, half + 1) / half
-        for phase in range(up):  # every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line that line
+        for phase in range(
+            up
+        ):  # every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line that line
             branch = slice(phase, None, up)
             taps[branch] /= up * taps[branch].sum()
             shapes = window[branch] * lag[branch] ** np.array([[0], [1]])
@@ -126,17 +144,23 @@ class LowPass:
     channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
     direction: Literal["causal", "zero_phase"] = "zero_phase"  # ``causal`` or ``zero_phase``
     design: Literal["butterworth", "fir"] = "butterworth"  # ``butterworth`` or ``fir``
-    reach: PositiveFloat = 0.3  # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
+    reach: PositiveFloat = (
+        0.3  # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
+    )
 
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
-            raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
+            raise ConfigurationError(
+                "a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one"
+            )
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels; errors where one is missing or has gaps, or the cut-off does not suit the rate or the limits."""
         where, rate_hz = f"recording '{recording.id}'", recording.rate_hz
         if not 0 < self.cutoff_hz < rate_hz / 2:
-            raise ConfigurationError(f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
+            raise ConfigurationError(
+                f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz"
+            )
         length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
         what = f"{where}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
         check_limit("filter_samples", length, what, ConfigurationError)
@@ -146,10 +170,16 @@ class LowPass:
             if self.design == "fir":
                 return self._symmetric(samples, rate_hz)
             if self.direction == "causal":
-                return scipy.signal.sosfilt(sections, samples, zi=scipy.signal.sosfilt_zi(sections) * samples[0])[0]
-            return scipy.signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
+                return scipy.signal.sosfilt(
+                    sections, samples, zi=scipy.signal.sosfilt_zi(sections) * samples[0]
+                )[0]
+            return scipy.signal.sosfiltfilt(
+                sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1)
+            )
 
-        return recording.with_channels({name: filtered(recording[name]) for name in _without_gaps(recording, self.channels)})
+        return recording.with_channels(
+            {name: filtered(recording[name]) for name in _without_gaps(recording, self.channels)}
+        )
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
         """By the ``fir``, on samples extended at both ends by odd reflection; a constant stays that constant, a line that line."""
@@ -175,29 +205,42 @@ class RemoveOutliers:
         width = 2 * self.half_window + 1
         what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
         check_limit("filter_samples", width, what, ConfigurationError)
-        check_limit("memory", 8 * width * len(recording), f"{what} compares {width * len(recording)} values a channel", ConfigurationError)
+        check_limit(
+            "memory",
+            8 * width * len(recording),
+            f"{what} compares {width * len(recording)} values a channel",
+            ConfigurationError,
+        )
         at_once = max(VALUES_AT_ONCE // width, 1)
 
         def cleaned(samples: FloatArray) -> FloatArray:
-            padded = np.pad(samples, self.half_window, mode="reflect" if len(samples) > 1 else "edge")
+            padded = np.pad(
+                samples, self.half_window, mode="reflect" if len(samples) > 1 else "edge"
+            )
             result = np.empty(len(samples))
             for begin in range(0, len(samples), at_once):
                 inside = samples[begin : begin + at_once]
-                neighbours = np.lib.stride_tricks.sliding_window_view(padded[begin : begin + len(inside) + width - 1], width)
+                neighbours = np.lib.stride_tricks.sliding_window_view(
+                    padded[begin : begin + len(inside) + width - 1], width
+                )
                 median = np.median(neighbours, axis=1)
                 deviation = 1.4826 * np.median(np.abs(neighbours - median[:, None]), axis=1)
                 spike = np.abs(inside - median) > self.threshold * deviation + 1e-12
                 result[begin : begin + len(inside)] = np.where(spike, median, inside)
             return result
 
-        return recording.with_channels({name: cleaned(recording[name]) for name in _without_gaps(recording, self.channels)})
+        return recording.with_channels(
+            {name: cleaned(recording[name]) for name in _without_gaps(recording, self.channels)}
+        )
 
 
 @dataclass(frozen=True)
 class BridgeImpossible:
     """Replace samples beyond what a vehicle can do by straight lines, in channels with a few of them; offline."""
 
-    beside: Annotated[float, Field(ge=0.0)] = 0.0  # reach of a line to either side, where a slower signal was interpolated [s]
+    beside: Annotated[float, Field(ge=0.0)] = (
+        0.0  # reach of a line to either side, where a slower signal was interpolated [s]
+    )
 
     def __call__(self, recording: Recording) -> Recording:
         """Bridge them; a channel with more than a tenth of them stays, whose unit is then wrong."""
@@ -205,8 +248,16 @@ class BridgeImpossible:
         places, changed = np.arange(len(recording)), {}
         for name, samples in recording.channels.items():
             beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
-            if beyond.any() and (near := np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5).mean() <= MOST_BRIDGED:
-                changed[name] = np.where(near, np.interp(places, places[~near], samples[~near]), samples)
+            if (
+                beyond.any()
+                and (
+                    near := np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5
+                ).mean()
+                <= MOST_BRIDGED
+            ):
+                changed[name] = np.where(
+                    near, np.interp(places, places[~near], samples[~near]), samples
+                )
         return recording.with_channels(changed)
 
 
@@ -226,7 +277,9 @@ class MountingCorrection:
 
     def __call__(self, recording: Recording) -> Recording:
         """Correct ax and ay. Raises `DataError`: ax, ay or yaw_rate is missing or has gaps."""
-        ax, ay, yaw_rate = (recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate")))
+        ax, ay, yaw_rate = (
+            recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate"))
+        )
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
         if self.lever_x or self.lever_y:
@@ -249,7 +302,11 @@ class ReferenceLever:
     def __call__(self, recording: Recording) -> Recording:
         """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate."""
         turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
-        moved = {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y} if "vx_ref" in recording else {}
+        moved = (
+            {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y}
+            if "vx_ref" in recording
+            else {}
+        )
         moved["vy_ref"] = recording["vy_ref"] - recording[turning] * self.lever_x
         made_of = {turning, *moved}
         if "sideslip_ref" in recording:
@@ -283,18 +340,28 @@ class DelayCorrection:
         reach = 0 if abs(fraction) < 1e-9 else self.reach
         first, last = max(reach - whole, 0), length - max(reach + whole, 0)
         if first >= last:
-            raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s")
+            raise DataError(
+                f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s"
+            )
         taps = self._taps(fraction) if reach else np.ones(1)
         channels = {name: samples[first:last] for name, samples in recording.channels.items()}
-        for name in _without_gaps(recording, self.channels):  # output sample k is the sum of taps over the samples around k + whole
+        for name in _without_gaps(
+            recording, self.channels
+        ):  # output sample k is the sum of taps over the samples around k + whole
             neighbours = np.lib.stride_tricks.sliding_window_view(recording[name], len(taps))
             channels[name] = neighbours[first + whole - reach : last + whole - reach] @ taps
-        return replace(recording, start_time=recording.start_time + first / recording.rate_hz, channels=channels)
+        return replace(
+            recording,
+            start_time=recording.start_time + first / recording.rate_hz,
+            channels=channels,
+        )
 
     def _taps(self, fraction: float) -> FloatArray:
         distance = np.arange(-self.reach, self.reach + 1) - fraction
         inside = np.clip(1.0 - np.square(distance / (self.reach + 1)), 0.0, None)
-        taps = np.sinc(distance) * np.i0(self.kaiser_beta * np.sqrt(inside)) / np.i0(self.kaiser_beta)
+        taps = (
+            np.sinc(distance) * np.i0(self.kaiser_beta * np.sqrt(inside)) / np.i0(self.kaiser_beta)
+        )
         return np.asarray(taps / taps.sum(), dtype=np.float64)  # a constant stays that constant
 
 
@@ -302,11 +369,15 @@ class DelayCorrection:
 class OffsetCorrection:
     """Take constant offsets off channels."""
 
-    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)  # by channel, in its unit
+    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(
+        hash=False
+    )  # by channel, in its unit
 
     def __call__(self, recording: Recording) -> Recording:
         """Subtract the offsets. Raises `DataError`: a channel is missing."""
-        return recording.with_channels({name: recording[name] - value for name, value in self.offsets.items()})
+        return recording.with_channels(
+            {name: recording[name] - value for name, value in self.offsets.items()}
+        )
 
 
 TRANSFORMS: dict[str, type[Any]] = {
@@ -337,7 +408,9 @@ class Preparation:
     """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a model."""
 
     method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
-    transforms: tuple[dict[str, Any], ...] = ()  # applied before, at the native rate, each by its ``name`` and its arguments
+    transforms: tuple[
+        dict[str, Any], ...
+    ] = ()  # applied before, at the native rate, each by its ``name`` and its arguments
 
     def __post_init__(self) -> None:
         for entry in self.transforms:
@@ -351,7 +424,9 @@ class Preparation:
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
     """Build a transform from plain values: its ``name`` and its arguments. Raises `ConfigurationError`: an unknown name or argument."""
     if not isinstance(config, Mapping):
-        raise ConfigurationError(f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}")
+        raise ConfigurationError(
+            f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}"
+        )
     arguments = {str(key): value for key, value in config.items() if key != "name"}
     if isinstance(arguments.get("channels"), str):
         arguments["channels"] = [arguments["channels"]]
@@ -380,7 +455,9 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray, n_out:
     half = len(taps) // 2
     margin = -(-(half // up + 1) // down) * down  # whole steps of the output grid
     extended = _extended(samples, margin)
-    rows = np.ascontiguousarray(np.pad(extended, (0, -len(extended) % down)).reshape(-1, down).T)  # (down, steps)
+    rows = np.ascontiguousarray(
+        np.pad(extended, (0, -len(extended) % down)).reshape(-1, down).T
+    )  # (down, steps)
     filtered = np.zeros(n_out)
     _compiled_sums()(rows, up * taps, up, margin * up + half, filtered)
     return filtered
@@ -403,7 +480,11 @@ def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
             sums[:] = 0.0
             last = newest + phase * down
             for sample in range(-((len(taps) - 1 - last) // up), last // up + 1):
-                row, first, tap = rows[sample % down], np.uint64(sample // down + begin // up), taps[last - up * sample]
+                row, first, tap = (
+                    rows[sample % down],
+                    np.uint64(sample // down + begin // up),
+                    taps[last - up * sample],
+                )
                 for i in range(count):
                     sums[i] += row[first + np.uint64(i)] * tap
             for i in range(count):
@@ -412,7 +493,11 @@ def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
 
 def _extended(samples: FloatArray, margin: int) -> FloatArray:
     """Samples with ``margin`` more at both ends, by odd reflection."""
-    return np.pad(samples, margin, mode="reflect", reflect_type="odd") if len(samples) > 1 else np.pad(samples, margin, mode="edge")
+    return (
+        np.pad(samples, margin, mode="reflect", reflect_type="odd")
+        if len(samples) > 1
+        else np.pad(samples, margin, mode="edge")
+    )
 
 
 def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -421,5 +506,7 @@ def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ..
     for name in chosen:
         if name in recording.gappy:
             what = f"channel '{name}' has gaps and cannot be filtered"
-            raise DataError(f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate")
+            raise DataError(
+                f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate"
+            )
     return chosen

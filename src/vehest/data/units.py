@@ -7,8 +7,25 @@ import math
 from vehest.data.errors import DataError
 
 _FACTORS = {  # SI unit -> unit -> factor that makes it SI
-    "m/s": {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "knots": 1852.0 / 3600.0, "ft/s": 0.3048, "cm/s": 0.01, "mm/s": 0.001},
-    "m/s²": {"m/s²": 1.0, "m/s^2": 1.0, "m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s²": 0.3048, "cm/s²": 0.01, "mm/s²": 0.001},
+    "m/s": {
+        "m/s": 1.0,
+        "km/h": 1.0 / 3.6,
+        "mph": 0.44704,
+        "knots": 1852.0 / 3600.0,
+        "ft/s": 0.3048,
+        "cm/s": 0.01,
+        "mm/s": 0.001,
+    },
+    "m/s²": {
+        "m/s²": 1.0,
+        "m/s^2": 1.0,
+        "m/s2": 1.0,
+        "g": 9.80665,
+        "mg": 9.80665e-3,
+        "ft/s²": 0.3048,
+        "cm/s²": 0.01,
+        "mm/s²": 0.001,
+    },
     "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 0.001},
     "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "mrad/s": 0.001},
     "N": {"N": 1.0, "kN": 1e3},
@@ -19,7 +36,9 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "1": {"1": 1.0},
 }
-_UNITS = {unit: (si_unit, factor) for si_unit, units in _FACTORS.items() for unit, factor in units.items()}
+_UNITS = {
+    unit: (si_unit, factor) for si_unit, units in _FACTORS.items() for unit, factor in units.items()
+}
 
 
 def factor_to_si(unit: str, si_unit: str) -> float:

@@ -30,14 +30,18 @@ class WindowSet:
         return len(self.starts)
 
 
-def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int) -> WindowSet:
+def windows_of(
+    recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int
+) -> WindowSet:
     """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1); raises `DataError` for gaps or no windows."""
     check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
     series, targets, starts, offset = [], [], [], 0
     for recording in recordings:
         for name in (*channels, target):
             if name in recording.gappy and np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps; windows need a value at every sample")
+                raise DataError(
+                    f"recording '{recording.id}': channel '{name}' has gaps; windows need a value at every sample"
+                )
         first = window_starts(len(recording), n_window)
         series.append(recording.stack(channels))
         targets.append(recording[target][first + n_window])
@@ -45,8 +49,12 @@ def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target:
         offset += len(recording)
     if not sum(len(first) for first in starts):
         lengths = ", ".join(f"'{r.id}' {len(r)}" for r in recordings)
-        raise DataError(f"windows of {n_window} samples and a target need longer recordings than: {lengths}")
-    return WindowSet(np.concatenate(series), np.concatenate(targets), np.concatenate(starts), n_window)
+        raise DataError(
+            f"windows of {n_window} samples and a target need longer recordings than: {lengths}"
+        )
+    return WindowSet(
+        np.concatenate(series), np.concatenate(targets), np.concatenate(starts), n_window
+    )
 
 
 def window_starts(n_samples: int, n_window: int) -> NDArray[np.int64]:

@@ -23,7 +23,9 @@ from vehest.training.context import FitRecord as FitRecord
 
 def rate(default: float) -> Any:
     """The setting ``rate_hz`` with another default [Hz]."""
-    return setting(default, "sampling rate it works at", unit="Hz", positive=True, most=HIGHEST_RATE)
+    return setting(
+        default, "sampling rate it works at", unit="Hz", positive=True, most=HIGHEST_RATE
+    )
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,9 @@ def require_learnable(
         for name in channels:
             if name not in recording:
                 hint = (hints or {}).get(name, "")
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}")
+                raise DataError(
+                    f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}"
+                )
             if name not in skippable and np.isnan(recording[name]).any():
                 what = f"channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; cut them out in conf/split"
                 raise DataError(f"recording '{recording.id}': {what}")
@@ -69,13 +73,17 @@ class Trial(NamedTuple):
     about: str  # text for people
     # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the settings have
     overrides: str = ""
-    samples: int = 0  # that some range for training, and each for validation, has to have at the family's rate
+    samples: int = (
+        0  # that some range for training, and each for validation, has to have at the family's rate
+    )
 
 
 class Stepper(ABC):
     """An estimator that runs along with the drive, one sample after another."""
 
-    horizon_steps: int = 0  # sampling intervals after the sample for which the returned estimate holds
+    horizon_steps: int = (
+        0  # sampling intervals after the sample for which the returned estimate holds
+    )
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -101,34 +109,66 @@ class Estimator(ABC):
     settings_type: ClassVar[Any] = EstimatorSettings
     training_type: ClassVar[type]  # dataclass of the settings of its fit
     learns_from: tuple[str, ...] = ("vy_ref",)  # reference channels that its fit reads
-    skippable: ClassVar[tuple[str, ...]] = ()  # channels of ``channels`` that may have gaps, because the method does without a sample
-    refuses: ClassVar[tuple[str, ...]] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
-    may_be_nan: ClassVar[tuple[str, ...]] = ()  # weights that may stay NaN, because each recording tells them
+    skippable: ClassVar[
+        tuple[str, ...]
+    ] = ()  # channels of ``channels`` that may have gaps, because the method does without a sample
+    refuses: ClassVar[
+        tuple[str, ...]
+    ] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
+    may_be_nan: ClassVar[
+        tuple[str, ...]
+    ] = ()  # weights that may stay NaN, because each recording tells them
     covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
-    horizon_steps: ClassVar[int] = 0  # sampling intervals after a sample for which the estimate made with it holds
-    ignores_initial_state: ClassVar[bool] = False  # whether an initial state is left aside; else it is used, or refused as an error
-    slow_kernel: ClassVar[str] = ""  # ``module:function`` that takes tens of seconds to compile; empty: none
+    horizon_steps: ClassVar[int] = (
+        0  # sampling intervals after a sample for which the estimate made with it holds
+    )
+    ignores_initial_state: ClassVar[bool] = (
+        False  # whether an initial state is left aside; else it is used, or refused as an error
+    )
+    slow_kernel: ClassVar[str] = (
+        ""  # ``module:function`` that takes tens of seconds to compile; empty: none
+    )
     # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    trials: ClassVar[tuple[Trial, ...]] = ()  # in the first comparison on a new car; none: it is left out
+    trials: ClassVar[
+        tuple[Trial, ...]
+    ] = ()  # in the first comparison on a new car; none: it is left out
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
     style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
-    template: ClassVar[str] = ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
-    version: ClassVar[str] = "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
+    template: ClassVar[str] = (
+        ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
+    )
+    version: ClassVar[str] = (
+        "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
+    )
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         own = {name: value for name, value in vars(cls).items() if isinstance(value, Field)}
-        of_bases = dict.fromkeys(base.settings_type for base in cls.__bases__ if issubclass(base, Estimator))
-        bases = [one for one in of_bases if not any(other is not one and issubclass(other, one) for other in of_bases)]
+        of_bases = dict.fromkeys(
+            base.settings_type for base in cls.__bases__ if issubclass(base, Estimator)
+        )
+        bases = [
+            one
+            for one in of_bases
+            if not any(other is not one and issubclass(other, one) for other in of_bases)
+        ]
         if not own and len(bases) == 1:
             return
         kinds = {name: cls.__annotations__[name] for name in own}
         optional = [name for name, value in own.items() if value.default is None]
-        kinds |= {name: f"{kind} | None" if isinstance(kind := kinds[name], str) else kind | None for name in optional}
+        kinds |= {
+            name: f"{kind} | None" if isinstance(kind := kinds[name], str) else kind | None
+            for name in optional
+        }
         described = [(name, kind, own[name]) for name, kind in kinds.items()]
-        cls.settings_type = make_dataclass("settings_type", described, bases=tuple(bases), frozen=True)
-        cls.settings_type.__module__, cls.settings_type.__qualname__ = cls.__module__, f"{cls.__qualname__}.settings_type"
+        cls.settings_type = make_dataclass(
+            "settings_type", described, bases=tuple(bases), frozen=True
+        )
+        cls.settings_type.__module__, cls.settings_type.__qualname__ = (
+            cls.__module__,
+            f"{cls.__qualname__}.settings_type",
+        )
         for name in own:
             setattr(cls, name, property(attrgetter(f"settings.{name}")))
 
@@ -208,7 +248,9 @@ class Estimator(ABC):
 
     @classmethod
     @abstractmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Fit estimators of one ``batch_key`` together, each with the result it would have alone.
 
         Args:
@@ -229,7 +271,9 @@ class Estimator(ABC):
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
     def estimate(
-        self, recordings: Sequence[Recording], initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None
+        self,
+        recordings: Sequence[Recording],
+        initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
     ) -> list[Estimate]:
         """Estimate the lateral velocity of recordings, at the estimator's rate, that carry no reference channels.
 
@@ -259,9 +303,17 @@ class Estimator(ABC):
             )
         for name in self.channels:
             if name not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' needs")
-            if name in recording.gappy and name not in self.skippable and np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip")
+                raise DataError(
+                    f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' needs"
+                )
+            if (
+                name in recording.gappy
+                and name not in self.skippable
+                and np.isnan(recording[name]).any()
+            ):
+                raise DataError(
+                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip"
+                )
         return recording.select(self.channels)
 
     def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
@@ -269,12 +321,20 @@ class Estimator(ABC):
         try:
             values = [float(sample[name]) for name in self.channels]
         except KeyError as error:
-            raise DataError(f"the sample has no channel {error}; it needs {', '.join(self.channels)}") from None
+            raise DataError(
+                f"the sample has no channel {error}; it needs {', '.join(self.channels)}"
+            ) from None
         if not all(map(math.isfinite, values)):
             for name, value in zip(self.channels, values, strict=True):
                 what = "infinite" if math.isinf(value) else "NaN"
-                if not math.isfinite(value) and what in self.refuses and not (what == "NaN" and name in self.skippable):
-                    raise DataError(f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take")
+                if (
+                    not math.isfinite(value)
+                    and what in self.refuses
+                    and not (what == "NaN" and name in self.skippable)
+                ):
+                    raise DataError(
+                        f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take"
+                    )
         return np.array(values)
 
     def _wrapped(
@@ -291,9 +351,14 @@ class Estimator(ABC):
         clock = (recording.rate_hz, recording.start_time)
         return Estimate(recording.id, self.name, *clock, channels, mode, covariance, covariance_of)  # type: ignore[arg-type]
 
-    def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
+    def _estimate_all(
+        self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
+    ) -> list[Estimate]:
         """Estimate checked recordings, each from its state; one after another, unless a method can do better."""
-        return [self._estimate_one(recording, state) for recording, state in zip(recordings, states, strict=True)]
+        return [
+            self._estimate_one(recording, state)
+            for recording, state in zip(recordings, states, strict=True)
+        ]
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
         """The state before the first sample; none where the method has no state.
@@ -320,14 +385,22 @@ class Estimator(ABC):
     def require_fitted(self) -> None:  # noqa: B027 (most networks are complete when they are made)
         """Raises `ConfigurationError`: a number is neither given nor fitted."""
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+    def _estimate_one(
+        self, recording: Recording, initial_state: Mapping[str, float] | None
+    ) -> Estimate:
         self.require_fitted()
         samples = recording.stack(self.channels)
         found, _ = self.run(samples, self.first_state(samples[0], dict(initial_state or {})))
         covariance, innovations = found.pop("covariance", None), found.pop("innovations", None)
         if innovations is not None:
             found["nis"], found["nis_dof"] = innovations()
-        return self._wrapped(recording, found.pop("vy"), covariance, self.covariance_of if covariance is not None else (), **found)
+        return self._wrapped(
+            recording,
+            found.pop("vy"),
+            covariance,
+            self.covariance_of if covariance is not None else (),
+            **found,
+        )
 
     def online(self) -> Stepper:
         """A stepper in its initial state; raises `ConfigurationError`: it has not been fitted, or is not causal."""
@@ -345,11 +418,19 @@ class Estimator(ABC):
         """Take weights back; raises `DataError`: a name or shape does not fit the settings."""
 
 
-def require_shapes(of: Estimator, weights: Mapping[str, np.ndarray[Any, Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
+def require_shapes(
+    of: Estimator,
+    weights: Mapping[str, np.ndarray[Any, Any]],
+    expected: Mapping[str, tuple[int, ...]],
+) -> None:
     """Raise `DataError` for weights of other names or shapes than an estimator's settings ask for."""
-    differing = sorted({(name, values.shape) for name, values in weights.items()} ^ set(expected.items()))
+    differing = sorted(
+        {(name, values.shape) for name, values in weights.items()} ^ set(expected.items())
+    )
     if differing:
-        raise DataError(f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape")
+        raise DataError(
+            f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape"
+        )
 
 
 class RunStepper(Stepper):

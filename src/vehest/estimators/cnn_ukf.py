@@ -20,14 +20,28 @@ from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
-from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples, reference_sideslip
+from vehest.estimators.networks.sample_network import (
+    SampleNetwork,
+    clip_sideslip,
+    learnt_samples,
+    reference_sideslip,
+)
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
-from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, record_of_phases, train_phases
+from vehest.training.sequences import (
+    Phase,
+    PhaseSettings,
+    drawn_starts,
+    record_of_phases,
+    train_phases,
+)
 
-START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
+START = (
+    0.1,
+    0.02,
+)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
 SATURATED = 20.0  # of which the logistic function is 1
 DISTRUST, PROCESS = 1, [2, 3]  # which outputs they are
@@ -41,10 +55,14 @@ class EndToEndSettings(Group):
     group = "training"
     version: ClassVar[str] = "1"
     pre_training: PhaseSettings = setting(
-        PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10), "the network alone, on samples in random order"
+        PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10),
+        "the network alone, on samples in random order",
     )
     pre_training_batch: int = setting(256, "samples in a batch", least=1)
-    end_to_end: PhaseSettings = setting(PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30), "network and filter, on sequences")
+    end_to_end: PhaseSettings = setting(
+        PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30),
+        "network and filter, on sequences",
+    )
     steps: int = setting(256, "samples of a training sequence", least=2)
     batch_size: int = setting(32, "sequences in a batch", least=1)
     loss_unit: Literal["rad", "deg"] = setting(
@@ -53,7 +71,9 @@ class EndToEndSettings(Group):
         "adds to their size, 1e-8, so that it takes steps far below its rate",
     )
     identification: IdentificationSettings = setting(IdentificationSettings(), "of the filter")
-    dtype: Literal["float32", "float64"] = setting("float32", "precision of the network; the filter computes in double precision")
+    dtype: Literal["float32", "float64"] = setting(
+        "float32", "precision of the network; the filter computes in double precision"
+    )
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
 
@@ -107,11 +127,19 @@ class CnnUkf(NetworkUkf):
         ),
     )
     training_type = EndToEndSettings
-    curve: Literal["plain", "smooth"] = setting("smooth", "tyres of Eq. 9 (plain) or 10 (smooth), which gradients pass")
+    curve: Literal["plain", "smooth"] = setting(
+        "smooth", "tyres of Eq. 9 (plain) or 10 (smooth), which gradients pass"
+    )
     hidden: tuple[int, int] = setting((200, 100), "widths of the network's hidden layers")
-    pseudo_measurement: bool = setting(True, "whether the filter measures the angle; otherwise σ_DD is held at 1 rad")
-    adaptive_distrust: bool = setting(True, "whether σ_DD changes from sample to sample; otherwise one value is learnt")
-    adaptive_process: bool = setting(True, "whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels")
+    pseudo_measurement: bool = setting(
+        True, "whether the filter measures the angle; otherwise σ_DD is held at 1 rad"
+    )
+    adaptive_distrust: bool = setting(
+        True, "whether σ_DD changes from sample to sample; otherwise one value is learnt"
+    )
+    adaptive_process: bool = setting(
+        True, "whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels"
+    )
 
     @property
     def without(self) -> tuple[str, ...]:
@@ -132,23 +160,39 @@ class CnnUkf(NetworkUkf):
     def output_of(self, outputs: Tensor) -> NetworkOutput:
         """Outputs of the network, (..., 4), as angle and noise."""
         shares = torch.sigmoid(outputs[..., 1:].double())
-        return NetworkOutput(outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:])
+        return NetworkOutput(
+            outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:]
+        )
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
         """Angle, its variance and the process noise."""
         found = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
-        return PseudoMeasurement(clip_sideslip(found.sideslip.numpy()), found.variance.numpy(), found.process.square().numpy())
+        return PseudoMeasurement(
+            clip_sideslip(found.sideslip.numpy()),
+            found.variance.numpy(),
+            found.process.square().numpy(),
+        )
 
-    def fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
+    def fit_network(
+        self, data: FitData, training: EndToEndSettings, context: FitContext, index: int
+    ) -> FitRecord:
         """Pre-training, then training through the filter."""
-        network, train, judged = self.prepare_network(data, training, [self._seed], self.minimum_speed)
-        levels = torch.tensor([self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64)
-        levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
+        network, train, judged = self.prepare_network(
+            data, training, [self._seed], self.minimum_speed
+        )
+        levels = torch.tensor(
+            [self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64
+        )
+        levels = levels.clamp(
+            max=MOST_NOISE
+        )  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         handles = self._hold(network)
-        driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))  # sequences are cut from all that was driven
+        driven = network.samples(
+            *learnt_samples(data.train, self.network_inputs, self.name)
+        )  # sequences are cut from all that was driven
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
             self._pre_training(train, judged, levels, training),
@@ -159,14 +203,22 @@ class CnnUkf(NetworkUkf):
                 end_to_end.batches,
                 end_to_end.loss,
                 lambda: self.mean_squared_error(
-                    data.validation, over=training.identification.error, pseudo=self.pseudo_measurements(data.validation)
+                    data.validation,
+                    over=training.identification.error,
+                    pseudo=self.pseudo_measurements(data.validation),
                 ),
             ),
         ]
-        record = record_of_phases(train_phases(phases, self._seed, context, index, training.checkpoint_seconds))
+        record = record_of_phases(
+            train_phases(phases, self._seed, context, index, training.checkpoint_seconds)
+        )
         for handle in handles:
             handle.remove()
-        return FitRecord(record.history, {**record.metrics, "lost_sequences": end_to_end.lost}, record.interrupted)
+        return FitRecord(
+            record.history,
+            {**record.metrics, "lost_sequences": end_to_end.lost},
+            record.interrupted,
+        )
 
     def _hold(self, network: SampleNetwork) -> list[RemovableHandle]:
         """Take heads away: what is held has no weights and no gradient, so that the network is of the usual shape and says constants."""
@@ -184,14 +236,20 @@ class CnnUkf(NetworkUkf):
             if held:
                 kept = torch.ones(4, dtype=network.unit.dtype)
                 kept[held] = 0.0
-                handles.append(network.get_parameter(name).register_hook(lambda gradient, kept=kept: gradient * kept))
+                handles.append(
+                    network.get_parameter(name).register_hook(
+                        lambda gradient, kept=kept: gradient * kept
+                    )
+                )
         with torch.no_grad():
             network.get_parameter("weight_3")[..., held_weights] = 0.0
             if not s.pseudo_measurement:
                 network.get_parameter("bias_3")[..., DISTRUST] = SATURATED
         return handles
 
-    def _pre_training(self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings) -> Phase:
+    def _pre_training(
+        self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
+    ) -> Phase:
         """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
         network, dropout = self.network, self.dropout
 
@@ -202,21 +260,41 @@ class CnnUkf(NetworkUkf):
             return likelihood + (found.process - levels).square().sum(-1).mean(-1)
 
         def losses(draw: Draw) -> Tensor:
-            return loss_of(network(train.inputs[draw.rows], draw.seeds, dropout), train.targets[draw.rows])
+            return loss_of(
+                network(train.inputs[draw.rows], draw.seeds, dropout), train.targets[draw.rows]
+            )
 
         def judge() -> Tensor:
             return loss_of(network(judged.inputs.unsqueeze(0)), judged.targets)
 
         return sample_phase(
-            "pre_training", network, training.pre_training, training.pre_training_batch, len(train.targets), 1, losses, judge
+            "pre_training",
+            network,
+            training.pre_training,
+            training.pre_training_batch,
+            len(train.targets),
+            1,
+            losses,
+            judge,
         )
 
 
 class EndToEnd:
     """Backpropagation through network and filter over sequences (Eqs. 7 and 8)."""
 
-    def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:
-        self.estimator, self.samples, self.recordings, self.training = estimator, samples, recordings, training
+    def __init__(
+        self,
+        estimator: CnnUkf,
+        samples: Samples,
+        recordings: Sequence[Recording],
+        training: EndToEndSettings,
+    ) -> None:
+        self.estimator, self.samples, self.recordings, self.training = (
+            estimator,
+            samples,
+            recordings,
+            training,
+        )
         self.filter = TrackFilter(estimator.track())
         self.sensors = estimator.noise_covariances(estimator.levels)[1]
         self.lengths = [len(recording) for recording in recordings]
@@ -227,16 +305,26 @@ class EndToEnd:
                 f"(the longest has {max(self.lengths)}); lower training.steps"
             )
         taken = [estimator.taken(recording.stack(estimator.channels)) for recording in recordings]
-        self.measured, self.driven = (torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True))
-        self.trusted = torch.as_tensor(np.concatenate([estimator.trusts_forces(part[0][:, 0]) for part in taken]))
-        self.sideslip = torch.as_tensor(np.concatenate([reference_sideslip(recording) for recording in recordings]))
-        motion = [np.stack([recording["vy_ref"], recording["yaw_rate"]], 1) for recording in recordings]
+        self.measured, self.driven = (
+            torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True)
+        )
+        self.trusted = torch.as_tensor(
+            np.concatenate([estimator.trusts_forces(part[0][:, 0]) for part in taken])
+        )
+        self.sideslip = torch.as_tensor(
+            np.concatenate([reference_sideslip(recording) for recording in recordings])
+        )
+        motion = [
+            np.stack([recording["vy_ref"], recording["yaw_rate"]], 1) for recording in recordings
+        ]
         self.states = torch.as_tensor(np.concatenate(motion))
         self.lost = 0
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
         """As many sequences of each recording as fit into it, from an offset that is drawn, in random order."""
-        for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(self.training.batch_size):
+        for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(
+            self.training.batch_size
+        ):
             seeds = torch.randint(2**62, (1,), generator=generator)
             yield self.cut(chosen, seeds)
 
@@ -244,7 +332,14 @@ class EndToEnd:
         """Cuts that begin at these samples, (B,)."""
         rows = firsts.unsqueeze(1) + torch.arange(self.training.steps)
         of_sensors = (self.measured[rows], self.driven[rows], self.trusted[rows])
-        return Cuts(self.samples.inputs[rows], self.sideslip[rows], *of_sensors, self.states[firsts], seeds, firsts)
+        return Cuts(
+            self.samples.inputs[rows],
+            self.sideslip[rows],
+            *of_sensors,
+            self.states[firsts],
+            seeds,
+            firsts,
+        )
 
     def loss(self, batch: Cuts) -> Tensor:
         """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad², or deg² if the settings say so].
@@ -255,7 +350,9 @@ class EndToEnd:
         """
         estimator = self.estimator
         count, steps = batch.sideslip.shape
-        outputs = estimator.network(batch.inputs.reshape(1, count * steps, -1), batch.seeds, estimator.dropout)
+        outputs = estimator.network(
+            batch.inputs.reshape(1, count * steps, -1), batch.seeds, estimator.dropout
+        )
         outputs = outputs.reshape(count, steps, -1).double()
         lost = torch.zeros(count, dtype=torch.bool)
         if outputs.requires_grad:
@@ -263,13 +360,24 @@ class EndToEnd:
         found = estimator.output_of(outputs)
         initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
         measurements = torch.cat([batch.measured, found.sideslip.unsqueeze(-1)], -1)
-        process, noise = torch.diag_embed(found.process.square()), with_variance(self.sensors[batch.trusted.long()], found.variance)
-        filtered = self.filter.filtered(measurements, batch.driven, process, noise, initial).steps.filtered
+        process, noise = (
+            torch.diag_embed(found.process.square()),
+            with_variance(self.sensors[batch.trusted.long()], found.variance),
+        )
+        filtered = self.filter.filtered(
+            measurements, batch.driven, process, noise, initial
+        ).steps.filtered
         sideslip = torch.atan2(filtered.mean[..., 0], batch.driven[..., 0])
-        finite = torch.isfinite(filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1))
+        finite = torch.isfinite(
+            filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1)
+        )
         lost |= self._account(~finite, batch, "covariance")
-        errors = [(batch.sideslip - angle)[~lost].square().mean() for angle in (found.sideslip, sideslip)]
-        return (errors[0] + errors[1]) * (math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0)
+        errors = [
+            (batch.sideslip - angle)[~lost].square().mean() for angle in (found.sideslip, sideslip)
+        ]
+        return (errors[0] + errors[1]) * (
+            math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0
+        )
 
     def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
         """A gradient, (B, T, 4), that is zero for sequences that are lost, or for which it is not finite."""

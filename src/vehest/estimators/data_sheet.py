@@ -34,13 +34,21 @@ class DataSheet(Recursive):
     template = "static"
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", positive=True)
-    cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: half the wheelbase", unit="m")
-    cornering_coefficient: float = setting(10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True)
+    cg_to_rear_axle: float = setting(
+        None,
+        "distance of the centre of gravity from the rear axle; null: half the wheelbase",
+        unit="m",
+    )
+    cornering_coefficient: float = setting(
+        10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True
+    )
 
     def check(self) -> None:
         """Raises `ConfigurationError`: no wheelbase, or a centre of gravity outside of it."""
         if self.wheelbase is None:
-            raise ConfigurationError("estimator 'data_sheet' needs your car's wheelbase: estimator.wheelbase=2.7 [m]")
+            raise ConfigurationError(
+                "estimator 'data_sheet' needs your car's wheelbase: estimator.wheelbase=2.7 [m]"
+            )
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
                 f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
@@ -54,12 +62,18 @@ class DataSheet(Recursive):
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """r (l_r - u² / (c g)) [m/s]."""
         vx, yaw_rate = samples.T
-        return {"vy": yaw_rate * (self.rear - np.square(vx) / (self.cornering_coefficient * GRAVITY))}, state
+        return {
+            "vy": yaw_rate * (self.rear - np.square(vx) / (self.cornering_coefficient * GRAVITY))
+        }, state
 
     def c_values(self) -> dict[str, Any]:
         """What the data sheet says."""
         about = "Steady cornering of a linear single track from a data sheet."
-        return {"about": about, "rear": self.rear, "stiffness": self.cornering_coefficient * GRAVITY}
+        return {
+            "about": about,
+            "rear": self.rear,
+            "stiffness": self.cornering_coefficient * GRAVITY,
+        }
 
 
 ESTIMATOR = DataSheet

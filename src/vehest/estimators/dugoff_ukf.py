@@ -57,16 +57,31 @@ from vehest.vehicle.dugoff import (
 Inputs = Literal["full", "imu"]
 WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
 INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")
-CHANNELS: dict[str, tuple[str, ...]] = {"full": (*INERTIAL, *(wheel for pair in WHEELS.values() for wheel in pair)), "imu": INERTIAL}
-SENSORS: dict[str, tuple[str, ...]] = {"full": ("ay", "yaw_rate", "fy_front", "fy_rear"), "imu": ("ay", "yaw_rate")}
+CHANNELS: dict[str, tuple[str, ...]] = {
+    "full": (*INERTIAL, *(wheel for pair in WHEELS.values() for wheel in pair)),
+    "imu": INERTIAL,
+}
+SENSORS: dict[str, tuple[str, ...]] = {
+    "full": ("ay", "yaw_rate", "fy_front", "fy_rear"),
+    "imu": ("ay", "yaw_rate"),
+}
 SEARCHED: dict[str, tuple[str, ...]] = {
     "full": ("process_vy", "process_yaw_rate", "force_factor"),
     "imu": ("process_vy", "process_yaw_rate"),
 }
-ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
-BOXES = {"process_vy": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten; that of the yaw rate is a setting
+ASSUMED = {
+    "process_vy": 7e-4,
+    "process_yaw_rate": 2e-3,
+    "force_factor": 1.0,
+}  # the first two: Bertipaglia et al. 2024
+BOXES = {
+    "process_vy": (-5.0, 0.0),
+    "force_factor": (0.0, 2.0),
+}  # powers of ten; that of the yaw rate is a setting
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
+QUIET_SECONDS = (
+    0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
+)
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
 
 
@@ -75,13 +90,23 @@ class TrackLevels(Group):
     """Standard deviations; those that are not given are found by the fit."""
 
     group = "estimator.noise"
-    process_vy: float | None = setting(None, "of the lateral velocity, over one sample's step", unit="m/s", positive=True)
-    process_yaw_rate: float | None = setting(None, "of the yaw rate, over one sample's step", unit="rad/s", positive=True)
-    force_factor: float | None = setting(None, "by which the forces' is larger where the car behaves linearly", positive=True)
+    process_vy: float | None = setting(
+        None, "of the lateral velocity, over one sample's step", unit="m/s", positive=True
+    )
+    process_yaw_rate: float | None = setting(
+        None, "of the yaw rate, over one sample's step", unit="rad/s", positive=True
+    )
+    force_factor: float | None = setting(
+        None, "by which the forces' is larger where the car behaves linearly", positive=True
+    )
     ay: float | None = setting(None, "of the accelerometer", unit="m/s²", positive=True)
     yaw_rate: float | None = setting(None, "of the gyroscope", unit="rad/s", positive=True)
-    fy_front: float | None = setting(None, "of the front axle's lateral force", unit="N", positive=True)
-    fy_rear: float | None = setting(None, "of the rear axle's lateral force", unit="N", positive=True)
+    fy_front: float | None = setting(
+        None, "of the front axle's lateral force", unit="N", positive=True
+    )
+    fy_rear: float | None = setting(
+        None, "of the rear axle's lateral force", unit="N", positive=True
+    )
 
 
 LEVELS = tuple(entry.name for entry in fields(TrackLevels))
@@ -92,10 +117,18 @@ class AxleTyres(Group):
     """Dugoff's parameters of both axles, all or none; where they are not given, the fit finds them."""
 
     group = "estimator.tyres"
-    cornering_stiffness_front: float | None = setting(None, "of the front axle", unit="N/rad", positive=True)
-    friction_front: float | None = setting(None, "of its tyres where they hardly slide", positive=True)
-    reduction_front: float | None = setting(None, "share of that which is lost per m/s of sliding", unit="s/m", least=0.0)
-    cornering_stiffness_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
+    cornering_stiffness_front: float | None = setting(
+        None, "of the front axle", unit="N/rad", positive=True
+    )
+    friction_front: float | None = setting(
+        None, "of its tyres where they hardly slide", positive=True
+    )
+    reduction_front: float | None = setting(
+        None, "share of that which is lost per m/s of sliding", unit="s/m", least=0.0
+    )
+    cornering_stiffness_rear: float | None = setting(
+        None, "of the rear axle", unit="N/rad", positive=True
+    )
     friction_rear: float | None = setting(None, "likewise", positive=True)
     reduction_rear: float | None = setting(None, "likewise", unit="s/m", least=0.0)
 
@@ -103,7 +136,9 @@ class AxleTyres(Group):
         super().__post_init__()
         given = [value for value in asdict(self).values() if value is not None]
         if given and len(given) < len(TYRES):
-            raise ConfigurationError(f"estimator.tyres: give all of {', '.join(TYRES)}, or none of them")
+            raise ConfigurationError(
+                f"estimator.tyres: give all of {', '.join(TYRES)}, or none of them"
+            )
 
 
 TYRES = tuple(entry.name for entry in fields(AxleTyres))
@@ -143,13 +178,23 @@ class DugoffUkf(SigmaPointEstimator):
     states = TRACK_STATES
     covariance_of = TRACK_STATES
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
-    inputs: Inputs = setting("full", "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car")
+    inputs: Inputs = setting(
+        "full",
+        "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car",
+    )
     curve: Literal["plain", "smooth"] = setting("plain", "tyres of Eq. 9 (plain) or 10 (smooth)")
     minimum_speed: float = setting(
-        3.0, "speed below which wheels roll without slip, and nothing counts as measured", unit="m/s", positive=True
+        3.0,
+        "speed below which wheels roll without slip, and nothing counts as measured",
+        unit="m/s",
+        positive=True,
     )
-    nonlinear_from: float = setting(4.0, "|ay| from which the car behaves non-linearly, so that forces are trusted", unit="m/s²")
-    linear_below: float = setting(3.0, "|ay| down to which it then stays so", unit="m/s²", least=0.0)
+    nonlinear_from: float = setting(
+        4.0, "|ay| from which the car behaves non-linearly, so that forces are trusted", unit="m/s²"
+    )
+    linear_below: float = setting(
+        3.0, "|ay| down to which it then stays so", unit="m/s²", least=0.0
+    )
     correlated_samples: float = setting(
         1.0,
         "samples over which errors of sensors are alike, by which their variance is larger; about rate_hz / (2 f) of white noise behind a "
@@ -215,17 +260,25 @@ class DugoffUkf(SigmaPointEstimator):
     def track(self) -> DugoffTrack:
         """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
         if np.isnan(self.axle_tyres).any():
-            raise ConfigurationError(f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres")
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres"
+            )
         s = self.settings
-        front, rear = (DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6)))
+        front, rear = (
+            DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6))
+        )
         return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     @classmethod
-    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Identify tyres, read sensors' levels, find the process noise, each where it is not given; see `IdentificationSettings`."""
         return [member.identify(data, training, context) for member in members]
 
-    def identify(self, data: FitData, training: IdentificationSettings, context: FitContext) -> FitRecord:
+    def identify(
+        self, data: FitData, training: IdentificationSettings, context: FitContext
+    ) -> FitRecord:
         """Fit tyres and levels."""
         started = time.monotonic()
         metrics: dict[str, float] = {"epochs": 0}
@@ -244,14 +297,22 @@ class DugoffUkf(SigmaPointEstimator):
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
         if data.validation and all("vy_ref" in recording for recording in data.validation):
-            metrics["best_validation_loss"] = finite(self.mean_squared_error(data.validation, training.skip_seconds, over=training.error))
+            metrics["best_validation_loss"] = finite(
+                self.mean_squared_error(data.validation, training.skip_seconds, over=training.error)
+            )
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
 
-    def _identify(self, recordings: Sequence[Recording], training: IdentificationSettings) -> dict[str, float]:
+    def _identify(
+        self, recordings: Sequence[Recording], training: IdentificationSettings
+    ) -> dict[str, float]:
         """Set the tyres; returns them with half of the range over restarts, and what forces are left over."""
-        chosen = [recording for recording in recordings if fnmatch.fnmatch(recording.id, training.tyres_from)]
+        chosen = [
+            recording
+            for recording in recordings
+            if fnmatch.fnmatch(recording.id, training.tyres_from)
+        ]
         if not chosen:
             raise DataError(
                 f"no training recording is called '{training.tyres_from}', which tyres are to be identified on; "
@@ -269,7 +330,9 @@ class DugoffUkf(SigmaPointEstimator):
             generations=training.generations,
         )
         self.axle_tyres = fit.parameters.ravel()
-        spread = dict(zip((f"{name}_spread" for name in TYRES), fit.spread.ravel().tolist(), strict=True))
+        spread = dict(
+            zip((f"{name}_spread" for name in TYRES), fit.spread.ravel().tolist(), strict=True)
+        )
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
         return {**dict(zip(TYRES, self.axle_tyres.tolist(), strict=True)), **spread, **rms}
 
@@ -279,19 +342,33 @@ class DugoffUkf(SigmaPointEstimator):
         found = {}
         for name in self._unknown(SENSORS[self.inputs]):
             series = [
-                np.where(recording["vx"] < self.minimum_speed, np.nan, recording.stack(WHEELS.get(name, (name,))).sum(1))
+                np.where(
+                    recording["vx"] < self.minimum_speed,
+                    np.nan,
+                    recording.stack(WHEELS.get(name, (name,))).sum(1),
+                )
                 for recording in recordings
             ]
             try:
-                found[name] = quiet_level(series, [recording["steer"] for recording in recordings], pieces)
+                found[name] = quiet_level(
+                    series, [recording["steer"] for recording in recordings], pieces
+                )
             except ValueError as error:
-                raise DataError(f"noise of '{name}' in the training recordings: {error}; give estimator.noise.{name}") from None
+                raise DataError(
+                    f"noise of '{name}' in the training recordings: {error}; give estimator.noise.{name}"
+                ) from None
             if not found[name] > 0.0:
-                raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
+                raise DataError(
+                    f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise"
+                )
         return found
 
     def _tune(
-        self, searched: Sequence[str], recordings: Sequence[Recording], training: IdentificationSettings, context: FitContext
+        self,
+        searched: Sequence[str],
+        recordings: Sequence[Recording],
+        training: IdentificationSettings,
+        context: FitContext,
     ) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
         for recording in recordings:
@@ -302,11 +379,20 @@ class DugoffUkf(SigmaPointEstimator):
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
-            return finite(self.mean_squared_error(recordings, training.skip_seconds, levels, training.error))
+            return finite(
+                self.mean_squared_error(recordings, training.skip_seconds, levels, training.error)
+            )
 
-        limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
+        limits = BOXES | {
+            "process_yaw_rate": (
+                math.log10(LEAST_PROCESS_YAW_RATE),
+                math.log10(training.most_process_yaw_rate),
+            )
+        }
         boxes = [limits[name] for name in searched]
-        return training.search(cost, boxes, [STARTS[name] for name in searched], self._seed, context)
+        return training.search(
+            cost, boxes, [STARTS[name] for name in searched], self._seed, context
+        )
 
     def mean_squared_error(
         self,
@@ -328,21 +414,36 @@ class DugoffUkf(SigmaPointEstimator):
                 sums.append((float(np.square(error[counted]).sum()), int(counted.sum())))
         return error_over(sums, over)
 
-    def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
+    def _estimate_all(
+        self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
+    ) -> list[Estimate]:
         """Recordings of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
-        for rows, steps in self.filtered(recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)):
+        for rows, steps in self.filtered(
+            recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)
+        ):
             mean, covariance = (part.numpy() for part in steps.filtered)
-            nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1).numpy()
+            nis = (
+                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
+                .result.mul(steps.innovation)
+                .sum(-1)
+                .numpy()
+            )
             dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
             for place, row in enumerate(rows):
                 n = len(recordings[row])
-                others = {"yaw_rate": mean[place, :n, 1].copy(), "nis": nis[place, :n].copy(), "nis_dof": dof[place, :n].copy()}
+                others = {
+                    "yaw_rate": mean[place, :n, 1].copy(),
+                    "nis": nis[place, :n].copy(),
+                    "nis_dof": dof[place, :n].copy(),
+                }
                 vy, own = mean[place, :n, 0].copy(), covariance[place, :n].copy()
                 estimates[row] = self._wrapped(recordings[row], vy, own, TRACK_STATES, **others)
         return [estimates[row] for row in range(len(recordings))]
 
-    def pseudo_measurements(self, recordings: Sequence[Recording]) -> list[PseudoMeasurement] | None:
+    def pseudo_measurements(
+        self, recordings: Sequence[Recording]
+    ) -> list[PseudoMeasurement] | None:
         """Of a network behind each recording; none: there is no network."""
         return None
 
@@ -365,24 +466,45 @@ class DugoffUkf(SigmaPointEstimator):
             seen, steps_noise = [part[0] for part in parts], process
             if pseudo is not None:
                 own = [pseudo[row] for row in rows]
-                seen = [np.column_stack([one, added.sideslip]) for one, added in zip(seen, own, strict=True)]
+                seen = [
+                    np.column_stack([one, added.sideslip])
+                    for one, added in zip(seen, own, strict=True)
+                ]
                 if own[0].process is not None:
-                    steps_noise = torch.diag_embed(torch.as_tensor(padded([added.process for added in own], None)))  # type: ignore[misc]
+                    steps_noise = torch.diag_embed(
+                        torch.as_tensor(padded([added.process for added in own], None))  # type: ignore[misc]
+                    )
             measurements = torch.as_tensor(padded(seen, np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            noise = sensors[torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()])).long()]
+            noise = sensors[
+                torch.as_tensor(
+                    np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()])
+                ).long()
+            ]
             if pseudo is not None:
-                noise = with_variance(noise, torch.as_tensor(padded([added.variance[:, None] for added in own], None)[..., 0]))
+                noise = with_variance(
+                    noise,
+                    torch.as_tensor(
+                        padded([added.variance[:, None] for added in own], None)[..., 0]
+                    ),
+                )
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 initial = model.start(inputs[:, 0], given)
-                yield rows, model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps
+                yield (
+                    rows,
+                    model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps,
+                )
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Samples (T, n) of ``channels`` as the filter takes them: measurements (T, 4), NaN where there are no forces; inputs (T, 3)."""
         yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
         wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
-        forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
+        forces = (
+            [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]]
+            if wheels.shape[1]
+            else [np.full(len(samples), np.nan)] * 2
+        )
         return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
@@ -395,18 +517,31 @@ class DugoffUkf(SigmaPointEstimator):
         Raises `ConfigurationError`: a level is neither given nor found.
         """
         if any(math.isnan(level) for level in levels.values()):
-            raise ConfigurationError(f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise")
-        process = torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64).square().diag()
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise"
+            )
+        process = (
+            torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64)
+            .square()
+            .diag()
+        )
         factor = levels.get("force_factor", 1.0)
-        rows = [[levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)] for own in (factor, 1.0)]
+        rows = [
+            [levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)]
+            for own in (factor, 1.0)
+        ]
         alike = self.correlated_samples
         return process, torch.diag_embed(torch.tensor(rows, dtype=torch.float64).square() * alike)
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
         """Straight ahead and unknown, or rolling."""
         own = TrackFilter(self.track())
-        mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
-        return UnscentedStepper(own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
+        mean, covariance = (
+            part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None])
+        )
+        return UnscentedStepper(
+            own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use()
+        )
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
         """Measurements as far as the car is fast enough, and the noise of the range that it is in."""
@@ -430,11 +565,16 @@ class DugoffUkf(SigmaPointEstimator):
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Tyre parameters in the order of `AxleTyres`, and levels of noise in that of `level_names`."""
-        return {"tyres": self.axle_tyres.copy(), "levels": np.array([self.levels[name] for name in self.level_names])}
+        return {
+            "tyres": self.axle_tyres.copy(),
+            "levels": np.array([self.levels[name] for name in self.level_names]),
+        }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take tyres and levels back."""
-        require_shapes(self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()})
+        require_shapes(
+            self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()}
+        )
         self.axle_tyres = np.array(weights["tyres"], dtype=np.float64)
         self.levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
 
@@ -446,7 +586,9 @@ class DugoffUkf(SigmaPointEstimator):
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
         """Where no recording matches the pattern that names those to identify tyres on."""
-        if self._tyres_given or any(fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings):
+        if self._tyres_given or any(
+            fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings
+        ):
             return ()
         return ("training.tyres_from='*'",)
 
@@ -495,7 +637,9 @@ def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
         sensors: of the four measured numbers, diagonal, (..., 4, 4).
         variance: of the network's angle (...) [rad²].
     """
-    return torch.diag_embed(torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1))
+    return torch.diag_embed(
+        torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1)
+    )
 
 
 ESTIMATOR = DugoffUkf

@@ -34,16 +34,24 @@ MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within 
 class EnsembleSettings(SampleSettings):
     """Training of filter, networks and scaling (Bertipaglia et al. 2024, Section IV-C)."""
 
-    phase: PhaseSettings = setting(PhaseSettings(learning_rate=8e-4, max_epochs=30), "step size and epochs of the networks")
-    scaling_trials: int = setting(60, "evaluations of Optuna for p₁ and p₂ of Eq. 11; Nelder-Mead has its limits in identification")
+    phase: PhaseSettings = setting(
+        PhaseSettings(learning_rate=8e-4, max_epochs=30), "step size and epochs of the networks"
+    )
+    scaling_trials: int = setting(
+        60,
+        "evaluations of Optuna for p₁ and p₂ of Eq. 11; Nelder-Mead has its limits in identification",
+    )
     identification: IdentificationSettings = setting(
-        IdentificationSettings(), "of the filter; its method is also that of the search for p₁ and p₂ (data: 0 and 1)"
+        IdentificationSettings(),
+        "of the filter; its method is also that of the search for p₁ and p₂ (data: 0 and 1)",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.scaling_trials < self.identification.stages:
-            raise ConfigurationError(f"training.scaling_trials must be at least training.identification.stages, not {self.scaling_trials}")
+            raise ConfigurationError(
+                f"training.scaling_trials must be at least training.identification.stages, not {self.scaling_trials}"
+            )
 
 
 class EnsembleUkf(NetworkUkf):
@@ -70,7 +78,8 @@ class EnsembleUkf(NetworkUkf):
     training_type = EnsembleSettings
     members: int = setting(20, "networks M of the ensemble; one alone has no spread", least=2)
     variance: Literal["models", "mixture"] = setting(
-        "models", "that of the networks' angles, as in the paper, or with the mean of their own variances on top"
+        "models",
+        "that of the networks' angles, as in the paper, or with the mean of their own variances on top",
     )
 
     def __init__(self, settings: Any) -> None:
@@ -86,10 +95,22 @@ class EnsembleUkf(NetworkUkf):
         """From a sample to an angle and its variance, by each member."""
         return SampleNetwork(len(self.network_inputs), self.hidden, 2, self.members)
 
-    def fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
+    def fit_network(
+        self, data: FitData, training: EnsembleSettings, context: FitContext, index: int
+    ) -> FitRecord:
         """Networks, then the scaling of their variance."""
-        streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.members, np.uint64) >> np.uint64(1)
-        record = self.fit_samples(data, training, gaussian_likelihood, context, index, streams.tolist(), self.minimum_speed)
+        streams = np.random.SeedSequence([self._seed, 2]).generate_state(
+            self.members, np.uint64
+        ) >> np.uint64(1)
+        record = self.fit_samples(
+            data,
+            training,
+            gaussian_likelihood,
+            context,
+            index,
+            streams.tolist(),
+            self.minimum_speed,
+        )
         if record.interrupted or training.identification.method == "data":
             return record
         search = self._search(data.validation, training, context)
@@ -102,14 +123,24 @@ class EnsembleUkf(NetworkUkf):
         }
         return FitRecord(record.history, {**record.metrics, **found}, search.interrupted)
 
-    def _search(self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext) -> SearchRecord:
-        found = [self._mean_and_variance(recording.stack(self.network_inputs)) for recording in recordings]
+    def _search(
+        self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext
+    ) -> SearchRecord:
+        found = [
+            self._mean_and_variance(recording.stack(self.network_inputs))
+            for recording in recordings
+        ]
         how = training.identification
         quiet = FitContext(should_stop=context.should_stop)
 
         def cost(scaling: FloatArray) -> float:
-            pseudo = [PseudoMeasurement(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in found]
-            return finite(self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo))
+            pseudo = [
+                PseudoMeasurement(sideslip, scaled_variance(variance, scaling))
+                for sideslip, variance in found
+            ]
+            return finite(
+                self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo)
+            )
 
         return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)
 
@@ -139,8 +170,12 @@ class EnsembleUkf(NetworkUkf):
         """Take them back."""
         scaling = np.array(weights.get("scaling", ()), dtype=np.float64)
         if scaling.shape != (2,):
-            raise DataError(f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of another shape")
-        super().load_weights({name: values for name, values in weights.items() if name != "scaling"})
+            raise DataError(
+                f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of another shape"
+            )
+        super().load_weights(
+            {name: values for name, values in weights.items() if name != "scaling"}
+        )
         self.scaling = scaling
 
 

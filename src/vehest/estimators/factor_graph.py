@@ -25,12 +25,27 @@ class FactorNoise(Group):
     """Standard deviations of the factors, per sample at 100 Hz."""
 
     group = "estimator.noise"
-    model_sideslip: float = setting(4e-3, "of β one sample later, given β and r", unit="rad", positive=True)
-    model_yaw_rate: float = setting(9e-3, "of r one sample later, given β and r", unit="rad/s", positive=True)
-    measured_yaw_rate: float = setting(1e-2, "of r, given the gyroscope", unit="rad/s", positive=True)
-    measured_ay: float = setting(7.0, "of a_y as the model has it, given the accelerometer", unit="m/s²", positive=True)
-    first_state: float = setting(100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True)
-    window_start: float = setting(1.0, "of a window's first β and r, given their running estimate", unit="rad, rad/s", positive=True)
+    model_sideslip: float = setting(
+        4e-3, "of β one sample later, given β and r", unit="rad", positive=True
+    )
+    model_yaw_rate: float = setting(
+        9e-3, "of r one sample later, given β and r", unit="rad/s", positive=True
+    )
+    measured_yaw_rate: float = setting(
+        1e-2, "of r, given the gyroscope", unit="rad/s", positive=True
+    )
+    measured_ay: float = setting(
+        7.0, "of a_y as the model has it, given the accelerometer", unit="m/s²", positive=True
+    )
+    first_state: float = setting(
+        100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True
+    )
+    window_start: float = setting(
+        1.0,
+        "of a window's first β and r, given their running estimate",
+        unit="rad, rad/s",
+        positive=True,
+    )
 
 
 class WindowState(NamedTuple):
@@ -52,9 +67,19 @@ class FactorGraph(SideslipFilter):
     """
 
     name, title = "factor_graph", "Factor graph"
-    trials = (Trial(10, "factor graph over half a second, causal; nothing is learnt", "estimator.window=0.5 {car}"),)
+    trials = (
+        Trial(
+            10,
+            "factor graph over half a second, causal; nothing is learnt",
+            "estimator.window=0.5 {car}",
+        ),
+    )
     offline = "a factor graph over a whole recording cannot run along with a drive; set estimator.window=0.05 [s]"
-    window: float | None = setting(None, "how far the graph of a causal estimate reaches back; null: one graph, offline", unit="s")
+    window: float | None = setting(
+        None,
+        "how far the graph of a causal estimate reaches back; null: one graph, offline",
+        unit="s",
+    )
     noise: FactorNoise = setting(FactorNoise(), "standard deviations of the factors")
 
     def check(self) -> None:
@@ -64,7 +89,9 @@ class FactorGraph(SideslipFilter):
                 f"estimator.window must be null or at least one sampling interval, {1 / self.rate_hz:g} s, not {self.window} s"
             )
         if self.gate is not None and self.window is None:
-            raise ConfigurationError("estimator.gate needs estimator.window: one graph over a whole recording has no sample to predict")
+            raise ConfigurationError(
+                "estimator.gate needs estimator.window: one graph over a whole recording has no sample to predict"
+            )
 
     @property
     def intervals(self) -> int:
@@ -79,7 +106,11 @@ class FactorGraph(SideslipFilter):
     @property
     def variant(self) -> str:
         """Batch, or how long the window is and its gate."""
-        return f"factor_graph_lag_{self.window:g}s{self.gate_suffix}" if self.causal else "factor_graph_batch"
+        return (
+            f"factor_graph_lag_{self.window:g}s{self.gate_suffix}"
+            if self.causal
+            else "factor_graph_batch"
+        )
 
     @property
     def full_title(self) -> str:
@@ -87,23 +118,35 @@ class FactorGraph(SideslipFilter):
         own = f"fixed lag of {self.window:g} s{self.gate_title}" if self.causal else "batch"
         return f"{self.title}, {own}"
 
-    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+    def first_gaussian(
+        self, sample: FloatArray, given: Mapping[str, float]
+    ) -> Gaussian[FloatArray]:
         """Straight ahead and unknown, or what a protocol hands over."""
         return self.first_motion(sample, np.full(2, self.noise.first_state), given)
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> WindowState:  # type: ignore[override]
         """An empty window."""
-        return WindowState(np.empty((0, len(self.channels))), self.first_gaussian(sample, given), np.zeros(2, np.int64))
+        return WindowState(
+            np.empty((0, len(self.channels))),
+            self.first_gaussian(sample, given),
+            np.zeros(2, np.int64),
+        )
 
     def run(self, samples: FloatArray, state: WindowState) -> tuple[dict[str, Any], WindowState]:  # type: ignore[override]
         """Lateral velocity [m/s] and yaw rate [rad/s]: of all samples together, or window by window."""
-        rows, start, refused = np.vstack([state.samples, samples]), state.start, state.refused.copy()
+        rows, start, refused = (
+            np.vstack([state.samples, samples]),
+            state.start,
+            state.refused.copy(),
+        )
         model, behind, full = self.linear_model(rows), len(state.samples), self.intervals + 1
         if self.causal:
             states = np.empty((len(samples), 2))
             for k in range(len(samples)):
                 window = slice(max(0, behind + k + 1 - full), behind + k + 1)
-                solved = self.solve_window(LinearModel(*(part[window] for part in model)), rows[window], start, refused)
+                solved = self.solve_window(
+                    LinearModel(*(part[window] for part in model)), rows[window], start, refused
+                )
                 states[k] = solved[-1]
                 if len(solved) == full:
                     start = Gaussian(solved[1], self.noise.window_start**2 * np.eye(2))
@@ -122,11 +165,18 @@ class FactorGraph(SideslipFilter):
         offset = np.stack([np.zeros(steps), D * steer], axis=1)
         process = np.diag(np.square([noise.model_sideslip, noise.model_yaw_rate]))
         measured = np.square([noise.measured_yaw_rate, noise.measured_ay])
-        process, measured = np.broadcast_to(process, (steps, 2, 2)), np.broadcast_to(measured, (steps, 2))
+        process, measured = (
+            np.broadcast_to(process, (steps, 2, 2)),
+            np.broadcast_to(measured, (steps, 2)),
+        )
         return LinearModel(A, B * steer[:, None], process, observation, offset, measured)
 
     def solve_window(
-        self, model: LinearModel[FloatArray], samples: FloatArray, start: Gaussian[FloatArray], refused: NDArray[np.int64]
+        self,
+        model: LinearModel[FloatArray],
+        samples: FloatArray,
+        start: Gaussian[FloatArray],
+        refused: NDArray[np.int64],
     ) -> FloatArray:
         """States of a window's samples given all of them, (N, 2), of their model and ``start``, the first state before its measurement.
 
@@ -136,9 +186,14 @@ class FactorGraph(SideslipFilter):
         filtered = kalman_scan(model, samples[:, MEASURED], start)
         gate = self.gate_in_use()
         if gate is not None:
-            errors, variances = filtered.innovation[-1], filtered.innovation_covariance[-1].diagonal()
+            errors, variances = (
+                filtered.innovation[-1],
+                filtered.innovation_covariance[-1].diagonal(),
+            )
             for i, column in enumerate(MEASURED):
-                if filtered.measured[-1, i] and refuses(errors[i], variances[i], gate.deviations**2, gate.patience, refused, i):
+                if filtered.measured[-1, i] and refuses(
+                    errors[i], variances[i], gate.deviations**2, gate.patience, refused, i
+                ):
                     samples[-1, column] = np.nan
             filtered = kalman_scan(model, samples[:, MEASURED], start)
         return smoothed_means(model, filtered)

@@ -21,7 +21,9 @@ class GruNetwork(RecurrentNetwork):
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero."""
-        driven = torch.einsum("...c,ghc->...gh", prepared_windows, self.input_weight) + self.gate_bias
+        driven = (
+            torch.einsum("...c,ghc->...gh", prepared_windows, self.input_weight) + self.gate_bias
+        )
         state = torch.zeros_like(driven[..., 0, 0, :])
         for k in range(prepared_windows.shape[-2]):
             recurrent = torch.einsum("...i,ghi->...gh", state, self.state_weight)

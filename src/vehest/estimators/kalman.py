@@ -32,12 +32,21 @@ class SensorNoise(Group):
     """Standard deviations of the sensors' noise, given, or else read off measured signals above a frequency."""
 
     group = "estimator.noise"
-    read_from: Literal["training", "recording"] = setting("training", "recordings of the fit, or each recording as a whole (offline)")
+    read_from: Literal["training", "recording"] = setting(
+        "training", "recordings of the fit, or each recording as a whole (offline)"
+    )
     yaw_rate: float | None = setting(None, "null: read off", unit="rad/s", positive=True)
     ay: float | None = setting(None, "null: read off", unit="m/s²", positive=True)
     steer: float | None = setting(None, "null: read off", unit="rad", positive=True)
-    cutoff: float = setting(0.2, "fraction of the Nyquist frequency above which signals count as noise", above=0.0, below=0.8)
-    steer_factor: float = setting(1000.0, "factor of the steering's level, as in the authors' code", positive=True)
+    cutoff: float = setting(
+        0.2,
+        "fraction of the Nyquist frequency above which signals count as noise",
+        above=0.0,
+        below=0.8,
+    )
+    steer_factor: float = setting(
+        1000.0, "factor of the steering's level, as in the authors' code", positive=True
+    )
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -53,9 +62,18 @@ class SensorOffsets(Group):
     """
 
     group = "estimator.offsets"
-    ay: float | None = setting(None, "of the accelerometer, or of the road's bank; null: no state", unit="m/s²", positive=True)
-    steer: float | None = setting(None, "of the steering angle; null: no state", unit="rad", positive=True)
-    seconds: float = setting(60.0, "time in which an offset's correlation falls to 1/e", unit="s", positive=True)
+    ay: float | None = setting(
+        None,
+        "of the accelerometer, or of the road's bank; null: no state",
+        unit="m/s²",
+        positive=True,
+    )
+    steer: float | None = setting(
+        None, "of the steering angle; null: no state", unit="rad", positive=True
+    )
+    seconds: float = setting(
+        60.0, "time in which an offset's correlation falls to 1/e", unit="s", positive=True
+    )
 
     @property
     def given(self) -> tuple[str, ...]:
@@ -82,12 +100,19 @@ class KalmanFilter(SideslipFilter):
         "set estimator.noise.read_from=training, or give the levels"
     )
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
-    offsets: SensorOffsets = setting(SensorOffsets(), "standard deviations of offsets that are states")
-    initial_deviation: float = setting(100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True)
+    offsets: SensorOffsets = setting(
+        SensorOffsets(), "standard deviations of offsets that are states"
+    )
+    initial_deviation: float = setting(
+        100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.values = {name: math.nan if name in self.noise.unknown else getattr(self.noise, name) for name in LEVELS}
+        self.values = {
+            name: math.nan if name in self.noise.unknown else getattr(self.noise, name)
+            for name in LEVELS
+        }
         self.unknown = self.noise.unknown if self.noise.read_from == "training" else ()
 
     @property
@@ -110,45 +135,68 @@ class KalmanFilter(SideslipFilter):
     @property
     def full_title(self) -> str:
         """Title with where the noise levels come from, offsets, and the gate."""
-        noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
+        noise = (
+            ""
+            if self.learns
+            else f", noise {'given' if self.causal else 'read off the recording itself'}"
+        )
         names = {"ay": "ay", "steer": "the steering angle"}
         offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
         return self.title + noise + offsets + self.gate_title
 
-    def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
+    def find_numbers(
+        self, data: FitData, training: Any, context: FitContext
+    ) -> tuple[Mapping[str, float], FitRecord]:
         """Noise levels of the measured channels of the training recordings."""
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
         return self.values | read_levels(recordings, self.noise.unknown, self.noise.cutoff, SILENT)
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+    def _estimate_one(
+        self, recording: Recording, initial_state: Mapping[str, float] | None
+    ) -> Estimate:
         own = self
         if not self.causal:
             own = copy(self)
             own.values = self._levels_of([recording])
         return super(KalmanFilter, own)._estimate_one(recording, initial_state)
 
-    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+    def first_gaussian(
+        self, sample: FloatArray, given: Mapping[str, float]
+    ) -> Gaussian[FloatArray]:
         """β and r, and offsets of 0 that are known to their standard deviations."""
         offsets = [getattr(self.offsets, name) for name in self.offsets.given]
-        return self.first_motion(sample, np.array([self.initial_deviation, self.initial_deviation, *offsets]), given)
+        return self.first_motion(
+            sample, np.array([self.initial_deviation, self.initial_deviation, *offsets]), given
+        )
 
     def filter_samples(
-        self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
+        self,
+        samples: FloatArray,
+        first: Gaussian[FloatArray],
+        gate: Gate | None = None,
+        refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
         """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ - b_δ."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         offsets, steps = self.offsets, len(samples)
         n = 2 + len(offsets.given)
-        transition, noise, observation = np.zeros((steps, n, n)), np.zeros((steps, n, n)), np.zeros((steps, 2, n))
+        transition, noise, observation = (
+            np.zeros((steps, n, n)),
+            np.zeros((steps, n, n)),
+            np.zeros((steps, 2, n)),
+        )
         spread = self.values["steer"] * self.noise.steer_factor * B
         transition[:, :2, :2], noise[:, :2, :2] = A, spread[:, :, None] * spread[:, None, :]
         observation[:, 0, :2], observation[:, 1, 1] = C, 1.0
         kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
         for row, name in enumerate(offsets.given, 2):
-            transition[:, row, row], noise[:, row, row] = kept, getattr(offsets, name) ** 2 * (1.0 - kept**2)
+            transition[:, row, row], noise[:, row, row] = (
+                kept,
+                getattr(offsets, name) ** 2 * (1.0 - kept**2),
+            )
             if name == "ay":
                 observation[:, 0, row] = 1.0
             else:
@@ -161,7 +209,9 @@ class KalmanFilter(SideslipFilter):
         found = kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
         mean, covariance = found.filtered
         innovations = (found.innovation, found.innovation_covariance, np.asarray(found.measured))
-        return FilteredStates(mean, None, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1]))
+        return FilteredStates(
+            mean, None, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1])
+        )
 
     def c_values(self) -> dict[str, Any]:
         """Its car, levels of noise, offsets and gate."""

@@ -41,9 +41,13 @@ class Kinematic(Recursive):
         best = int(np.argmin(errors))
         bounds = (math.log(grid[max(best - 1, 0)]), math.log(grid[min(best + 1, N_STARTS - 1)]))
         found = scipy.optimize.minimize_scalar(
-            lambda logarithm: self._error_with(recordings, math.exp(logarithm)), bounds=bounds, method="bounded"
+            lambda logarithm: self._error_with(recordings, math.exp(logarithm)),
+            bounds=bounds,
+            method="bounded",
         )
-        return {"time_constant": math.exp(found.x) if found.fun < errors[best] else float(grid[best])}
+        return {
+            "time_constant": math.exp(found.x) if found.fun < errors[best] else float(grid[best])
+        }
 
     def _error_with(self, recordings: Sequence[Recording], time_constant: float) -> float:
         self.time_constant = time_constant
@@ -58,12 +62,18 @@ class Kinematic(Recursive):
         """v [m/s] at each sample, from that one sample before."""
         vx, yaw_rate, ay = samples.T
         gain, (start,) = (1.0 - self.kept) * self.time_constant, state
-        vy = scipy.signal.lfilter([gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start]))[0]
+        vy = scipy.signal.lfilter(
+            [gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start])
+        )[0]
         return {"vy": vy}, (float(vy[-1]),)
 
     def c_values(self) -> dict[str, Any]:
         """Its time constant, and what follows from it."""
-        return {"time_constant": self.time_constant, "kept": self.kept, "gain": (1.0 - self.kept) * self.time_constant}
+        return {
+            "time_constant": self.time_constant,
+            "kept": self.kept,
+            "gain": (1.0 - self.kept) * self.time_constant,
+        }
 
 
 ESTIMATOR = Kinematic

@@ -62,7 +62,9 @@ class Ksnn(WindowedEstimator):
     @property
     def variant(self) -> str:
         """Name of the structure as in Table III."""
-        return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (f"_q{self.n_hidden}" if self.n_hidden else "")
+        return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (
+            f"_q{self.n_hidden}" if self.n_hidden else ""
+        )
 
     @property
     def full_title(self) -> str:
@@ -91,14 +93,29 @@ class Ksnn(WindowedEstimator):
     def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
         """By the compiled recursion alone."""
         weights, own = self.weights(), self.settings
-        flat = np.concatenate([weights[name].ravel() for name in kernel.shapes_of(own.n_local, own.n_hidden, bias=own.bias)])
+        flat = np.concatenate(
+            [
+                weights[name].ravel()
+                for name in kernel.shapes_of(own.n_local, own.n_hidden, bias=own.bias)
+            ]
+        )
         samples = np.ascontiguousarray(series, dtype=flat.dtype)
-        return kernel.recursion_of(own, float(weights["yaw_rate_max"])).values(flat[None], samples, starts[None])[0].astype(np.float64)
+        return (
+            kernel.recursion_of(own, float(weights["yaw_rate_max"]))
+            .values(flat[None], samples, starts[None])[0]
+            .astype(np.float64)
+        )
 
     def c_values(self) -> dict[str, Any]:
         """Its local models and their neurons."""
         weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
-        return kernel.c_tables(kernel.packed(weights), self.window, self.rate_hz, float(weights["yaw_rate_max"]), bias=self.bias)
+        return kernel.c_tables(
+            kernel.packed(weights),
+            self.window,
+            self.rate_hz,
+            float(weights["yaw_rate_max"]),
+            bias=self.bias,
+        )
 
 
 ESTIMATOR = Ksnn

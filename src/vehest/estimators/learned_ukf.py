@@ -25,7 +25,13 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.unscented_scan import MARGIN, CompiledNoise, StepNoise, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
-from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
+from vehest.training.through_filter import (
+    Drive,
+    ThroughFilterSettings,
+    Weights,
+    filter_phases,
+    one_step_phase,
+)
 from vehest.vehicle.dynamics import (
     PACEJKA,
     STATES,
@@ -42,7 +48,13 @@ from vehest.vehicle.dynamics import (
 from vehest.vehicle.planar import F1TENTH, LEARNT
 from vehest.vehicle.tyres import STILL
 
-SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}
+SHORT = {
+    "pacejka": "pc",
+    "residual": "pcr",
+    "neural": "nn",
+    "tyre_network": "nnt",
+    "friction_tyre_network": "nntf",
+}
 TITLES = {
     "pacejka": "Pacejka's tyres",
     "residual": "Pacejka's tyres and learnt residual rates",
@@ -54,8 +66,18 @@ REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")
 MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")
 INPUTS = ("steer", "motor_current")
 SLIP = 0.3  # rad and 1, what slips are divided by before a network sees them
-WEIGHTS = (0.2225, 0.5064, 0.1566, 0.1145)  # of vx, vy, yaw rate and rim speed: the inverse of how much they change from sample to sample
-UNKNOWN = (0.5, 0.3, 0.1, 0.1)  # m/s, m/s, rad/s, m/s: standard deviations of a start that nobody hands over
+WEIGHTS = (
+    0.2225,
+    0.5064,
+    0.1566,
+    0.1145,
+)  # of vx, vy, yaw rate and rim speed: the inverse of how much they change from sample to sample
+UNKNOWN = (
+    0.5,
+    0.3,
+    0.1,
+    0.1,
+)  # m/s, m/s, rad/s, m/s: standard deviations of a start that nobody hands over
 
 
 @dataclass(frozen=True)
@@ -66,20 +88,40 @@ class CarSettings(Group):
     mass: float = setting(5.1, "known", unit="kg", positive=True)
     wheelbase: float = setting(0.33, "known", unit="m", positive=True)
     wheel_radius: float = setting(0.05, "known", unit="m", positive=True)
-    yaw_inertia: float = setting(F1TENTH["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True)
-    cg_to_rear_axle: float = setting(F1TENTH["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True)
-    drag_constant: float = setting(F1TENTH["drag_constant"], "learnt from here on", unit="N", positive=True)
-    drag_linear: float = setting(F1TENTH["drag_linear"], "learnt from here on", unit="N s/m", positive=True)
-    drag_quadratic: float = setting(F1TENTH["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True)
-    powertrain_inertia: float = setting(F1TENTH["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True)
-    torque_constant: float = setting(F1TENTH["torque_constant"], "learnt from here on", unit="N m/A", positive=True)
-    friction_viscous: float = setting(F1TENTH["friction_viscous"], "learnt from here on", unit="N s", positive=True)
-    friction_coulomb: float = setting(F1TENTH["friction_coulomb"], "learnt from here on", unit="N m", positive=True)
+    yaw_inertia: float = setting(
+        F1TENTH["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True
+    )
+    cg_to_rear_axle: float = setting(
+        F1TENTH["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True
+    )
+    drag_constant: float = setting(
+        F1TENTH["drag_constant"], "learnt from here on", unit="N", positive=True
+    )
+    drag_linear: float = setting(
+        F1TENTH["drag_linear"], "learnt from here on", unit="N s/m", positive=True
+    )
+    drag_quadratic: float = setting(
+        F1TENTH["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True
+    )
+    powertrain_inertia: float = setting(
+        F1TENTH["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True
+    )
+    torque_constant: float = setting(
+        F1TENTH["torque_constant"], "learnt from here on", unit="N m/A", positive=True
+    )
+    friction_viscous: float = setting(
+        F1TENTH["friction_viscous"], "learnt from here on", unit="N s", positive=True
+    )
+    friction_coulomb: float = setting(
+        F1TENTH["friction_coulomb"], "learnt from here on", unit="N m", positive=True
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.cg_to_rear_axle >= self.wheelbase:
-            raise ConfigurationError(f"estimator.car.cg_to_rear_axle must be less than the wheelbase, not {self.cg_to_rear_axle}")
+            raise ConfigurationError(
+                f"estimator.car.cg_to_rear_axle must be less than the wheelbase, not {self.cg_to_rear_axle}"
+            )
 
 
 class LearnedUkf(Network, SigmaPointEstimator):
@@ -111,24 +153,47 @@ class LearnedUkf(Network, SigmaPointEstimator):
     training_type = ThroughFilterSettings
     network: CarFilter
     correlated_noise = True
-    dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = setting(
-        "friction_tyre_network", "pacejka (PC), residual (PCR), neural (NN), tyre_network (NNT) or friction_tyre_network (NNTF)"
+    dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = (
+        setting(
+            "friction_tyre_network",
+            "pacejka (PC), residual (PCR), neural (NN), tyre_network (NNT) or friction_tyre_network (NNTF)",
+        )
     )
-    noise: Literal["constant", "state_dependent"] = setting("state_dependent", "constant or state_dependent (subscript H) covariances")
-    through_filter: bool = setting(True, "whether the dynamics learn through the filter too (subscript U), or the noise alone")
-    friction: float = setting(0.6, "that of the training recordings, which its estimate is trained towards", positive=True)
+    noise: Literal["constant", "state_dependent"] = setting(
+        "state_dependent", "constant or state_dependent (subscript H) covariances"
+    )
+    through_filter: bool = setting(
+        True, "whether the dynamics learn through the filter too (subscript U), or the noise alone"
+    )
+    friction: float = setting(
+        0.6, "that of the training recordings, which its estimate is trained towards", positive=True
+    )
     start_friction: float | None = setting(None, "that estimates start from; null: the same")
-    width: int = setting(0, "of hidden layers; 0: the paper's, 64 for tyres and 256 for rates", least=0)
-    scaled: bool = setting(True, "whether networks see and give numbers of about 1; otherwise SI units, as in the authors' code")
-    repair: bool = setting(True, "whether covariances that lose definiteness are repaired; otherwise the estimate is NaN from there on")
-    least_speed: float = setting(0.05, "smallest forward speed that the state may have", unit="m/s", positive=True)
-    least_friction: float = setting(0.05, "smallest friction that the state may have", positive=True)
+    width: int = setting(
+        0, "of hidden layers; 0: the paper's, 64 for tyres and 256 for rates", least=0
+    )
+    scaled: bool = setting(
+        True,
+        "whether networks see and give numbers of about 1; otherwise SI units, as in the authors' code",
+    )
+    repair: bool = setting(
+        True,
+        "whether covariances that lose definiteness are repaired; otherwise the estimate is NaN from there on",
+    )
+    least_speed: float = setting(
+        0.05, "smallest forward speed that the state may have", unit="m/s", positive=True
+    )
+    least_friction: float = setting(
+        0.05, "smallest friction that the state may have", positive=True
+    )
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
     def check(self) -> None:
         """Raises `ConfigurationError`: friction that starts below its smallest value."""
         if self.start_friction is not None and not self.start_friction > self.least_friction:
-            raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
+            raise ConfigurationError(
+                f"estimator.start_friction must lie above least_friction, not at {self.start_friction}"
+            )
 
     @property
     def filter(self) -> CarFilter:
@@ -141,16 +206,27 @@ class LearnedUkf(Network, SigmaPointEstimator):
     def variant(self) -> str:
         """The paper's name: nntf_uh and so on; a star for another start of friction."""
         s = self.settings
-        subscript = ("u" if s.through_filter else "") + ("h" if s.noise == "state_dependent" else "")
+        subscript = ("u" if s.through_filter else "") + (
+            "h" if s.noise == "state_dependent" else ""
+        )
         name = SHORT[s.dynamics] + (f"_{subscript}" if subscript else "")
         name += "" if s.start_friction in (None, s.friction) else f"_mu{s.start_friction:g}"
-        return name + ("" if s.repair else "_unrepaired") + ("" if s.scaled else "_si") + self.gate_suffix
+        return (
+            name
+            + ("" if s.repair else "_unrepaired")
+            + ("" if s.scaled else "_si")
+            + self.gate_suffix
+        )
 
     @property
     def full_title(self) -> str:
         """Title with what is learnt."""
         s = self.settings
-        how = [TITLES[s.dynamics]] + ["learnt through the filter"] * s.through_filter + ["noise by state"] * (s.noise == "state_dependent")
+        how = (
+            [TITLES[s.dynamics]]
+            + ["learnt through the filter"] * s.through_filter
+            + ["noise by state"] * (s.noise == "state_dependent")
+        )
         if s.start_friction not in (None, s.friction):
             how.append(f"friction from {s.start_friction:g}")
         how += ["no repair"] * (not s.repair)
@@ -166,7 +242,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
         return replace(self.settings, start_friction=None, repair=True, gate=None)
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Train one seed after the other; members that differ only in their use get the same weights."""
         trained: dict[int, tuple[LearnedUkf, list[PhaseRecord]]] = {}
         seeds = [member._seed for member in members if isinstance(member, LearnedUkf)]
@@ -177,17 +255,29 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 twin, phases = trained[member._seed]
                 member.load_weights(twin.weights())
             else:
-                twins = [other for other, seed in enumerate(seeds) if other > index and seed == member._seed]
+                twins = [
+                    other
+                    for other, seed in enumerate(seeds)
+                    if other > index and seed == member._seed
+                ]
                 phases = member._train(data, training, context, index, twins)
                 trained[member._seed] = (member, phases)
             records.append(record_of_phases(phases))
         return records
 
     def _train(
-        self, data: FitData, training: ThroughFilterSettings, context: FitContext, index: int, twins: Sequence[int]
+        self,
+        data: FitData,
+        training: ThroughFilterSettings,
+        context: FitContext,
+        index: int,
+        twins: Sequence[int],
     ) -> list[PhaseRecord]:
         dtype = getattr(torch, training.dtype)
-        train, validation = ([self.drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
+        train, validation = (
+            [self.drive(recording, dtype) for recording in part]
+            for part in (data.train, data.validation)
+        )
         self.network = self.new_network().to(dtype)
         self.network.repair = True
         if self.scaled:
@@ -195,10 +285,21 @@ class LearnedUkf(Network, SigmaPointEstimator):
         self.filter.reset(torch.Generator().manual_seed(self._seed))
         weights = torch.tensor(WEIGHTS, dtype=dtype)
         last = torch.zeros(1, dtype=dtype)
-        counted = Weights(torch.cat([weights, last]), torch.cat([weights, last + 1.0]), torch.cat([weights[:3], last, last]))
+        counted = Weights(
+            torch.cat([weights, last]),
+            torch.cat([weights, last + 1.0]),
+            torch.cat([weights[:3], last, last]),
+        )
         learns_dynamics = self.through_filter
         phases = [
-            one_step_phase(self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
+            one_step_phase(
+                self.filter,
+                train,
+                validation,
+                counted,
+                training,
+                lambda name: name.startswith("dynamics."),
+            ),
             *filter_phases(
                 self.filter,
                 train,
@@ -210,7 +311,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 "through_filter" if learns_dynamics else "noise",
             ),
         ]
-        records = train_phases(phases, self._seed, context, index, training.checkpoint_seconds, twins)
+        records = train_phases(
+            phases, self._seed, context, index, training.checkpoint_seconds, twins
+        )
         self.filter.repair = self.repair
         return records
 
@@ -236,7 +339,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
             return ResidualCar(car, hidden=(width, width))
         if s.dynamics == "neural":
             return NeuralCar(hidden=(width, width))
-        return TyreNetworkCar(car, friction_scaled=s.dynamics == "friction_tyre_network", hidden=(width, width))
+        return TyreNetworkCar(
+            car, friction_scaled=s.dynamics == "friction_tyre_network", hidden=(width, width)
+        )
 
     def _scale(self, train: Sequence[Drive]) -> None:
         """Networks' inputs by their root mean square in training; forces by an axle's share of the weight, rates by theirs."""
@@ -252,7 +357,10 @@ class LearnedUkf(Network, SigmaPointEstimator):
             given = [0.5 * self.car.mass * GRAVITY] * 4
         else:
             scales = [vx, vy, yaw_rate, rim, steer, current]
-            rates = torch.cat([drive.states[1:, :4] - drive.states[:-1, :4] for drive in train]) * self.rate_hz
+            rates = (
+                torch.cat([drive.states[1:, :4] - drive.states[:-1, :4] for drive in train])
+                * self.rate_hz
+            )
             given = rates.square().mean(0).sqrt().clamp(min=1e-6).tolist()
         network.input_scale.copy_(torch.tensor(scales))
         network.output_scale.copy_(torch.tensor(given))
@@ -263,46 +371,82 @@ class LearnedUkf(Network, SigmaPointEstimator):
         measurements[:, 3] *= self.car.wheel_radius
         return measurements, _held(recording.stack(INPUTS))
 
-    def _start(self, measurement: FloatArray, state: Mapping[str, float] | None) -> tuple[Tensor, Tensor]:
+    def _start(
+        self, measurement: FloatArray, state: Mapping[str, float] | None
+    ) -> tuple[Tensor, Tensor]:
         """Mean and covariance at the first sample: known where it is handed over, else from what is measured."""
         dtype = next(self.filter.parameters()).dtype
         given = dict(state or {})
         s = self.settings
-        rim, yaw_rate = (0.0 if math.isnan(value) else float(value) for value in (measurement[3], measurement[2]))
+        rim, yaw_rate = (
+            0.0 if math.isnan(value) else float(value) for value in (measurement[3], measurement[2])
+        )
         values = {"vx": max(rim, s.least_speed), "vy": 0.0, "yaw_rate": yaw_rate, "rim_speed": rim}
         friction = s.friction if s.start_friction is None else s.start_friction
         mean = [given.get(name, values[name]) for name in STATES[:-1]] + [friction]
-        extra = [0.0 if name in given or (name == "rim_speed" and given) else d**2 for name, d in zip(STATES[:-1], UNKNOWN, strict=True)]
+        extra = [
+            0.0 if name in given or (name == "rim_speed" and given) else d**2
+            for name, d in zip(STATES[:-1], UNKNOWN, strict=True)
+        ]
         with torch.no_grad():
-            covariance = self.filter.initial_covariance().to(dtype) + torch.tensor([*extra, 0.0], dtype=dtype).diag()
+            covariance = (
+                self.filter.initial_covariance().to(dtype)
+                + torch.tensor([*extra, 0.0], dtype=dtype).diag()
+            )
         return torch.tensor(mean, dtype=dtype), covariance
 
-    def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
+    def _estimate_all(
+        self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
+    ) -> list[Estimate]:
         """Recordings of one length are filtered together."""
         estimates: dict[int, Estimate] = {}
         for length in dict.fromkeys(len(recording) for recording in recordings):
             rows = [row for row, recording in enumerate(recordings) if len(recording) == length]
-            together = self._filter([recordings[row] for row in rows], [states[row] for row in rows])
+            together = self._filter(
+                [recordings[row] for row in rows], [states[row] for row in rows]
+            )
             estimates |= dict(zip(rows, together, strict=True))
         return [estimates[row] for row in range(len(recordings))]
 
-    def _filter(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
+    def _filter(
+        self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
+    ) -> list[Estimate]:
         dtype = next(self.filter.parameters()).dtype
         samples = [self._samples(recording) for recording in recordings]
-        measurements, inputs = (torch.as_tensor(np.stack(part), dtype=dtype) for part in zip(*samples, strict=True))
+        measurements, inputs = (
+            torch.as_tensor(np.stack(part), dtype=dtype) for part in zip(*samples, strict=True)
+        )
         starts = [self._start(own[0][0], state) for own, state in zip(samples, states, strict=True)]
-        initial = Gaussian(torch.stack([mean for mean, _ in starts]), torch.stack([covariance for _, covariance in starts]))
+        initial = Gaussian(
+            torch.stack([mean for mean, _ in starts]),
+            torch.stack([covariance for _, covariance in starts]),
+        )
         with torch.no_grad():
-            steps = self.filter.filtered(measurements, inputs, initial, gate=self.gate_in_use()).steps
-            nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
-        mean, covariance, dof = steps.filtered.mean.double().numpy(), steps.filtered.covariance.double().numpy(), steps.measured.sum(-1)
+            steps = self.filter.filtered(
+                measurements, inputs, initial, gate=self.gate_in_use()
+            ).steps
+            nis = (
+                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
+                .result.mul(steps.innovation)
+                .sum(-1)
+            )
+        mean, covariance, dof = (
+            steps.filtered.mean.double().numpy(),
+            steps.filtered.covariance.double().numpy(),
+            steps.measured.sum(-1),
+        )
         estimates = []
         for row, recording in enumerate(recordings):
             own = {name: mean[row, :, k].copy() for k, name in enumerate(STATES)}
             vx = recording["vx"]
-            seen = replace(recording, channels={**recording.channels, "vx": np.where(np.isnan(vx), own["vx"], vx)})
+            seen = replace(
+                recording,
+                channels={**recording.channels, "vx": np.where(np.isnan(vx), own["vx"], vx)},
+            )
             extra = {"nis": nis[row].double().numpy(), "nis_dof": dof[row].double().numpy()}
-            estimates.append(self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra))
+            estimates.append(
+                self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra)
+            )
         return estimates
 
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
@@ -312,8 +456,16 @@ class LearnedUkf(Network, SigmaPointEstimator):
         """
         require_learnable([recording], (*REFERENCES, "motor_speed", *INPUTS), self.name)
         measurements, inputs = self._samples(recording)
-        states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.friction)]
-        return Drive(*(torch.as_tensor(part, dtype=dtype) for part in (np.stack(states, 1), inputs, measurements)))
+        states = [recording[name] for name in REFERENCES] + [
+            measurements[:, 3],
+            np.full(len(recording), self.friction),
+        ]
+        return Drive(
+            *(
+                torch.as_tensor(part, dtype=dtype)
+                for part in (np.stack(states, 1), inputs, measurements)
+            )
+        )
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
         """From the first measurement."""
@@ -321,7 +473,13 @@ class LearnedUkf(Network, SigmaPointEstimator):
         mean, covariance = (part.numpy() for part in self._start(first.measurement, None))
         with torch.no_grad():
             return UnscentedStepper(
-                own.point_model(), mean, covariance, len(MEASURED), own.rule, repair=own.repair, gate=self.gate_in_use()
+                own.point_model(),
+                mean,
+                covariance,
+                len(MEASURED),
+                own.rule,
+                repair=own.repair,
+                gate=self.gate_in_use(),
             )
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
@@ -365,7 +523,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
 def _held(values: FloatArray) -> FloatArray:
     """The last value where one is missing; 0 before the first."""
-    last = np.maximum.accumulate(np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None]))
+    last = np.maximum.accumulate(
+        np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None])
+    )
     return np.take_along_axis(np.concatenate([np.zeros_like(values[:1]), values]), last, axis=0)
 
 
@@ -381,7 +541,9 @@ def _dynamics_in_c(dynamics: Dynamics) -> dict[str, Any]:
         "front_arm": front_arm,
         "front_load": weight * p["cg_to_rear_axle"],
         "rear_load": weight * front_arm,
-        "curves": [[p[f"{letter}_{where}"] for letter in "BCD"] for where in ("x", "front", "rear")],
+        "curves": [
+            [p[f"{letter}_{where}"] for letter in "BCD"] for where in ("x", "front", "rear")
+        ],
     }
     network = getattr(dynamics, "network", None)
     if isinstance(network, Perceptron):
@@ -397,7 +559,13 @@ def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
     constant, weight, offset, *numbers = noise.car
     scale, least = map(float, numbers)
     n = len(constant)
-    values = {"constant": constant, "weight": weight, "offset": offset, "scale": scale, "least": least if math.isfinite(least) else None}
+    values = {
+        "constant": constant,
+        "weight": weight,
+        "offset": offset,
+        "scale": scale,
+        "least": least if math.isfinite(least) else None,
+    }
     return {**values, "units": n * math.log(2.0 * math.pi * math.e), "size": n}
 
 

@@ -19,20 +19,30 @@ class LearnedUkfVariant(LearnedUkf):
     name, title = "learned_ukf_variant", "Learned UKF, variant"
     template, trials = "", ()
     correlated_noise: bool = setting(
-        True, "whether covariances of process and measurements have entries off their diagonals, as in the paper"
+        True,
+        "whether covariances of process and measurements have entries off their diagonals, as in the paper",
     )
-    curvature: bool = setting(False, "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone")
+    curvature: bool = setting(
+        False,
+        "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone",
+    )
 
     def check(self) -> None:
         """Raises `ConfigurationError`: a curvature of other dynamics."""
         super().check()
         if self.curvature and self.dynamics != "pacejka":
-            raise ConfigurationError(f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}")
+            raise ConfigurationError(
+                f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}"
+            )
 
     @property
     def variant(self) -> str:
         """The paper's name, with what is different."""
-        return super().variant + ("" if self.correlated_noise else "_diagonal") + ("_curved" if self.curvature else "")
+        return (
+            super().variant
+            + ("" if self.correlated_noise else "_diagonal")
+            + ("_curved" if self.curvature else "")
+        )
 
     @property
     def full_title(self) -> str:
@@ -44,11 +54,17 @@ class LearnedUkfVariant(LearnedUkf):
     @property
     def n_parameters(self) -> int:
         """Those that can change: without entries off the diagonals of diagonal noise."""
-        held = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (1 if self.noise == "constant" else 2 + len(STATES))
+        held = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (
+            1 if self.noise == "constant" else 2 + len(STATES)
+        )
         return super().n_parameters - held * (not self.correlated_noise)
 
     def _new_dynamics(self) -> Dynamics:
-        return PacejkaCar(vars(self.car), with_curvature=True) if self.curvature else super()._new_dynamics()
+        return (
+            PacejkaCar(vars(self.car), with_curvature=True)
+            if self.curvature
+            else super()._new_dynamics()
+        )
 
 
 ESTIMATOR = LearnedUkfVariant

@@ -16,7 +16,14 @@ from vehest.training.search import DirectSearchSettings
 
 
 def implicit_euler_observer(
-    measurements: FloatArray, gain: float, threshold: float, step: float, v: float, u: float, vy: FloatArray, vx: FloatArray
+    measurements: FloatArray,
+    gain: float,
+    threshold: float,
+    step: float,
+    v: float,
+    u: float,
+    vy: FloatArray,
+    vx: FloatArray,
 ) -> None:
     """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the time of each sample, (T,).
 
@@ -33,7 +40,12 @@ def implicit_euler_observer(
     if math.isnan(u):
         u = measurements[0, 1]
     for k in range(measurements.shape[0]):
-        omega, speed, ay, ax = measurements[k, 0], measurements[k, 1], measurements[k, 2], measurements[k, 3]
+        omega, speed, ay, ax = (
+            measurements[k, 0],
+            measurements[k, 1],
+            measurements[k, 2],
+            measurements[k, 3],
+        )
         if abs(omega) < threshold:
             v, u = 0.0, speed
         else:
@@ -52,11 +64,25 @@ compiled_observer = numba.njit(cache=True, error_model="numpy")(implicit_euler_o
 
 
 def observe(
-    measurements: FloatArray, gain: float, threshold: float, step: float, v: float = 0.0, u: float = math.nan
+    measurements: FloatArray,
+    gain: float,
+    threshold: float,
+    step: float,
+    v: float = 0.0,
+    u: float = math.nan,
 ) -> tuple[FloatArray, FloatArray]:
     """Estimated vy and vx [m/s], each of shape (T,)."""
     vy, vx = np.empty(len(measurements)), np.empty(len(measurements))
-    compiled_observer(np.ascontiguousarray(measurements), float(gain), float(threshold), step, float(v), float(u), vy, vx)
+    compiled_observer(
+        np.ascontiguousarray(measurements),
+        float(gain),
+        float(threshold),
+        step,
+        float(v),
+        float(u),
+        vy,
+        vx,
+    )
     return vy, vx
 
 
@@ -79,7 +105,11 @@ class Luenberger(Recursive):
     template = "luenberger"
     gain: float = fitted("gain α", start=(3.0, 20.0), box=(0.0, 50.0))
     threshold: float = fitted(
-        "yaw rate ω_th below which it is reset", unit="rad/s", start=(0.0, 0.3), box=(0.0, 0.5), of_largest="yaw_rate"
+        "yaw rate ω_th below which it is reset",
+        unit="rad/s",
+        start=(0.0, 0.3),
+        box=(0.0, 0.5),
+        of_largest="yaw_rate",
     )
     style = "#767676", "solid", "s"
 

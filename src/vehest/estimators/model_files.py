@@ -38,7 +38,9 @@ class About:
     trained_on: tuple[str, ...] = ()  # ranges
     validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
     n_parameters: int | None = None
-    downsample: Preparation = field(default_factory=Preparation)  # how recordings were brought to its rate
+    downsample: Preparation = field(
+        default_factory=Preparation
+    )  # how recordings were brought to its rate
     interrupted: bool = False
     note: str = ""  # what people should know of its estimates
 
@@ -70,7 +72,9 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
         "channels": list(estimator.channels),
         "about": dict(about or {}),
     }
-    (folder / DESCRIPTION).write_text(yaml.safe_dump(description, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    (folder / DESCRIPTION).write_text(
+        yaml.safe_dump(description, sort_keys=False, allow_unicode=True), encoding="utf-8"
+    )
     try:
         save_file(estimator.weights(), folder / WEIGHTS)
     except SafetensorError as error:
@@ -94,13 +98,17 @@ def load_model(folder: Path) -> Estimator:
             f"here; train it again, or use the vehest that trained it"
         )
     weights = _read_weights(folder, kind.may_be_nan)
-    estimator = _built(kind, description.settings, sum(values.size for values in weights.values()), path)
+    estimator = _built(
+        kind, description.settings, sum(values.size for values in weights.values()), path
+    )
     try:
         estimator.load_weights(weights)
     except VehestError as error:
         raise DataError(f"'{folder / WEIGHTS}': {error}") from None
     except (TypeError, ValueError, KeyError, IndexError, StopIteration, RuntimeError) as error:
-        raise DataError(f"'{folder / WEIGHTS}' does not fit the settings in {DESCRIPTION} ({first_line(error)})") from error
+        raise DataError(
+            f"'{folder / WEIGHTS}' does not fit the settings in {DESCRIPTION} ({first_line(error)})"
+        ) from error
     return estimator
 
 
@@ -121,14 +129,18 @@ def read_description(folder: Path) -> Description:
     return replace(described, settings=content["settings"])
 
 
-def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path) -> Estimator:
+def _built(
+    kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path
+) -> Estimator:
     """An estimator of these settings, once they are known to ask for no more parameters than there are weights.
 
     Raises `DataError`: they ask for more, or make no sense.
     """
     for name, number in _whole_numbers(settings, "settings"):
         if number > max(USUAL_SIZE, n_weights):
-            raise DataError(f"'{path}': {name} is {number:.4g}, and {WEIGHTS} holds {n_weights} numbers; the two do not belong together")
+            raise DataError(
+                f"'{path}': {name} is {number:.4g}, and {WEIGHTS} holds {n_weights} numbers; the two do not belong together"
+            )
     try:
         own = validated(kind.settings_type, dict(settings), f"'{path}'", group="settings")
         try:
@@ -136,7 +148,9 @@ def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, p
         except (RuntimeError, NotImplementedError, TypeError, ValueError, OverflowError):
             needed = 0  # building it needs values
         if needed > n_weights:
-            raise DataError(f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its settings: they need {needed}")
+            raise DataError(
+                f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its settings: they need {needed}"
+            )
         return kind(own)
     except ConfigurationError as error:
         raise DataError(f"'{path}': {error}") from None
@@ -167,10 +181,14 @@ def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.nda
             for name in file.keys():  # noqa: SIM118
                 kind = file.get_slice(name).get_dtype()
                 if kind not in DTYPES:
-                    raise DataError(f"'{path}': tensor '{name}' is of type {kind}, not one of: {', '.join(DTYPES)}")
+                    raise DataError(
+                        f"'{path}': tensor '{name}' is of type {kind}, not one of: {', '.join(DTYPES)}"
+                    )
                 weights[name] = file.get_tensor(name)
     except (SafetensorError, OSError, ValueError) as error:
-        raise DataError(f"'{path}' is truncated or damaged ({first_line(error)}); train the model again") from error
+        raise DataError(
+            f"'{path}' is truncated or damaged ({first_line(error)}); train the model again"
+        ) from error
     for name, values in weights.items():
         bad = np.isinf(values) if name in may_be_nan else ~np.isfinite(values)
         if bad.any():

@@ -44,19 +44,28 @@ class Network(Estimator):
     def new_network(self) -> Any:
         """An ``nn.Module`` as it is built, to train or to load weights into."""
 
-    def fit_member(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
+    def fit_member(
+        self, data: FitData, training: Any, context: FitContext, index: int
+    ) -> FitRecord:
         """Train this one, whose place among the members is ``index``; see `fit_members`."""
         raise NotImplementedError(f"{type(self).__name__} has no method 'fit_member'")
 
     @classmethod
-    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Train members one after the other."""
-        return [member.fit_member(data, training, context, index) for index, member in enumerate(members)]
+        return [
+            member.fit_member(data, training, context, index)
+            for index, member in enumerate(members)
+        ]
 
     @property
     def n_parameters(self) -> int:
         """Numbers that training determines; ranges taken from the data do not count."""
-        return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)
+        return sum(
+            parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad
+        )
 
     def fewest_weights(self) -> int:
         """Its parameters, found without room for them."""
@@ -67,13 +76,18 @@ class Network(Estimator):
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of what `weights` returns, by name."""
-        return {name: tuple(tensor.shape) for name, tensor in self.new_network().state_dict().items()}
+        return {
+            name: tuple(tensor.shape) for name, tensor in self.new_network().state_dict().items()
+        }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Parameters and ranges (persistent buffers) of the network."""
         if self._loaded and "network" not in vars(self):
             return {name: values.copy() for name, values in self._loaded.items()}
-        return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
+        return {
+            name: tensor.detach().numpy().copy()
+            for name, tensor in self.network.state_dict().items()
+        }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take parameters and ranges back, in the precision they were trained in.

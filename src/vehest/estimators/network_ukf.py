@@ -39,7 +39,9 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         """What the network adds to samples (T, C) of ``network_inputs``."""
 
     @abstractmethod
-    def fit_network(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
+    def fit_network(
+        self, data: FitData, training: Any, context: FitContext, index: int
+    ) -> FitRecord:
         """Train the network, given the fitted filter."""
 
     @property
@@ -52,14 +54,22 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         """Weights and biases of the network, and what the filter's fit finds."""
         return super().n_parameters + self.n_identified
 
-    def fit_member(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
+    def fit_member(
+        self, data: FitData, training: Any, context: FitContext, index: int
+    ) -> FitRecord:
         """Fit the filter, then the network."""
-        of_filter = self.identify(data, training.identification, FitContext(should_stop=context.should_stop))
-        if of_filter.interrupted:  # the network must see the filter that the whole identification finds
+        of_filter = self.identify(
+            data, training.identification, FitContext(should_stop=context.should_stop)
+        )
+        if (
+            of_filter.interrupted
+        ):  # the network must see the filter that the whole identification finds
             return FitRecord({}, {"best_epoch": 0}, True)
         record = self.fit_network(data, training, context, index)
         seconds = of_filter.metrics["train_seconds"]
-        found = {name: value for name, value in of_filter.metrics.items() if name.startswith("noise_")}
+        found = {
+            name: value for name, value in of_filter.metrics.items() if name.startswith("noise_")
+        }
         metrics = {**record.metrics, **found, "identification_seconds": seconds}
         metrics["train_seconds"] = record.metrics["train_seconds"] + seconds
         return FitRecord(record.history, metrics, record.interrupted)
@@ -70,7 +80,9 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     def pseudo_measurements(self, recordings: Sequence[Recording]) -> list[PseudoMeasurement]:
         """Of each recording."""
-        return [self.pseudo_of(self.seen(recording.stack(self.channels))) for recording in recordings]
+        return [
+            self.pseudo_of(self.seen(recording.stack(self.channels))) for recording in recordings
+        ]
 
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
@@ -79,12 +91,16 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         added = self.pseudo_of(self.seen(sample[None]))
         if added.process is not None:
             memory["noise"] = np.diag(added.process[0])
-        return np.append(measurement, added.sideslip), np.diag(np.append(np.diagonal(noise), added.variance))
+        return np.append(measurement, added.sideslip), np.diag(
+            np.append(np.diagonal(noise), added.variance)
+        )
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Those of the filter and of the network."""
         parts = {"filter": DugoffUkf.weights(self), "network": SampleNetworkEstimator.weights(self)}
-        return {f"{part}.{name}": values for part, own in parts.items() for name, values in own.items()}
+        return {
+            f"{part}.{name}": values for part, own in parts.items() for name, values in own.items()
+        }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take them back."""
@@ -92,7 +108,9 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         for name, values in weights.items():
             part, _, own = name.partition(".")
             if part not in parts:
-                raise DataError(f"weights of '{self.name}' do not fit its settings: '{name}' is unknown")
+                raise DataError(
+                    f"weights of '{self.name}' do not fit its settings: '{name}' is unknown"
+                )
             parts[part][own] = values
         DugoffUkf.load_weights(self, parts["filter"])
         SampleNetworkEstimator.load_weights(self, parts["network"])
@@ -109,4 +127,9 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     def c_values(self) -> dict[str, Any]:
         """Filter and network."""
         values = {**super().c_values(), **self.network.c_values()}
-        return values | {"network": True, "seen": self.network_inputs, "least_variance": LEAST_VARIANCE, "m": values["m"] + 1}
+        return values | {
+            "network": True,
+            "seen": self.network_inputs,
+            "least_variance": LEAST_VARIANCE,
+            "m": values["m"] + 1,
+        }

@@ -20,7 +20,13 @@ from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate, require_shapes
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
-from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
+from vehest.estimators.filtering.tyre_fit import (
+    NORMAL_95,
+    AxleMotion,
+    TyreFit,
+    axle_motion,
+    fit_motion,
+)
 from vehest.estimators.kernels.rational_ekf import _roll, scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
@@ -35,7 +41,12 @@ LEVELS = ("yaw_rate", "ay", "steer", "tyres")
 CURVES = TYRE_PARAMETERS[:4]
 ASSUMED = {"steer": 0.02, "tyres": 0.003}  # rad √s, 1/√s: where nothing is tuned
 CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
-ROLLING = (0.05, 0.2, 1.0, 2.0)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
+ROLLING = (
+    0.05,
+    0.2,
+    1.0,
+    2.0,
+)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
 LOST = 1.0  # rad, standard deviation of a sideslip angle of which nothing is known any more
 LARGEST = (1.5, 5.0, 20.0, 100.0)  # the same units: what estimates are kept within
 WITHIN = 3.0  # standard deviations at the start that tyre parameters may leave their start by, whatever the bound
@@ -43,10 +54,17 @@ FORCE_SCALE = 0.05  # of axle forces from accelerations, one standard deviation:
 SLIP_OFFSET = math.radians(0.15)  # of slip angles by the reference, likewise: its mounting
 FRICTION_START = 0.1  # standard deviation of its logarithm
 GIVEN_DEVIATION = 0.1  # of the logarithms of curves that nobody fitted
-BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}  # powers of ten: ay and steer over yaw_rate, tyres as it is
+BOXES = {
+    "ay": (-1.0, 5.0),
+    "steer": (-4.0, 4.0),
+    "tyres": (-8.0, 1.0),
+}  # powers of ten: ay and steer over yaw_rate, tyres as it is
 EDGE = 0.01  # of a box's width: a search that ends nearer to its end has ended on it
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
-FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
+FIRST_SCALE, CALIBRATIONS = (
+    0.01,
+    2,
+)  # rad/s: where the level of the yaw rate starts, and how often it is scaled
 
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -64,8 +82,12 @@ class TrackNoise(Group):
 
     group = "estimator.noise"
     yaw_rate: float | None = setting(None, "of the gyroscope", unit="rad/s", positive=True)
-    ay: float | None = setting(None, "of the accelerometer, and of what the model misses", unit="m/s²", positive=True)
-    steer: float | None = setting(None, "of the steering angle, over a second's step", unit="rad √s", positive=True)
+    ay: float | None = setting(
+        None, "of the accelerometer, and of what the model misses", unit="m/s²", positive=True
+    )
+    steer: float | None = setting(
+        None, "of the steering angle, over a second's step", unit="rad √s", positive=True
+    )
     tyres: float | None = setting(
         None,
         "by which logarithms of tyre parameters wander; training drives on one set of tyres and one road say little of it",
@@ -79,12 +101,18 @@ class AxleCurves(Group):
     """Axle curves at friction 1, all that the tyres need or none; where they are not given, the fit finds them."""
 
     group = "estimator.curves"
-    c1_front: float | None = setting(None, "where the front axle's curve bends; not of linear tyres", unit="rad²", positive=True)
-    c2_front: float | None = setting(None, "cornering stiffness of the front axle", unit="N/rad", positive=True)
+    c1_front: float | None = setting(
+        None, "where the front axle's curve bends; not of linear tyres", unit="rad²", positive=True
+    )
+    c2_front: float | None = setting(
+        None, "cornering stiffness of the front axle", unit="N/rad", positive=True
+    )
     c1_rear: float | None = setting(None, "of the rear axle", unit="rad²", positive=True)
     c2_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
     deviation: float | None = setting(
-        None, "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after a fit, else 0.1", positive=True
+        None,
+        "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after a fit, else 0.1",
+        positive=True,
     )
 
 
@@ -115,13 +143,22 @@ class RationalFilter(SideslipFilter):
     )
     filter: Literal["extended", "unscented"] = setting("extended", "kind of Kalman filter")
     bound: float = setting(
-        3.0, "factor by which tyre parameters may leave those at the start, three of their standard deviations at least", above=1.0
+        3.0,
+        "factor by which tyre parameters may leave those at the start, three of their standard deviations at least",
+        above=1.0,
     )
     largest_sideslip: float = setting(
-        0.5, "beyond it the filter has diverged: motion and tyres restart", unit="rad", above=0.0, most=LARGEST[0]
+        0.5,
+        "beyond it the filter has diverged: motion and tyres restart",
+        unit="rad",
+        above=0.0,
+        most=LARGEST[0],
     )
     adapt_above: float = setting(
-        0.0, "lateral acceleration |u r| below which tyre parameters are held; 0: never, as in the paper", unit="m/s²", least=0.0
+        0.0,
+        "lateral acceleration |u r| below which tyre parameters are held; 0: never, as in the paper",
+        unit="m/s²",
+        least=0.0,
     )
     noise: TrackNoise = setting(TrackNoise(), "levels of noise")
     curves: AxleCurves = setting(AxleCurves(), "axle curves")
@@ -130,8 +167,12 @@ class RationalFilter(SideslipFilter):
         super().__init__(settings)
         given = {name: getattr(settings.curves, name) for name in self.curve_names}
         self.axle_curves = np.array([given.get(name, math.inf) for name in CURVES], np.float64)
-        self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
-        levels = vars(settings.noise) | {name: 0.0 for name in LEVELS if name not in self.level_names}
+        self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(
+            len(CURVES)
+        )
+        levels = vars(settings.noise) | {
+            name: 0.0 for name in LEVELS if name not in self.level_names
+        }
         self.values = {name: math.nan if level is None else level for name, level in levels.items()}
 
     def check(self) -> None:
@@ -143,7 +184,9 @@ class RationalFilter(SideslipFilter):
         for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
             given = [name for name in names if getattr(getattr(self, group), name) is not None]
             if given and len(given) < len(names):
-                raise ConfigurationError(f"estimator.{group}: give all of {', '.join(names)}, or none of them")
+                raise ConfigurationError(
+                    f"estimator.{group}: give all of {', '.join(names)}, or none of them"
+                )
 
     @property
     def adapted(self) -> tuple[str, ...]:
@@ -174,7 +217,9 @@ class RationalFilter(SideslipFilter):
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.tyres][0] + ("_ukf" if self.filter == "unscented" else "")
-        return kind + ("_held" if self.adapted and self.adapt_above > 0.0 else "") + self.gate_suffix
+        return (
+            kind + ("_held" if self.adapted and self.adapt_above > 0.0 else "") + self.gate_suffix
+        )
 
     @property
     def full_title(self) -> str:
@@ -207,14 +252,18 @@ class RationalFilter(SideslipFilter):
         return TyreTrack(self.car, (*self.axle_curves.tolist(), 1.0), adapted, 1.0 / self.rate_hz)  # type: ignore[arg-type]
 
     @classmethod
-    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Fit axle curves to the reference sideslip of the training recordings, then find the noise levels; see `NoiseTuningSettings`.
 
         Members of one seed cannot differ, others only by Optuna's trials.
         """
         return [member._fit_one(data, training, context) for member in members]
 
-    def _fit_one(self, data: FitData, training: NoiseTuningSettings, context: FitContext) -> FitRecord:
+    def _fit_one(
+        self, data: FitData, training: NoiseTuningSettings, context: FitContext
+    ) -> FitRecord:
         started = time.monotonic()
         metrics: dict[str, float] = {"epochs": 0}
         history: dict[str, list[float]] = {}
@@ -229,13 +278,23 @@ class RationalFilter(SideslipFilter):
             n = len(self._searched)
             history = search.history(self._searched)
             boxes = np.array([BOXES[name] for name in self._searched])
-            at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
-            metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
+            at_limits = np.minimum(
+                search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]
+            ) < EDGE * np.ptp(boxes, axis=1)
+            metrics |= {
+                "evaluations": search.evaluations,
+                "best_train_loss": search.cost,
+                "levels_at_limits": int(at_limits.sum()),
+            }
             self.values = extended._calibrated(search.best[:n], drives)
             interrupted = search.interrupted
-        if data.validation and all("sideslip_ref" in own or "vy_ref" in own for own in data.validation):
+        if data.validation and all(
+            "sideslip_ref" in own or "vy_ref" in own for own in data.validation
+        ):
             skip = round(training.skip_seconds * self.rate_hz)
-            metrics["best_validation_loss"] = self._cost(self._drives(data.validation), self.values, skip)
+            metrics["best_validation_loss"] = self._cost(
+                self._drives(data.validation), self.values, skip
+            )
         metrics |= {f"noise_{name}": self.values[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
@@ -255,13 +314,21 @@ class RationalFilter(SideslipFilter):
         found = {CURVES[row]: float(self.axle_curves[row]) for row in rows}
         half = NORMAL_95 * self.axle_curves * np.sqrt(np.diagonal(self.curve_covariance))
         intervals = {f"{CURVES[row]}_interval": float(half[row]) for row in rows}
-        self.curve_covariance[np.ix_(rows, rows)] += (self.curves.deviation or 0.0) ** 2 * np.eye(len(rows))
+        self.curve_covariance[np.ix_(rows, rows)] += (self.curves.deviation or 0.0) ** 2 * np.eye(
+            len(rows)
+        )
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
         return {**found, **intervals, **rms}
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
         assumed = {name: value for name, value in ASSUMED.items() if name in self._unknown}
-        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in self._unknown], CUTOFF)
+        return (
+            self.values
+            | assumed
+            | read_levels(
+                recordings, [name for name in LEVELS[:2] if name in self._unknown], CUTOFF
+            )
+        )
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
@@ -275,7 +342,12 @@ class RationalFilter(SideslipFilter):
         """Samples of ``channels``, (T, 4), and the reference sideslip [rad], (T,), of each recording."""
         return [(recording.stack(self.channels), _reference(recording)) for recording in recordings]
 
-    def _tune(self, drives: Sequence[tuple[FloatArray, FloatArray]], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
+    def _tune(
+        self,
+        drives: Sequence[tuple[FloatArray, FloatArray]],
+        training: NoiseTuningSettings,
+        context: FitContext,
+    ) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
         skip = round(training.skip_seconds * self.rate_hz)
 
@@ -285,7 +357,9 @@ class RationalFilter(SideslipFilter):
         boxes, starts = ([limits[name] for name in self._searched] for limits in (BOXES, STARTS))
         return training.search(cost, boxes, starts, self._seed, context)
 
-    def _calibrated(self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
+    def _calibrated(
+        self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]
+    ) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
         found = dict(zip(self._searched, (10.0**powers).tolist(), strict=True))
         tyres = found.get("tyres", self.noise.tyres or 0.0)
@@ -293,7 +367,12 @@ class RationalFilter(SideslipFilter):
             return {**self.values, "tyres": tyres}
 
         def scaled(scale: float) -> dict[str, float]:
-            return {"yaw_rate": scale, "ay": scale * found["ay"], "steer": scale * found["steer"], "tyres": tyres}
+            return {
+                "yaw_rate": scale,
+                "ay": scale * found["ay"],
+                "steer": scale * found["steer"],
+                "tyres": tyres,
+            }
 
         scale = FIRST_SCALE
         for _ in range(CALIBRATIONS):
@@ -306,16 +385,26 @@ class RationalFilter(SideslipFilter):
             scale *= math.sqrt(total / max(count, 1.0))
         return scaled(scale)
 
-    def _cost(self, drives: Sequence[tuple[FloatArray, FloatArray]], levels: Mapping[str, float], skip: int) -> float:
+    def _cost(
+        self,
+        drives: Sequence[tuple[FloatArray, FloatArray]],
+        levels: Mapping[str, float],
+        skip: int,
+    ) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
         total, count = 0.0, 0
         for samples, reference in drives:
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
-            total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
+            total, count = (
+                total + float(np.square(error[counted]).sum()),
+                count + int(counted.sum()),
+            )
         return finite(total / max(count, 1))
 
-    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+    def first_gaussian(
+        self, sample: FloatArray, given: Mapping[str, float]
+    ) -> Gaussian[FloatArray]:
         """At rest on its course, or what a protocol hands over; parameters as they were fitted."""
         tyres = self.start_tyres()
         first = self.first_motion(sample, np.array([*ROLLING, *np.zeros(len(tyres))]), given)
@@ -369,18 +458,40 @@ class RationalFilter(SideslipFilter):
             np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
             *(1.0 / self.rate_hz, self.minimum_speed, self.adapt_above),
         )
-        variances = np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull])
+        variances = np.square(
+            [
+                levels["yaw_rate"],
+                levels["ay"],
+                levels["steer"],
+                *[levels["tyres"]] * len(adapted),
+                *pull,
+            ]
+        )
         guessed = self.largest_sideslip, LOST**2, np.square(ROLLING)
         limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
         gated = limit, patience, np.zeros(2, np.int64) if refused is None else refused
         bounds = np.append(bounds, [math.inf] * len(pull))
-        scan(np.ascontiguousarray(samples), track, variances, bounds, self.start_tyres(), guessed, gated, (mean, covariance), out)
+        scan(
+            np.ascontiguousarray(samples),
+            track,
+            variances,
+            bounds,
+            self.start_tyres(),
+            guessed,
+            gated,
+            (mean, covariance),
+            out,
+        )
         return FilteredStates(*out, Gaussian(mean, covariance))
 
-    def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
+    def _unscented(
+        self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]
+    ) -> FilteredStates:
         """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
         car, track, bound = self.car, self.track(), self.bounds()
-        limit = torch.as_tensor(bound)  # points are drawn again each time, so they may be kept within it in place
+        limit = torch.as_tensor(
+            bound
+        )  # points are drawn again each time, so they may be kept within it in place
         model = TorchModel(
             lambda points, inputs: track.transition(points.clamp_(-limit, limit), inputs),
             lambda points, inputs: track.observation(points.clamp_(-limit, limit), inputs),
@@ -398,7 +509,9 @@ class RationalFilter(SideslipFilter):
                 innovation, spread, measured = np.zeros(2), np.eye(2), np.zeros(2, bool)
             else:
                 if k:
-                    before = np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]])
+                    before = np.array(
+                        [max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]]
+                    )
                     wanders = abs(before[0] * (mean[1] + track.step * mean[3])) >= self.adapt_above
                     spreads = levels["steer"], levels["tyres"] * wanders
                     at = torch.as_tensor(mean[None]), torch.as_tensor(before[None])
@@ -410,7 +523,11 @@ class RationalFilter(SideslipFilter):
                     if diverged:
                         prior.mean[4:], prior.covariance[4:, 4:] = 0.0, self.start_tyres()
                 filtered.update(np.array([yaw_rate, ay]), np.array([vx, steer]), sensors)
-                innovation, spread, measured = filtered.innovation, filtered.innovation_covariance, ~np.isnan([yaw_rate, ay])
+                innovation, spread, measured = (
+                    filtered.innovation,
+                    filtered.innovation_covariance,
+                    ~np.isnan([yaw_rate, ay]),
+                )
                 if abs(vx * prior.mean[1]) < self.adapt_above:
                     gain = filtered.gain.copy()
                     gain[4:] = 0.0
@@ -419,13 +536,23 @@ class RationalFilter(SideslipFilter):
                     mean[:] = prior.mean + gain @ innovation
                 mean.clip(-bound, bound, out=mean)
             deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-            for target, values in zip(out, (mean, deviation, covariance[:2, :2], innovation, spread, measured), strict=True):
+            for target, values in zip(
+                out,
+                (mean, deviation, covariance[:2, :2], innovation, spread, measured),
+                strict=True,
+            ):
                 target[k] = values
         return FilteredStates(*out, Gaussian(mean.copy(), covariance.copy()))
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""
-        values = dict(zip(TYRE_PARAMETERS, np.repeat([*self.axle_curves, 1.0], len(states)).reshape(5, -1), strict=True))
+        values = dict(
+            zip(
+                TYRE_PARAMETERS,
+                np.repeat([*self.axle_curves, 1.0], len(states)).reshape(5, -1),
+                strict=True,
+            )
+        )
         for column, name in enumerate(self.adapted, len(MOTION)):
             values[name] = values[name] * np.exp(states[:, column])
         return values
@@ -433,7 +560,10 @@ class RationalFilter(SideslipFilter):
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
         """What an estimate says of the tyres."""
         tyres = self.parameters_of(states)
-        found = {f"cornering_stiffness_{axle}": tyres[f"c2_{axle}"] * tyres["friction"] for axle in ("front", "rear")}
+        found = {
+            f"cornering_stiffness_{axle}": tyres[f"c2_{axle}"] * tyres["friction"]
+            for axle in ("front", "rear")
+        }
         if self.tyres != "linear":
             found |= {f"tyre_c1_{axle}": tyres[f"c1_{axle}"] for axle in ("front", "rear")}
         if self.tyres == "rational_friction":
@@ -443,7 +573,9 @@ class RationalFilter(SideslipFilter):
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
         """Raises `ConfigurationError`: curves or levels are neither given nor fitted."""
         has_no_curves = np.isnan(self.axle_curves).any()
-        if has_no_curves or any(math.isnan(level) for level in (self.values if levels is None else levels).values()):
+        if has_no_curves or any(
+            math.isnan(level) for level in (self.values if levels is None else levels).values()
+        ):
             raise ConfigurationError(
                 f"estimator '{self.name}' has no {'axle curves' if has_no_curves else 'noise levels'} yet; "
                 "fit or load it first, or give estimator.curves and estimator.noise"
@@ -456,11 +588,17 @@ class RationalFilter(SideslipFilter):
         """
         levels = np.array([self.values[name] for name in LEVELS])
         curves = np.where(np.isinf(self.axle_curves), 0.0, self.axle_curves)
-        return {"curves": curves, "curve_covariance": self.curve_covariance.copy(), "levels": levels}
+        return {
+            "curves": curves,
+            "curve_covariance": self.curve_covariance.copy(),
+            "levels": levels,
+        }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take curves and levels back."""
-        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
+        require_shapes(
+            self, weights, {name: values.shape for name, values in self.weights().items()}
+        )
         curves = np.array(weights["curves"], dtype=np.float64)
         self.axle_curves = np.where(curves == 0.0, math.inf, curves)
         self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)
@@ -469,7 +607,9 @@ class RationalFilter(SideslipFilter):
     def c_values(self) -> dict[str, Any]:
         """Its car, curves, levels of noise and gate; raises `ConfigurationError`: its filter is unscented."""
         if self.filter != "extended":
-            raise ConfigurationError("estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended")
+            raise ConfigurationError(
+                "estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended"
+            )
         adapted = [_slope_in_c(name) for name in self.adapted]
         step = 1.0 / self.rate_hz
         return {
@@ -478,7 +618,11 @@ class RationalFilter(SideslipFilter):
             "columns": 4 + len(adapted) + max(2, 1 + len(adapted)),
             "linear": self.tyres == "linear",
             "adapted": adapted,
-            "wanted": [part for part in ("c1", "friction") if any(part in tyre["slope"] for tyre in adapted)],
+            "wanted": [
+                part
+                for part in ("c1", "friction")
+                if any(part in tyre["slope"] for tyre in adapted)
+            ],
             "states": {name: row for row, name in enumerate(self.adapted, 4)},
             "curves": dict(zip(TYRE_PARAMETERS, [*self.axle_curves.tolist(), 1.0], strict=True)),
             "car": self.car,
@@ -516,29 +660,45 @@ def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording
     found = [recording for recording in recordings if fnmatchcase(recording.id, pattern)]
     if not found:
         known = ", ".join(sorted({recording.id for recording in recordings}))
-        raise ConfigurationError(f"training.curves_from '{pattern}' matches no training recording ({known})")
+        raise ConfigurationError(
+            f"training.curves_from '{pattern}' matches no training recording ({known})"
+        )
     return found
 
 
-def _covariances_of_logarithms(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit) -> list[FloatArray]:
+def _covariances_of_logarithms(
+    motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit
+) -> list[FloatArray]:
     """Covariance of the logarithms of each axle's parameters, least squares' own and what they cannot see: the scale of all forces, and an
     offset of all slip angles, whose effect is that of a fit to shifted ones."""
     shifted = fit_motion(motion._replace(slip=motion.slip + SLIP_OFFSET), kind)
     found = []
-    for own, other, covariance in zip((fit.front, fit.rear), (shifted.front, shifted.rear), fit.covariance, strict=True):
+    for own, other, covariance in zip(
+        (fit.front, fit.rear), (shifted.front, shifted.rear), fit.covariance, strict=True
+    ):
         effect, scale = np.log(other / own), np.eye(len(own))[-1] * FORCE_SCALE
-        found.append(covariance / np.outer(own, own) + np.outer(effect, effect) + np.outer(scale, scale))
+        found.append(
+            covariance / np.outer(own, own) + np.outer(effect, effect) + np.outer(scale, scale)
+        )
     return found
 
 
 def _reference(recording: Recording) -> FloatArray:
     """Reference sideslip [rad], (T,)."""
     if "sideslip_ref" not in recording and "vy_ref" not in recording:
-        raise DataError(f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data")
-    return recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], recording["vx"])
+        raise DataError(
+            f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data"
+        )
+    return (
+        recording["sideslip_ref"]
+        if "sideslip_ref" in recording
+        else np.arctan2(recording["vy_ref"], recording["vx"])
+    )
 
 
-def _empty(steps: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+def _empty(
+    steps: int, n: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Room for everything in `FilteredStates` but the last state."""
     pairs = (np.empty((steps, 2, 2)), np.empty((steps, 2)), np.empty((steps, 2, 2)))
     return (np.empty((steps, n)), np.empty((steps, n)), *pairs, np.empty((steps, 2), np.bool_))

@@ -20,7 +20,9 @@ from vehest.estimators.base import Estimator, FitData, FitRecord, require_learna
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
-_numbers_type: Any = cache(partial(namedtuple, "Numbers"))  # one type a family, so that numba compiles its ``step`` once
+_numbers_type: Any = cache(
+    partial(namedtuple, "Numbers")
+)  # one type a family, so that numba compiles its ``step`` once
 
 
 def compiled(step: Callable[..., Any]) -> Any:
@@ -36,7 +38,9 @@ class Recursive(Estimator):
     """
 
     training_type: ClassVar[type] = NoTraining
-    states: ClassVar[tuple[str, ...]] = ("vy",)  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
+    states: ClassVar[tuple[str, ...]] = (
+        "vy",
+    )  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
     refuses: ClassVar[tuple[str, ...]] = ("NaN",)
     step: ClassVar[Any]
     values: dict[str, float]  # fitted numbers by name
@@ -67,7 +71,11 @@ class Recursive(Estimator):
 
     def numbers(self) -> Any:
         """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes them: a named tuple."""
-        numbers = {name: value for name, value in vars(self.settings).items() if isinstance(value, int | float)} | self.values
+        numbers = {
+            name: value
+            for name, value in vars(self.settings).items()
+            if isinstance(value, int | float)
+        } | self.values
         return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
@@ -77,7 +85,9 @@ class Recursive(Estimator):
         """
         return None
 
-    def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
+    def find_numbers(
+        self, data: FitData, training: Any, context: FitContext
+    ) -> tuple[Mapping[str, float], FitRecord]:
         """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
@@ -86,11 +96,23 @@ class Recursive(Estimator):
         if values is not None:
             self.values |= values
             losses = {"best_train_loss": data.train, "best_validation_loss": data.validation}
-            return values, FitRecord(metrics={name: self.mean_squared_error(recordings) for name, recordings in losses.items()})
+            return values, FitRecord(
+                metrics={
+                    name: self.mean_squared_error(recordings) for name, recordings in losses.items()
+                }
+            )
         declared = [self.settings.declarations()[name] for name in self.unknown]
-        scales = [max(float(np.abs(r[own.of_largest]).max()) for r in data.train) if own.of_largest else 1.0 for own in declared]
+        scales = [
+            max(float(np.abs(r[own.of_largest]).max()) for r in data.train)
+            if own.of_largest
+            else 1.0
+            for own in declared
+        ]
         boxes, starts = (
-            [tuple(value * scale for value in getattr(own, part)) for own, scale in zip(declared, scales, strict=True)]
+            [
+                tuple(value * scale for value in getattr(own, part))
+                for own, scale in zip(declared, scales, strict=True)
+            ]
             for part in ("box", "start")
         )
 
@@ -113,7 +135,9 @@ class Recursive(Estimator):
         return len(self.unknown)
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Fit one; the others, which could not differ, get the same.
 
         Raises `DataError`: a channel or the reference is missing or has gaps.
@@ -124,7 +148,9 @@ class Recursive(Estimator):
         record = FitRecord()
         if own[0].learns:
             channels = (*own[0].channels, *own[0].learns_from)
-            require_learnable([*data.train, *data.validation], channels, own[0].name, own[0].skippable)
+            require_learnable(
+                [*data.train, *data.validation], channels, own[0].name, own[0].skippable
+            )
             values, record = own[0].find_numbers(data, training, context)
         for member in own:
             member.values |= {name: float(value) for name, value in values.items()}
@@ -136,27 +162,37 @@ class Recursive(Estimator):
         errors = []
         for recording in recordings:
             samples = recording.stack(self.channels)
-            errors.append(self.run(samples, self.first_state(samples[0], {}))[0]["vy"] - recording["vy_ref"])
+            errors.append(
+                self.run(samples, self.first_state(samples[0], {}))[0]["vy"] - recording["vy_ref"]
+            )
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
     def require_fitted(self) -> None:
         """Raises `ConfigurationError`: a number is neither given nor fitted."""
         if any(math.isnan(value) for value in self.values.values()):
-            raise ConfigurationError(f"estimator '{self.name}' has not been fitted yet; fit or load it first")
+            raise ConfigurationError(
+                f"estimator '{self.name}' has not been fitted yet; fit or load it first"
+            )
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Each number as an array of one; without any, one that says that there is none."""
-        return {name: np.array([value]) for name, value in self.values.items()} or {"none": np.zeros(1)}
+        return {name: np.array([value]) for name, value in self.values.items()} or {
+            "none": np.zeros(1)
+        }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take the numbers back; raises `DataError`: one is missing or unknown."""
-        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
+        require_shapes(
+            self, weights, {name: values.shape for name, values in self.weights().items()}
+        )
         self.values = {name: float(weights[name][0]) for name in self.values}
 
 
 def _fitted_number(name: str) -> property:
     """Attribute of an estimator that is one of its ``values``."""
-    return property(lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)}))
+    return property(
+        lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)})
+    )
 
 
 @numba.njit(error_model="numpy")

@@ -21,8 +21,15 @@ ENTRY_POINTS = "vehest.estimators"
 @cache
 def estimator_names() -> list[str]:
     """Every known name: vehest's own, then those that other packages installed."""
-    own = [module.name for module in pkgutil.iter_modules(package.__path__) if _own_class(module.name) is not None]
-    return [*sorted(own), *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in own)]
+    own = [
+        module.name
+        for module in pkgutil.iter_modules(package.__path__)
+        if _own_class(module.name) is not None
+    ]
+    return [
+        *sorted(own),
+        *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in own),
+    ]
 
 
 @cache
@@ -41,5 +48,7 @@ def estimator_class(name: str) -> type[Estimator]:
 def _own_class(name: str) -> type[Estimator] | None:
     if name not in {module.name for module in pkgutil.iter_modules(package.__path__)}:
         return None
-    found: type[Estimator] | None = getattr(importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None)
+    found: type[Estimator] | None = getattr(
+        importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None
+    )
     return found

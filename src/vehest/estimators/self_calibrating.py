@@ -26,7 +26,9 @@ TYPICAL_WHEELBASE = 2.7  # m
 TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not given
 SCALED = {
     **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
-    **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
+    **dict.fromkeys(
+        ("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5
+    ),
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "compliance": -0.5},
 }
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
@@ -56,59 +58,128 @@ class SelfCalibrating(Recursive):
     refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
-    cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
+    cg_to_rear_axle: float = setting(
+        None,
+        "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases",
+        unit="m",
+    )
     smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline")
-    measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")
-    grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
+    measured_ax: bool = setting(
+        True, "whether ax is measured; else the longitudinal equation tells nothing"
+    )
+    grips: tuple[float, ...] = setting(
+        (4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]"
+    )
     grip: float = setting(14.0, "median of the prior of a_max", unit="m/s²", positive=True)
     grip_deviation: float = setting(0.55, "deviation of its logarithm", positive=True)
-    grip_excess: float = setting(2.0, "deviation over a second of accelerations beyond a grip limit", unit="m/s²", positive=True)
+    grip_excess: float = setting(
+        2.0,
+        "deviation over a second of accelerations beyond a grip limit",
+        unit="m/s²",
+        positive=True,
+    )
     exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
-    largest_share: float = setting(0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0)
-    compliance: float = setting(0.0045, "prior of C of a car of 2.7 m", unit="rad s²/m", positive=True)
+    largest_share: float = setting(
+        0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0
+    )
+    compliance: float = setting(
+        0.0045, "prior of C of a car of 2.7 m", unit="rad s²/m", positive=True
+    )
     compliance_deviation: float = setting(0.5, "its deviation over C", positive=True)
     leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
     leakage_deviation: float = setting(0.03, "its deviation", positive=True)
-    rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
-    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, else of v's point", positive=True)
+    rear_deviation: float = setting(
+        0.1,
+        "deviation of b over the wheelbase where the centre of gravity is not given",
+        positive=True,
+    )
+    imu_deviation: float = setting(
+        0.05,
+        "deviation of the inertial unit's place over the wheelbase, else of v's point",
+        positive=True,
+    )
     rear_share: float = setting(
-        0.3, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
+        0.3,
+        "of b found over typical by which vy is moved to the typical point, where it is not given",
+        least=0.0,
+        most=1.0,
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
     offset_ax: float = setting(0.2, "deviation of β_x", unit="m/s²", positive=True)
     offset_ax_time: float = setting(10.0, "time constant of β_x", unit="s", positive=True)
     noise_vy: float = setting(0.05, "process noise of v over a second", unit="m/s", positive=True)
-    noise_delay: float = setting(0.02, "process noise of v for each m/s³ by which u ω changes", unit="√s³", least=0.0)
+    noise_delay: float = setting(
+        0.02, "process noise of v for each m/s³ by which u ω changes", unit="√s³", least=0.0
+    )
     noise_vx: float = setting(0.1, "process noise of u over a second", unit="m/s", positive=True)
     noise_speed: float = setting(0.15, "deviation of the measured speed", unit="m/s", positive=True)
-    axle_lag: float = setting(0.3, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
+    axle_lag: float = setting(
+        0.3, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True
+    )
     axle_error_time: float = setting(2.0, "time constant of e", unit="s", positive=True)
-    axle_constant: float = setting(0.007, "size s of the axle's error: constant", unit="m/s", positive=True)
+    axle_constant: float = setting(
+        0.007, "size s of the axle's error: constant", unit="m/s", positive=True
+    )
     axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
     axle_per_slip: float = setting(0.03, "size over speed, prior of C and |φ|", least=0.0)
-    axle_per_bend: float = setting(2.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0)
-    axle_per_slope: float = setting(0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0)
+    axle_per_bend: float = setting(
+        2.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0
+    )
+    axle_per_slope: float = setting(
+        0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0
+    )
     axle_white: float = setting(0.03, "white error of the axle", unit="m/s", positive=True)
     axle_white_share: float = setting(0.3, "white share of its variance", least=0.0)
     gate: float = setting(3.0, "deviations at which an innovation is cut off", positive=True)
-    memory: float = setting(150.0, "time after which the drive counts e times less in all weights", unit="s", positive=True)
-    minimum_speed: float = setting(3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True)
-    variance_share: float = setting(0.5, "share of the filters' and candidates' variance that is reported", positive=True)
-    residual_share: float = setting(0.1, "share of the mean square that is left of v' that is reported, too", least=0.0)
-    angle_floor: float = setting(0.0025, "least deviation of the sideslip angle", unit="rad", least=0.0)
-    residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
+    memory: float = setting(
+        150.0,
+        "time after which the drive counts e times less in all weights",
+        unit="s",
+        positive=True,
+    )
+    minimum_speed: float = setting(
+        3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True
+    )
+    variance_share: float = setting(
+        0.5, "share of the filters' and candidates' variance that is reported", positive=True
+    )
+    residual_share: float = setting(
+        0.1, "share of the mean square that is left of v' that is reported, too", least=0.0
+    )
+    angle_floor: float = setting(
+        0.0025, "least deviation of the sideslip angle", unit="rad", least=0.0
+    )
+    residual_time: float = setting(
+        1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True
+    )
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
-    residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
-    largest_leakage: float = setting(0.05, "of κ that residuals of the candidates are freed of", least=0.0)
+    residual_floor: float = setting(
+        0.03, "residual below which candidates are alike", unit="m/s", positive=True
+    )
+    largest_leakage: float = setting(
+        0.05, "of κ that residuals of the candidates are freed of", least=0.0
+    )
     lateral_power: float = setting(5.0, "power by which the residual of v' counts", least=0.0)
     longitudinal_power: float = setting(7.0, "power by which the residual of u' counts", least=0.0)
-    network_odds: float = setting(1.0, "weight of the network over the bank's at the start", positive=True)
-    decision_time: float = setting(5.0, "driving after which residuals count half", unit="s", positive=True)
-    steady_odds: float = setting(0.4, "weight of steady cornering over the bank's at the start", positive=True)
-    steady_power: float = setting(3.0, "power of the typical wheelbase over the car's by which it grows", least=0.0)
-    network_start: float = setting(0.7, "weight at the start of the filter with the network's axle", positive=True)
-    network_wheelbase: float = setting(1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0)
+    network_odds: float = setting(
+        1.0, "weight of the network over the bank's at the start", positive=True
+    )
+    decision_time: float = setting(
+        5.0, "driving after which residuals count half", unit="s", positive=True
+    )
+    steady_odds: float = setting(
+        0.4, "weight of steady cornering over the bank's at the start", positive=True
+    )
+    steady_power: float = setting(
+        3.0, "power of the typical wheelbase over the car's by which it grows", least=0.0
+    )
+    network_start: float = setting(
+        0.7, "weight at the start of the filter with the network's axle", positive=True
+    )
+    network_wheelbase: float = setting(
+        1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -122,7 +193,9 @@ class SelfCalibrating(Recursive):
                 f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
             )
         if not self.grips or not all(limit > 0.0 for limit in self.grips):
-            raise ConfigurationError(f"estimator.grips must be positive accelerations, not {list(self.grips)}")
+            raise ConfigurationError(
+                f"estimator.grips must be positive accelerations, not {list(self.grips)}"
+            )
 
     @property
     def causal(self) -> bool:
@@ -137,7 +210,11 @@ class SelfCalibrating(Recursive):
     @property
     def rear(self) -> float:
         """Distance of the rear axle behind the reference point [m], as given or typical."""
-        return TYPICAL_REAR * self.wheelbase if self.cg_to_rear_axle is None else float(self.cg_to_rear_axle)
+        return (
+            TYPICAL_REAR * self.wheelbase
+            if self.cg_to_rear_axle is None
+            else float(self.cg_to_rear_axle)
+        )
 
     @property
     def bank_arrays(self) -> tuple[FloatArray, FloatArray]:
@@ -152,13 +229,29 @@ class SelfCalibrating(Recursive):
         rear_deviation = self.rear_deviation if self.cg_to_rear_axle is None else self.imu_deviation
         compliance = self.numbers().compliance
         mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, self.rear, compliance, 0.0])
-        own = (self.leakage_deviation, rear_deviation * self.wheelbase, self.compliance_deviation * compliance, 1.0)
+        own = (
+            self.leakage_deviation,
+            rear_deviation * self.wheelbase,
+            self.compliance_deviation * compliance,
+            1.0,
+        )
         return mean, np.array([0.3, self.noise_speed, self.offset_ay, self.offset_ax, *own])
 
     @property
     def decay(self) -> FloatArray:
         """Factors by which states return to the prior in a sample, (8,)."""
-        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
+        times = np.array(
+            [
+                np.inf,
+                np.inf,
+                self.offset_ay_time,
+                self.offset_ax_time,
+                np.inf,
+                np.inf,
+                np.inf,
+                self.axle_error_time,
+            ]
+        )
         return np.exp(-1.0 / (self.rate_hz * times * math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)))
 
     @property
@@ -170,14 +263,30 @@ class SelfCalibrating(Recursive):
 
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
-        own = {name: float(value) for name, value in vars(self.settings).items() if name in Numbers._fields}
-        own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
-        own["point"] = 0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase  # m: of the point of v
+        own = {
+            name: float(value)
+            for name, value in vars(self.settings).items()
+            if name in Numbers._fields
+        }
+        own |= {
+            "dt": 1.0 / self.rate_hz,
+            "rear": self.rear,
+            "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share,
+        }
+        own["point"] = (
+            0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase
+        )  # m: of the point of v
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         if self.rate_hz != NETWORK_HZ or self.wheelbase < self.network_wheelbase:
-            own |= {"network_odds": UNLIKELY, "network_start": UNLIKELY}  # its weights hold for its own steps alone
+            own |= {
+                "network_odds": UNLIKELY,
+                "network_start": UNLIKELY,
+            }  # its weights hold for its own steps alone
         powers = SCALED | {"steady_odds": -self.steady_power}
-        own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in powers.items()}
+        own |= {
+            name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power
+            for name, power in powers.items()
+        }
         if not self.measured_ax:
             own |= {"noise_vx": UNMEASURED, "longitudinal_power": 0.0}
         return Numbers(**own)
@@ -188,12 +297,21 @@ class SelfCalibrating(Recursive):
         mean[kernel.V], mean[kernel.U] = given.get("vy", 0.0), sample[1]
         lags = np.zeros(kernel.LAGS)
         first = self.with_ax(sample[None])[0]
-        lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = *first[[0, 2, 3]], sample[1], sample[1]
+        lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = (
+            *first[[0, 2, 3]],
+            sample[1],
+            sample[1],
+        )
         lags[kernel.PREDICTED] = first[0] * (self.rear - mean[kernel.COMPLIANCE] * first[1] ** 2)
         weights = self.bank_arrays[1]
-        means, covariances = np.tile(mean, (len(weights), 1)), np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
+        means, covariances = (
+            np.tile(mean, (len(weights), 1)),
+            np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1)),
+        )
         candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
-        return kernel.State(means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1)))
+        return kernel.State(
+            means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1))
+        )
 
     def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
         """vy [m/s] and its variance."""
@@ -203,13 +321,18 @@ class SelfCalibrating(Recursive):
             found, _, state = self.trace(samples, state, 1)
         return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
 
-    def trace(self, samples: FloatArray, state: kernel.State, kept: int | None = None) -> tuple[FloatArray, FloatArray, kernel.State]:
+    def trace(
+        self, samples: FloatArray, state: kernel.State, kept: int | None = None
+    ) -> tuple[FloatArray, FloatArray, kernel.State]:
         """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample.
 
         With ``kept=1`` those of the states are of the last sample alone.
         """
         state = kernel.State(*(part.copy() for part in state))
-        found, parameters = np.empty((len(samples), 2)), np.empty((kept or len(samples), 2 * kernel.STATES))
+        found, parameters = (
+            np.empty((len(samples), 2)),
+            np.empty((kept or len(samples), 2 * kernel.STATES)),
+        )
         rows = self.with_ax(samples)
         kernel.scan(*self._constants, self.network, state, rows, found, parameters)
         return found, parameters, state
@@ -221,14 +344,17 @@ class SelfCalibrating(Recursive):
 
     def with_ax(self, samples: FloatArray) -> FloatArray:
         """Samples with a column for ax, also where it is not measured."""
-        return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
+        return np.ascontiguousarray(
+            samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))])
+        )
 
     def c_values(self) -> dict[str, Any]:
         """Numbers, priors and the network."""
         n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
         return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
-            "numbers": n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()},
+            "numbers": n._asdict()
+            | {name: -math.expm1(-n.dt / time) for name, time in gains.items()},
             "grips": grips,
             "start": start,
             "prior": mean,
@@ -247,8 +373,13 @@ class SelfCalibrating(Recursive):
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take the network back; raises `DataError`: a part is missing, or has another shape."""
-        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
-        self.network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
+        require_shapes(
+            self, weights, {name: values.shape for name, values in self.weights().items()}
+        )
+        self.network, self._width = (
+            np.ascontiguousarray(weights["network"]),
+            float(weights["yaw_rate_max"][0]),
+        )
         self.__dict__.pop("_constants", None)
 
 
@@ -256,7 +387,9 @@ class SelfCalibrating(Recursive):
 def _shipped_network() -> tuple[FloatArray, float]:
     """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
     weights = load_model(Path(__file__).parents[1] / "pretrained").weights()
-    return packed({name: values.astype(np.float64) for name, values in weights.items()}), float(weights["yaw_rate_max"])
+    return packed({name: values.astype(np.float64) for name, values in weights.items()}), float(
+        weights["yaw_rate_max"]
+    )
 
 
 def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
@@ -271,11 +404,23 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         state: before the first of them.
     """
     _, _, last = estimator.trace(samples, state)
-    best, n, mean, decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior[0], estimator.decay
+    best, n, mean, decay = (
+        int(np.argmax(last.log_weights)),
+        estimator.numbers(),
+        estimator.prior[0],
+        estimator.decay,
+    )
     state = kernel.State(*(part.copy() for part in state))
     rows, before = estimator.with_ax(samples).copy(), state.last.copy()
-    means, covariances = np.empty((len(rows), kernel.STATES)), np.empty((len(rows), kernel.STATES, kernel.STATES))
-    network, turning, scratch = np.empty(len(rows)), np.empty(len(rows)), (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
+    means, covariances = (
+        np.empty((len(rows), kernel.STATES)),
+        np.empty((len(rows), kernel.STATES, kernel.STATES)),
+    )
+    network, turning, scratch = (
+        np.empty(len(rows)),
+        np.empty(len(rows)),
+        (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES))),
+    )
     for k in range(len(rows)):
         network[k], turning[k] = state.lags[kernel.PREDICTED], -state.lags[kernel.YAW_RATE]
         kernel.scan(*estimator._constants, estimator.network, state, rows[k : k + 1], *scratch)
@@ -295,14 +440,20 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         if k == 0:
             break
         step = np.eye(kernel.STATES)
-        step[kernel.V, kernel.LEAKAGE], step[kernel.V, kernel.OFFSET_Y] = -n.dt * middle[k, 2], -n.dt
+        step[kernel.V, kernel.LEAKAGE], step[kernel.V, kernel.OFFSET_Y] = (
+            -n.dt * middle[k, 2],
+            -n.dt,
+        )
         step[kernel.U, kernel.V], step[kernel.U, kernel.OFFSET_X] = n.dt * middle[k, 0], -n.dt
         step *= decay[:, None]
         predicted = step @ means[k - 1] + constant
         predicted[[kernel.V, kernel.U]] += n.dt * (middle[k, 2] - turn[k]), n.dt * middle[k, 3]
         spread = step @ covariances[k - 1] @ step.T + np.diag(noise[k])
         gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
-        x, p = means[k - 1] + gain @ (x - predicted), covariances[k - 1] + gain @ (p - spread) @ gain.T
+        x, p = (
+            means[k - 1] + gain @ (x - predicted),
+            covariances[k - 1] + gain @ (p - spread) @ gain.T,
+        )
     own = found[:, 0] + n.rear_known * (n.rear - found[:, 1]) * rows[:, 0]
     steady = rows[:, 0] * (n.rear - n.compliance * np.square(rows[:, 1]))
     moving = np.clip(rows[:, 1] / n.minimum_speed - 1.0, 0.0, 1.0)
@@ -311,10 +462,16 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     values = np.column_stack([own, network, steady])
     vy = (shares * values).sum(axis=1)
     variance = found[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
-    return np.column_stack([vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])])
+    return np.column_stack(
+        [vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])]
+    )
 
 
-NUMERIC = [own.name for own in fields(SelfCalibrating.settings_type) if isinstance(own.default, int | float)]
+NUMERIC = [
+    own.name
+    for own in fields(SelfCalibrating.settings_type)
+    if isinstance(own.default, int | float)
+]
 DERIVED = ["dt", "point", "rear", "rear_known", "yaw_rate_max", "without_ax"]
 Numbers: Any = namedtuple("Numbers", NUMERIC + DERIVED)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 

@@ -10,7 +10,13 @@ from vehest.constants import FloatArray
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
-from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetwork, SampleNetworkEstimator, clip_sideslip
+from vehest.estimators.networks.sample_network import (
+    INPUTS,
+    NAMED,
+    SampleNetwork,
+    SampleNetworkEstimator,
+    clip_sideslip,
+)
 from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings
 
@@ -23,12 +29,20 @@ class SideslipFfnn(SampleNetworkEstimator):
     """
 
     name, title = "sideslip_ffnn", "Feed-forward network"
-    trials = (Trial(8, "feed-forward network over single samples; a minute", "estimator.inputs=imu training.phase.max_epochs=100"),)
+    trials = (
+        Trial(
+            8,
+            "feed-forward network over single samples; a minute",
+            "estimator.inputs=imu training.phase.max_epochs=100",
+        ),
+    )
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SampleSettings
     ignores_initial_state = True
     template = "sideslip_ffnn"
-    inputs: Literal["full", "imu"] = setting("full", "full: with the forces of all tyres; imu: without")
+    inputs: Literal["full", "imu"] = setting(
+        "full", "full: with the forces of all tyres; imu: without"
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -48,7 +62,9 @@ class SideslipFfnn(SampleNetworkEstimator):
         """With its inputs."""
         return f"{self.title}{', without tyre forces' if self.inputs == 'imu' else ''}"
 
-    def fit_member(self, data: FitData, training: SampleSettings, context: FitContext, index: int) -> FitRecord:
+    def fit_member(
+        self, data: FitData, training: SampleSettings, context: FitContext, index: int
+    ) -> FitRecord:
         """Train on samples in random order."""
         return self.fit_samples(data, training, squared_error, context, index, [self._seed])
 

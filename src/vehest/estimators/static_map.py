@@ -36,15 +36,26 @@ class StaticMap(Recursive):
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
         """Least squares; raises `DataError`: the car hardly turns, or always at one speed."""
-        yaw_rate, vx, vy = (np.concatenate([recording[name] for recording in recordings]) for name in ("yaw_rate", "vx", "vy_ref"))
+        yaw_rate, vx, vy = (
+            np.concatenate([recording[name] for recording in recordings])
+            for name in ("yaw_rate", "vx", "vy_ref")
+        )
         columns = {"b": yaw_rate, "k": -yaw_rate * np.square(vx)}
         for name in set(columns) - set(self.unknown):
             vy = vy - self.values[name] * columns[name]
         design = np.stack([columns[name] for name in self.unknown], axis=1)
         scale = np.sqrt(np.mean(np.square(design), axis=0))
         if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
-            raise DataError("the training recordings do not determine a static map: the car hardly turns, or always at the same speed")
-        return dict(zip(self.unknown, (np.linalg.lstsq(design / scale, vy, rcond=None)[0] / scale).tolist(), strict=True))
+            raise DataError(
+                "the training recordings do not determine a static map: the car hardly turns, or always at the same speed"
+            )
+        return dict(
+            zip(
+                self.unknown,
+                (np.linalg.lstsq(design / scale, vy, rcond=None)[0] / scale).tolist(),
+                strict=True,
+            )
+        )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """r (b - k u²) [m/s]."""
@@ -53,7 +64,10 @@ class StaticMap(Recursive):
 
     def c_values(self) -> dict[str, Any]:
         """Its two numbers."""
-        return {"about": "Steady cornering of a linear single track, its two numbers by least squares.", **self.values}
+        return {
+            "about": "Steady cornering of a linear single track, its two numbers by least squares.",
+            **self.values,
+        }
 
 
 ESTIMATOR = StaticMap

@@ -8,7 +8,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vehest.declared import setting
-from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
+from vehest.estimators.networks.velocity_recurrent import (
+    TRIAL,
+    RecurrentVelocityEstimator,
+    State,
+    VelocityNetwork,
+)
 
 
 class VelocityGruNetwork(VelocityNetwork):
@@ -42,8 +47,18 @@ class VelocityGru(RecurrentVelocityEstimator):
     name, title = "velocity_gru", "Velocity GRU"
     trials = (TRIAL,)
     network_type = VelocityGruNetwork
-    dropout: float = setting(0.075, "share of the hidden state that is hidden from the read-out in training", least=0.0, below=1.0)
-    negative_slope: float = setting(0.3, "of the leaky rectifier after the read-out; assumed (the default of Keras)", above=0.0, most=1.0)
+    dropout: float = setting(
+        0.075,
+        "share of the hidden state that is hidden from the read-out in training",
+        least=0.0,
+        below=1.0,
+    )
+    negative_slope: float = setting(
+        0.3,
+        "of the leaky rectifier after the read-out; assumed (the default of Keras)",
+        above=0.0,
+        most=1.0,
+    )
 
 
 ESTIMATOR = VelocityGru

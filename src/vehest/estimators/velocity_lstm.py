@@ -8,7 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from vehest.declared import setting
-from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
+from vehest.estimators.networks.velocity_recurrent import (
+    TRIAL,
+    RecurrentVelocityEstimator,
+    State,
+    VelocityNetwork,
+)
 
 
 class VelocityLstmNetwork(VelocityNetwork):
@@ -37,11 +42,21 @@ class VelocityLstmNetwork(VelocityNetwork):
         """Run over the samples."""
         hidden, (last, cell) = self.recurrent(inputs, (state[0], state[1]))
         n_states = self.recurrent.hidden_size
-        driven = nn.functional.linear(hidden if mask is None else hidden * mask, self.dense.weight[:, :n_states], self.dense.bias)
-        by_previous, read_out, bias = self.dense.weight[:, n_states:].t(), self.read_out.weight.t(), self.read_out.bias
+        driven = nn.functional.linear(
+            hidden if mask is None else hidden * mask,
+            self.dense.weight[:, :n_states],
+            self.dense.bias,
+        )
+        by_previous, read_out, bias = (
+            self.dense.weight[:, n_states:].t(),
+            self.read_out.weight.t(),
+            self.read_out.bias,
+        )
         previous, outputs = state[2], []
         for step in driven.unbind(1):
-            previous = torch.addmm(bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out)
+            previous = torch.addmm(
+                bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out
+            )
             outputs.append(previous)
         return torch.stack(outputs, dim=1), (last, cell, previous)
 
@@ -52,7 +67,12 @@ class VelocityLstm(RecurrentVelocityEstimator):
     name, title = "velocity_lstm", "Velocity LSTM"
     trials = (TRIAL,)
     network_type = VelocityLstmNetwork
-    dropout: float = setting(0.075, "share of the hidden state that is hidden from the dense layers in training", least=0.0, below=1.0)
+    dropout: float = setting(
+        0.075,
+        "share of the hidden state that is hidden from the dense layers in training",
+        least=0.0,
+        below=1.0,
+    )
     n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
 
 

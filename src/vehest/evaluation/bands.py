@@ -20,21 +20,39 @@ from vehest.trust.bands import block_labels as manoeuvre_labels
 CONFIDENCE = 0.95
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
 SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
-Banded = tuple[FloatArray, FloatArray]  # errors of all ranges, (N,) [deg] or [m/s], and half widths in the same unit, (N, L), of `LEVELS`
+Banded = tuple[
+    FloatArray, FloatArray
+]  # errors of all ranges, (N,) [deg] or [m/s], and half widths in the same unit, (N, L), of `LEVELS`
 
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     """Errors and bands of ``vy`` [m/s] and ``sideslip`` [deg]; all levels are in proportion to that at 90 %."""
-    turned = np.concatenate([np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi for part in parts])
-    errors = {"vy": np.concatenate([part.vy - part.vy_ref for part in parts]), "sideslip": np.degrees(turned)}
+    turned = np.concatenate(
+        [
+            np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+            for part in parts
+        ]
+    )
+    errors = {
+        "vy": np.concatenate([part.vy - part.vy_ref for part in parts]),
+        "sideslip": np.degrees(turned),
+    }
     shown = {"vy": 1.0, "sideslip": np.degrees(1.0)}
     beside = {"vy": bands.vy.beside(SHOWN_LEVEL), "sideslip": bands.sideslip.beside(SHOWN_LEVEL)}
-    half = {name: shown[name] * np.concatenate([part.bands[name] for part in parts])[:, None] * beside[name] for name in SUFFIXES}
+    half = {
+        name: shown[name]
+        * np.concatenate([part.bands[name] for part in parts])[:, None]
+        * beside[name]
+        for name in SUFFIXES
+    }
     return {name: (errors[name], half[name]) for name in SUFFIXES}
 
 
 def band_figures(
-    own: Mapping[str, Banded], parts: Sequence[Scored], turns: Sequence[FloatArray | None], rate_hz: float
+    own: Mapping[str, Banded],
+    parts: Sequence[Scored],
+    turns: Sequence[FloatArray | None],
+    rate_hz: float,
 ) -> dict[str, float]:
     """Figures of the bands of a test set at ``rate_hz`` [Hz], whose yaw rates ``turns`` [rad/s] are None where not measured.
 
@@ -48,9 +66,14 @@ def band_figures(
         errors, half = own[name]
         shown = half[:, LEVELS.index(SHOWN_LEVEL)]
         inside = np.abs(errors)[:, None] <= half
-        by_block = block_sums(inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels) / np.bincount(labels)
+        by_block = block_sums(
+            inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels
+        ) / np.bincount(labels)
         normalised = np.square(np.divide(errors, shown, out=np.zeros_like(errors), where=shown > 0))
-        found = {f"coverage_{100 * level:.0f}": float(inside[:, k].mean()) for k, level in enumerate(LEVELS)}
+        found = {
+            f"coverage_{100 * level:.0f}": float(inside[:, k].mean())
+            for k, level in enumerate(LEVELS)
+        }
         found |= {
             "coverage_90_p10": float(np.quantile(by_block, 0.1)),
             "coverage_90_p90": float(np.quantile(by_block, 0.9)),
@@ -64,7 +87,9 @@ def band_figures(
     return figures
 
 
-def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float) -> dict[str, tuple[float, float]]:
+def coverage_intervals(
+    own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
+) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
     segments, found = segments_of(parts, rate_hz), {}
     starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
@@ -79,7 +104,9 @@ def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_
     return found
 
 
-def figures_by_regime(own: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
+def figures_by_regime(
+    own: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float
+) -> dict[str, dict[str, float]]:
     """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only those that have 2 s of samples."""
     found: dict[str, dict[str, float]] = {}
     for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
@@ -87,8 +114,15 @@ def figures_by_regime(own: Mapping[str, Banded], masks: Sequence[Mapping[str, Ma
         for name, suffix in SUFFIXES.items():
             errors, half = (values[inside] for values in own[name])
             shown = half[:, LEVELS.index(SHOWN_LEVEL)]
-            values = (np.mean(np.abs(errors) <= shown), 2.0 * shown.mean(), interval_score(errors, shown, SHOWN_LEVEL).mean())
-            found[regime] |= {f"{metric}{suffix}": float(value) for metric, value in zip(IN_REGIMES, values, strict=True)}
+            values = (
+                np.mean(np.abs(errors) <= shown),
+                2.0 * shown.mean(),
+                interval_score(errors, shown, SHOWN_LEVEL).mean(),
+            )
+            found[regime] |= {
+                f"{metric}{suffix}": float(value)
+                for metric, value in zip(IN_REGIMES, values, strict=True)
+            }
     return found
 
 
@@ -118,7 +152,9 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
     Source: Laio & Tamea, Verification tools for probabilistic forecasts of continuous hydrological variables, Hydrology and Earth System
     Sciences 11, 2007, for the integral; Gneiting & Raftery 2007, Section 4.2.
     """
-    orders = np.sort([0.5, *(0.5 - 0.5 * level for level in levels), *(0.5 + 0.5 * level for level in levels)])
+    orders = np.sort(
+        [0.5, *(0.5 - 0.5 * level for level in levels), *(0.5 + 0.5 * level for level in levels)]
+    )
     quantiles = np.concatenate([-half[:, ::-1], np.zeros((len(errors), 1)), half], axis=1)
     shares = np.diff([0.0, *(0.5 * (orders[1:] + orders[:-1])), 1.0])
     missed = -errors[:, None] - quantiles  # reference - quantile, both less the estimate
@@ -140,7 +176,12 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
     Survey Methodology 24 (2), 1998.
     """
     n_blocks, share = len(sizes), float(sums.sum() / sizes.sum())
-    variance = n_blocks / (n_blocks - 1) * float(np.sum(np.square(sums - share * sizes))) / float(sizes.sum()) ** 2
+    variance = (
+        n_blocks
+        / (n_blocks - 1)
+        * float(np.sum(np.square(sums - share * sizes)))
+        / float(sizes.sum()) ** 2
+    )
     independent = float(n_blocks)
     if 0.0 < share < 1.0 and variance > 0.0:
         tail = 0.5 + CONFIDENCE / 2.0

@@ -69,7 +69,10 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
 
 def joined(parts: Sequence[Segments]) -> Segments:
     """Segments of several test sets as of one, whose pieces stay apart."""
-    first, columns = 0.0, {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS}
+    first, columns = (
+        0.0,
+        {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS},
+    )
     for position, part in enumerate(parts):
         columns["piece"][position] = part.piece + first
         first += float(part.piece.max()) + 1.0
@@ -90,7 +93,9 @@ def read_segments(path: Path) -> dict[str, Segments]:
     """Segments of every test set; raises `MissingError` where there is no such file, `DataError` where it is damaged."""
     rows: dict[str, list[list[float]]] = {}
     for row in read_rows(path, ("test_set", *COLUMNS)):
-        rows.setdefault(row["test_set"], []).append([number_in(row, name, path) for name in COLUMNS])
+        rows.setdefault(row["test_set"], []).append(
+            [number_in(row, name, path) for name in COLUMNS]
+        )
     return {name: Segments(*np.array(values).T) for name, values in rows.items()}
 
 
@@ -100,11 +105,15 @@ def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
     if len(pieces) >= LEAST_PIECES:
         return np.asarray(np.searchsorted(pieces, segments.piece), dtype=np.int64)
     runs = [losses[:, segments.piece == piece] for piece in pieces]
-    length = max(math.ceil(politis_white_length([run[row] for run in runs])) for row in range(len(losses)))
+    length = max(
+        math.ceil(politis_white_length([run[row] for run in runs])) for row in range(len(losses))
+    )
     labels, count = np.empty(len(segments), dtype=np.int64), 0
     for piece in pieces:
         own = np.flatnonzero(segments.piece == piece)
-        n_blocks = max(len(own) // length, 1)  # what is left over is shared out, so that no block is a stump
+        n_blocks = max(
+            len(own) // length, 1
+        )  # what is left over is shared out, so that no block is a stump
         labels[own] = count + np.minimum(np.arange(len(own)) * n_blocks // len(own), n_blocks - 1)
         count += n_blocks
     return labels
@@ -128,7 +137,11 @@ def politis_white_length(runs: Sequence[FloatArray]) -> float:
     """
     covariances = _pooled_covariances(runs)
     n = sum(len(run) for run in runs)
-    return _length(covariances, _window(covariances, n), n) if len(covariances) > 1 and covariances[0] > 0 else 1.0
+    return (
+        _length(covariances, _window(covariances, n), n)
+        if len(covariances) > 1 and covariances[0] > 0
+        else 1.0
+    )
 
 
 def _beyond(n: int) -> int:
@@ -143,14 +156,20 @@ def _pooled_covariances(runs: Sequence[FloatArray]) -> FloatArray:
     deviations = [run - mean for run in runs]
     longest = max(min(math.ceil(math.sqrt(n)) + _beyond(n), n - 1), 0)
     return np.array(
-        [sum(float(run[lag:] @ run[: len(run) - lag]) for run in deviations if len(run) > lag) / n for lag in range(longest + 1)]
+        [
+            sum(float(run[lag:] @ run[: len(run) - lag]) for run in deviations if len(run) > lag)
+            / n
+            for lag in range(longest + 1)
+        ]
     )
 
 
 def _window(covariances: FloatArray, n: int) -> int:
     """M, twice the lag after which `_beyond` autocorrelations in a row are insignificant."""
     small = np.abs(covariances[1:] / covariances[0]) < 2.0 * math.sqrt(math.log10(n) / n)
-    settled = [lag for lag in range(len(small) - _beyond(n) + 1) if small[lag : lag + _beyond(n)].all()]
+    settled = [
+        lag for lag in range(len(small) - _beyond(n) + 1) if small[lag : lag + _beyond(n)].all()
+    ]
     longest = len(covariances) - 1
     return min(2 * max(settled[0], 1), longest) if settled else longest
 
@@ -186,12 +205,27 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
     sizes = block_sums(segments.samples, labels)
     summed = {
         name: block_sums(getattr(segments, name), labels)
-        for name in ("squared_error_vy", "squared_error_sideslip", "error_vy", "squared_vy_ref", "vy_ref")
+        for name in (
+            "squared_error_vy",
+            "squared_error_sideslip",
+            "error_vy",
+            "squared_vy_ref",
+            "vy_ref",
+        )
     }
-    vy, sideslip = (root_interval(summed[name][None], sizes) for name in ("squared_error_vy", "squared_error_sideslip"))
+    vy, sideslip = (
+        root_interval(summed[name][None], sizes)
+        for name in ("squared_error_vy", "squared_error_sideslip")
+    )
     found = {"rmse_vy": (vy.low, vy.high), "rmse_sideslip": (sideslip.low, sideslip.high)}
     found["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
     if summed["squared_vy_ref"].sum() > 0:
-        fvu = unexplained_interval(summed["squared_error_vy"], summed["error_vy"], summed["squared_vy_ref"], summed["vy_ref"], sizes)
+        fvu = unexplained_interval(
+            summed["squared_error_vy"],
+            summed["error_vy"],
+            summed["squared_vy_ref"],
+            summed["vy_ref"],
+            sizes,
+        )
         found |= {"fvu": (fvu.low, fvu.high), "r2": (1.0 - fvu.high, 1.0 - fvu.low)}
     return found

@@ -47,7 +47,13 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 
-INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")  # channels that a bound knows what to make of; the first two are needed
+INPUTS = (
+    "vx",
+    "yaw_rate",
+    "ay",
+    "ax",
+    "steer",
+)  # channels that a bound knows what to make of; the first two are needed
 SETS = (
     ("vx", "yaw_rate"),
     ("vx", "yaw_rate", "ay"),
@@ -58,7 +64,9 @@ SETS = (
 )
 """Sets of inputs that reports compare."""
 
-STIFFNESS_DEVIATION = math.log(15.0 / 6.0) / 4.0  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+STIFFNESS_DEVIATION = (
+    math.log(15.0 / 6.0) / 4.0
+)  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
 BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
 LEAST_SAMPLES = 20
@@ -68,7 +76,11 @@ UNIFORM = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
 TINY = 1e-9
 
 _SPEEDS = ("motor_speed", "wheel_speed_")
-_SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")  # thrust and brakes say nothing of v that the speed does not
+_SILENT = (
+    "motor_current",
+    "wheel_torque_",
+    "brake_pressure_",
+)  # thrust and brakes say nothing of v that the speed does not
 
 
 @dataclass(frozen=True)
@@ -84,7 +96,9 @@ class Drive:
     """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,)."""
 
     rate_hz: float  # [Hz]
-    inputs: dict[str, FloatArray]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    inputs: dict[
+        str, FloatArray
+    ]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
     known_start: bool = False  # whether estimators start from the reference at the first sample
@@ -101,9 +115,14 @@ class Drive:
         return Drive(self.rate_hz, own, self.vy_ref[self.first :], 0)
 
 
-def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Drive]:
+def drives_of(
+    spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
+) -> list[Drive]:
     """The ranges or sequences of a test set, as `score_all` counts them."""
-    return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
+    return [
+        drive_of(reference, piece, protocol)
+        for reference, piece in pieces_of(spans, recording_of, protocol)
+    ]
 
 
 def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
@@ -111,7 +130,13 @@ def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
     begin = reference.index_range(span.start - protocol.warm_up_seconds, span.stop)[0]
     first, end = scored_range(reference, span, protocol)
     inputs = {name: filled(reference[name][begin:end]) for name in INPUTS if name in reference}
-    return Drive(reference.rate_hz, inputs, reference["vy_ref"][begin:end], first - begin, protocol.initial_state)
+    return Drive(
+        reference.rate_hz,
+        inputs,
+        reference["vy_ref"][begin:end],
+        first - begin,
+        protocol.initial_state,
+    )
 
 
 def inputs_of(channels: Collection[str]) -> frozenset[str] | None:
@@ -153,9 +178,15 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
         if len(drive.vy_ref) < 4:
             continue
         own = drive.inputs
-        parts = ([own["ay"]] if "ay" in both else []) + ([own["vx"] * own["yaw_rate"]] if "yaw_rate" in both else [])
+        parts = ([own["ay"]] if "ay" in both else []) + (
+            [own["vx"] * own["yaw_rate"]] if "yaw_rate" in both else []
+        )
         third.append(np.diff(drive.vy_ref, 3))
-        explained.append(np.stack([np.diff(_middle(part), 2) for part in parts], 1) if parts else np.empty((len(third[-1]), 0)))
+        explained.append(
+            np.stack([np.diff(_middle(part), 2) for part in parts], 1)
+            if parts
+            else np.empty((len(third[-1]), 0))
+        )
         longest += len(third[-1])
     if longest < LEAST_SAMPLES:
         return None
@@ -163,7 +194,9 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
     if known.shape[1]:
         rest = rest - known @ np.linalg.lstsq(known, rest, rcond=None)[0]
     velocity, speed = _joined(drives)
-    level = max(_robust_deviation(rest) / math.sqrt(20.0), quantisation_step(velocity) / math.sqrt(12.0))
+    level = max(
+        _robust_deviation(rest) / math.sqrt(20.0), quantisation_step(velocity) / math.sqrt(12.0)
+    )
     return Floor(level, _rms([_sideslip_deviation(np.full_like(velocity, level), velocity, speed)]))
 
 
@@ -195,7 +228,9 @@ def _robust_deviation(samples: FloatArray) -> float:
 class Noise(NamedTuple):
     """A disturbance in two parts."""
 
-    density: float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    density: (
+        float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    )
     deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
     time_constant: float  # of the slow part [s]
 
@@ -220,7 +255,9 @@ class _Levels:
     front: Axle | None
 
 
-def cramer_rao_floor(drives: Sequence[Drive], inputs: Collection[str], *, car: bool = True) -> Floor | None:
+def cramer_rao_floor(
+    drives: Sequence[Drive], inputs: Collection[str], *, car: bool = True
+) -> Floor | None:
     """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored samples.
 
     Args:
@@ -234,12 +271,19 @@ def cramer_rao_floor(drives: Sequence[Drive], inputs: Collection[str], *, car: b
         ValueError: vx or yaw_rate is not among the inputs, or one of them is none of `INPUTS`.
     """
     if not {"vx", "yaw_rate"} <= set(inputs) <= set(INPUTS):
-        raise ValueError(f"inputs of a bound are vx, yaw_rate and some of {', '.join(INPUTS[2:])}, not {', '.join(sorted(inputs))}")
-    if not all(set(inputs) <= set(drive.inputs) for drive in drives) or sum(len(drive.scored.vy_ref) for drive in drives) < LEAST_SAMPLES:
+        raise ValueError(
+            f"inputs of a bound are vx, yaw_rate and some of {', '.join(INPUTS[2:])}, not {', '.join(sorted(inputs))}"
+        )
+    if (
+        not all(set(inputs) <= set(drive.inputs) for drive in drives)
+        or sum(len(drive.scored.vy_ref) for drive in drives) < LEAST_SAMPLES
+    ):
         return None
     levels = _levels(drives, set(inputs), car)
     velocity, speed = _joined(drives)
-    deviation = np.concatenate([_deviation_along(drive, set(inputs), levels)[drive.first :] for drive in drives])
+    deviation = np.concatenate(
+        [_deviation_along(drive, set(inputs), levels)[drive.first :] for drive in drives]
+    )
     return Floor(_rms([deviation]), _rms([_sideslip_deviation(deviation, velocity, speed)]))
 
 
@@ -253,7 +297,14 @@ def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatA
     Source: Tichavský, Muravchik & Nehorai 1998, whose recursion is then the Riccati recursion of the Kalman filter.
     """
     steps, m, n = model.observation.shape
-    zero = LinearModel(model.transition, np.zeros(n), model.process_noise, model.observation, np.zeros(m), model.observation_noise)
+    zero = LinearModel(
+        model.transition,
+        np.zeros(n),
+        model.process_noise,
+        model.observation,
+        np.zeros(m),
+        model.observation_noise,
+    )
     return kalman_scan(zero, np.zeros((steps, m)), Gaussian(np.zeros(n), prior)).filtered.covariance
 
 
@@ -269,12 +320,18 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
         rate_hz: sampling rate [Hz].
     """
     block = max(round(BLOCK_SECONDS * rate_hz), 1)
-    means = [samples[: len(samples) // block * block].reshape(-1, block).mean(1) for samples in series]
-    products = [[own[lag:] * own[: len(own) - lag] for own in means if len(own) > lag] for lag in range(3)]
+    means = [
+        samples[: len(samples) // block * block].reshape(-1, block).mean(1) for samples in series
+    ]
+    products = [
+        [own[lag:] * own[: len(own) - lag] for own in means if len(own) > lag] for lag in range(3)
+    ]
     lags = [float(np.concatenate(own).mean()) if own else 0.0 for own in products]
     variance = _rms(series) ** 2
     if not min(lags[:2]) > 0:
-        return Noise(min(max(lags[0], 0.0) * BLOCK_SECONDS, variance / rate_hz), 0.0, SLOW_SECONDS[0])
+        return Noise(
+            min(max(lags[0], 0.0) * BLOCK_SECONDS, variance / rate_hz), 0.0, SLOW_SECONDS[0]
+        )
     low, high = (math.exp(-BLOCK_SECONDS / time) for time in SLOW_SECONDS)
     ratio = min(max(lags[2] / lags[1], low), high)
     x = -math.log(ratio)
@@ -291,7 +348,9 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     total = np.zeros(longest)
     for samples in series:
         spectrum = np.fft.rfft(samples, 2 * len(samples))
-        total[: len(samples)] += np.fft.irfft(np.square(np.abs(spectrum)), 2 * len(samples))[: len(samples)]
+        total[: len(samples)] += np.fft.irfft(np.square(np.abs(spectrum)), 2 * len(samples))[
+            : len(samples)
+        ]
     below = np.flatnonzero(total < total[0] / math.e)
     lags = int(below[0]) if len(below) else longest
     return Noise(0.0, max(deviation, TINY), max(lags, 1) / rate_hz)
@@ -301,10 +360,24 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
     parts, rate = [drive.scored for drive in drives], drives[0].rate_hz
     lateral = longitudinal = rear = front = None
     if "ay" in inputs:
-        left = [(own.vy_ref, own.inputs["ay"] - own.inputs["vx"] * own.inputs["yaw_rate"], own.inputs["ay"]) for own in parts]
+        left = [
+            (
+                own.vy_ref,
+                own.inputs["ay"] - own.inputs["vx"] * own.inputs["yaw_rate"],
+                own.inputs["ay"],
+            )
+            for own in parts
+        ]
         lateral = split_noise(_unexplained(left, rate), rate)
     if "ax" in inputs:
-        left = [(own.inputs["vx"], own.inputs["ax"] + own.vy_ref * own.inputs["yaw_rate"], own.inputs["ax"]) for own in parts]
+        left = [
+            (
+                own.inputs["vx"],
+                own.inputs["ax"] + own.vy_ref * own.inputs["yaw_rate"],
+                own.inputs["ax"],
+            )
+            for own in parts
+        ]
         longitudinal = split_noise(_unexplained(left, rate), rate)
     if car:
         rear = _fitted_axle(parts, inputs, False)
@@ -321,18 +394,29 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
     )
 
 
-def _unexplained(series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float) -> list[FloatArray]:
+def _unexplained(
+    series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float
+) -> list[FloatArray]:
     """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out."""
     left = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
     sensor = [_middle(own) for *_, own in series]
     power = sum(float(own @ own) for own in sensor)
-    scale = sum(float(own @ other) for own, other in zip(left, sensor, strict=True)) / power if power > 0 else 0.0
+    scale = (
+        sum(float(own @ other) for own, other in zip(left, sensor, strict=True)) / power
+        if power > 0
+        else 0.0
+    )
     return [own - scale * other for own, other in zip(left, sensor, strict=True)]
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
-    columns = [_axle_columns(own, inputs, front) for own in parts]  # slip and arm make up v, or v - δ u
-    targets = [own.vy_ref - own.inputs["steer"] * own.inputs["vx"] if front else own.vy_ref for own in parts]
+    columns = [
+        _axle_columns(own, inputs, front) for own in parts
+    ]  # slip and arm make up v, or v - δ u
+    targets = [
+        own.vy_ref - own.inputs["steer"] * own.inputs["vx"] if front else own.vy_ref
+        for own in parts
+    ]
     coefficients = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
     left = [target - known @ coefficients for target, known in zip(targets, columns, strict=True)]
     return Axle(coefficients, split_noise(left, parts[0].rate_hz))
@@ -360,7 +444,9 @@ def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatAr
     return deviation
 
 
-def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearModel[FloatArray], FloatArray]:
+def _model_of(
+    drive: Drive, inputs: set[str], levels: _Levels
+) -> tuple[LinearModel[FloatArray], FloatArray]:
     """The model of the module's docstring in steps, and the prior covariance of its state, v first.
 
     The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ: given z, with the gain K = q/(q + r),
@@ -369,7 +455,9 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
     steps, step = len(drive.vy_ref), drive.step
     transition: dict[tuple[int, int], FloatArray | float] = {}
     noises, priors = list[float](), list[float]()
-    measured: list[tuple[dict[int, FloatArray | float], float]] = []  # combinations of states, and the variance of each
+    measured: list[
+        tuple[dict[int, FloatArray | float], float]
+    ] = []  # combinations of states, and the variance of each
 
     def state(decay: float, noise: float, prior: float) -> int:
         """Add x⁺ = decay x + w; returns its index."""
@@ -380,7 +468,9 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
         return index
 
     decay, noise = _in_steps(levels.velocity, step)
-    v = state(decay, noise, levels.reference**2 if drive.known_start else levels.velocity.deviation**2)
+    v = state(
+        decay, noise, levels.reference**2 if drive.known_start else levels.velocity.deviation**2
+    )
     if levels.lateral is not None:
         white = levels.lateral.density * step + TINY**2
         gain = noise / (noise + white)
@@ -398,7 +488,11 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
             error = state(*_in_steps(axle.error, step), axle.error.deviation**2)
             stiffness = state(1.0, 0.0, STIFFNESS_DEVIATION**2)
             slip = _axle_columns(drive, inputs, front)[:, 1:4] @ axle.coefficients[1:4]
-            white = axle.error.density / step + levels.reference**2 + (LEAST_WHITE * axle.error.deviation) ** 2
+            white = (
+                axle.error.density / step
+                + levels.reference**2
+                + (LEAST_WHITE * axle.error.deviation) ** 2
+            )
             measured.append(({v: 1.0, error: -1.0, stiffness: -slip}, white))
     n, m = len(noises), max(len(measured), 1)
     A, C = np.zeros((steps, n, n)), np.zeros((steps, m, n))
@@ -426,14 +520,18 @@ def _middle(samples: FloatArray) -> FloatArray:
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
     parts = [drive.scored for drive in drives]
-    return np.concatenate([own.vy_ref for own in parts]), np.concatenate([own.inputs["vx"] for own in parts])
+    return np.concatenate([own.vy_ref for own in parts]), np.concatenate(
+        [own.inputs["vx"] for own in parts]
+    )
 
 
 def _rms(series: Sequence[FloatArray]) -> float:
     return float(np.sqrt(np.mean(np.square(np.concatenate(series)))))
 
 
-def _sideslip_deviation(deviation: FloatArray, velocity: FloatArray, speed: FloatArray) -> FloatArray:
+def _sideslip_deviation(
+    deviation: FloatArray, velocity: FloatArray, speed: FloatArray
+) -> FloatArray:
     """Standard deviation of atan2(v, u) [deg] to first order, (K,)."""
     slope = np.abs(speed) / np.maximum(np.square(speed) + np.square(velocity), TINY)
     return np.minimum(np.degrees(deviation * slope), UNIFORM)

@@ -21,7 +21,9 @@ LONGEST = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 
-def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
+def lever_arm_figures(
+    parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol
+) -> dict[str, float]:
     """Errors of a test set whose references were all measured at unknown points, with the lever arm x that leaves the least.
 
     It minimises the mean of (v̂ - v - x·r)² within `LONGEST`: Σ(v̂ - v)r / Σr².
@@ -34,7 +36,11 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
     for reference, span in pieces:
         turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
         derived = reference.provenance.get("derived")  # from the data set's declaration
-        if turning is None or not isinstance(derived, dict) or derived.get("reference_point") != "unknown":
+        if (
+            turning is None
+            or not isinstance(derived, dict)
+            or derived.get("reference_point") != "unknown"
+        ):
             return {}
         first, end = scored_range(reference, span, protocol)
         yaw_rates.append(reference[turning][first:end])
@@ -43,7 +49,10 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
             return {}
     if not yaw_rates:
         return {}
-    error, turns = np.concatenate([part.vy - part.vy_ref for part in parts]), np.concatenate(yaw_rates)
+    error, turns = (
+        np.concatenate([part.vy - part.vy_ref for part in parts]),
+        np.concatenate(yaw_rates),
+    )
     power = float(turns @ turns)
     x = float(np.clip(error @ turns / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
     moved = []

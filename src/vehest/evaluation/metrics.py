@@ -17,19 +17,44 @@ from vehest.data.splits import Span
 
 NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
 
-REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}  # quantity of an estimate -> channel that it is measured against
+REFERENCES = {
+    "vx": "vx_ref",
+    "vy": "vy_ref",
+    "yaw_rate": "yaw_rate_ref",
+}  # quantity of an estimate -> channel that it is measured against
 
-COVERAGE = {1: 0.6827, 2: 0.9545}  # number of standard deviations -> fraction of Gaussian errors within them
+COVERAGE = {
+    1: 0.6827,
+    2: 0.9545,
+}  # number of standard deviations -> fraction of Gaussian errors within them
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
 
 _NAMES = {
     "1": (
-        *("fvu", "r2", "mse_weighted", "mae_weighted", "ae99_weighted", "nees", "nis", "coverage_1sigma", "coverage_2sigma", "share"),
+        *(
+            "fvu",
+            "r2",
+            "mse_weighted",
+            "mae_weighted",
+            "ae99_weighted",
+            "nees",
+            "nis",
+            "coverage_1sigma",
+            "coverage_2sigma",
+            "share",
+        ),
         *("n_sequences", "n_parameters", "epochs"),
     ),
-    "deg": ("rmse_sideslip", "max_error_sideslip", "max_error_sideslip_nonlinear", "p99_sideslip", "floor_reference", "floor_cramer_rao"),
+    "deg": (
+        "rmse_sideslip",
+        "max_error_sideslip",
+        "max_error_sideslip_nonlinear",
+        "p99_sideslip",
+        "floor_reference",
+        "floor_cramer_rao",
+    ),
     "deg²": ("mse_sideslip", "mse_sideslip_nonlinear"),
     "m/s": ("rmse_vy", "rmse_vx", "floor_reference_vy", "floor_cramer_rao_vy"),
     "rad/s": ("rmse_yaw_rate",),
@@ -37,7 +62,16 @@ _NAMES = {
     "s": ("train_seconds", "step_seconds"),
 }
 _OF_BANDS = {
-    "1": ("coverage_50", "coverage_68", "coverage_90", "coverage_95", "coverage_90_p10", "coverage_90_p90", "error_icc", "band_blocks"),
+    "1": (
+        "coverage_50",
+        "coverage_68",
+        "coverage_90",
+        "coverage_95",
+        "coverage_90_p10",
+        "coverage_90_p90",
+        "error_icc",
+        "band_blocks",
+    ),
     "{}": ("width_90", "interval_score", "crps"),  # in the unit of the quantity
 }
 UNITS: dict[str, str] = {name: unit for unit, names in _NAMES.items() for name in names}
@@ -54,12 +88,16 @@ class Protocol:
     """What is scored, and when."""
 
     rate_hz: float = 20.0  # at which every estimate is read, whatever rate it was made at [Hz]; held, never interpolated
-    warm_up_seconds: float = 10.0  # how long before a range, or before each sequence, an estimator may start [s]
+    warm_up_seconds: float = (
+        10.0  # how long before a range, or before each sequence, an estimator may start [s]
+    )
     skip_seconds: float = 1.5  # start of each range, or of each sequence, that is not scored [s]
     # ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate starts anew; a
     # remainder is left out [s]; None leaves ranges whole
     sequence_seconds: float | None = None
-    initial_state: bool = False  # whether estimates start at the reference state of the first sample
+    initial_state: bool = (
+        False  # whether estimates start at the reference state of the first sample
+    )
     # test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by their
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
@@ -68,7 +106,9 @@ class Protocol:
     @property
     def plain(self) -> dict[str, Any]:
         """For a key; without a least speed it is that of a protocol that knows none."""
-        return {name: value for name, value in asdict(self).items() if name != "least_speed" or value}
+        return {
+            name: value for name, value in asdict(self).items() if name != "least_speed" or value
+        }
 
     @property
     def sets_elsewhere(self) -> frozenset[str]:
@@ -109,9 +149,13 @@ class Scored:
     ay: FloatArray  # measured lateral acceleration [m/s²]; NaN where the recording has none
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    covariance: FloatArray | None = None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    covariance: FloatArray | None = (
+        None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    )
     covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
-    nis: FloatArray | None = None  # normalised innovation squared of the filter's update, where the method gives it
+    nis: FloatArray | None = (
+        None  # normalised innovation squared of the filter's update, where the method gives it
+    )
     nis_dof: FloatArray | None = None  # numbers measured at each update
     # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one
     bands: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -123,7 +167,9 @@ class Scored:
         return {name: pairs[name][0] - pairs[name][1] for name in REFERENCES if name in pairs}
 
 
-def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Span]:
+def sequences(
+    spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
+) -> list[Span]:
     """The stretches that estimates are made of: the ranges, or the sequences that they are cut into; `DataError` if all are too short."""
     if protocol.sequence_seconds is None:
         return list(spans)
@@ -133,7 +179,9 @@ def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
         recording = recording_of(span)
         first, end = recording.index_range(span.start, span.stop)
         for begin in range(first, end - steps + 1, steps):
-            start, stop = (recording.start_time + index / recording.rate_hz for index in (begin, begin + steps))
+            start, stop = (
+                recording.start_time + index / recording.rate_hz for index in (begin, begin + steps)
+            )
             pieces.append(Span(span.dataset, span.recording, start, stop))
     if not pieces:
         raise DataError(
@@ -158,7 +206,10 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
 
 
 def score_all(
-    estimate_of: Callable[[int], Estimate], spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
+    estimate_of: Callable[[int], Estimate],
+    spans: Sequence[Span],
+    recording_of: Callable[[Span], Recording],
+    protocol: Protocol,
 ) -> list[Scored]:
     """Score a test set's estimates by place in its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``; raises `DataError`."""
     return [
@@ -167,9 +218,13 @@ def score_all(
     ]
 
 
-def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> Iterator[tuple[Recording, Span]]:
+def pieces_of(
+    spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
+) -> Iterator[tuple[Recording, Span]]:
     """Each range or sequence of a test set with the whole recording that it lies in, one in memory at a time; raises `DataError`."""
-    read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
+    read = lru_cache(maxsize=1)(
+        lambda dataset, recording: recording_of(Span(dataset, recording))
+    )  # a range's sequences stand together
 
     def cached(span: Span) -> Recording:
         return read(span.dataset, span.recording)
@@ -180,7 +235,9 @@ def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
 
 def scored_range(reference: Recording, span: Span, protocol: Protocol) -> tuple[int, int]:
     """First index and end index of the samples of a recording that are scored in a range."""
-    return reference.index_range(max(span.start, reference.start_time) + protocol.skip_seconds, span.stop)
+    return reference.index_range(
+        max(span.start, reference.start_time) + protocol.skip_seconds, span.stop
+    )
 
 
 def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protocol) -> Scored:
@@ -198,21 +255,41 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     scored = reference.cut(start, span.stop)
     for name in ("vx", "vy_ref", *(["ay"] if "ay" in scored else [])):
         if np.isnan(scored[name]).any():
-            raise DataError(f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without")
+            raise DataError(
+                f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without"
+            )
 
     def held(name: str) -> FloatArray:
         values = estimate.held_at(scored.time, name)
-        _require_all(values, f"estimator '{estimate.estimator}' has no estimate{'' if name == 'vy' else f' of {name}'}", span)
+        _require_all(
+            values,
+            f"estimator '{estimate.estimator}' has no estimate{'' if name == 'vy' else f' of {name}'}",
+            span,
+        )
         return values
 
     vy, standing = held("vy"), np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
-    measured = {name: scored[own] for name, own in REFERENCES.items() if own in scored and name in estimate.channels and name != "vy"}
+    measured = {
+        name: scored[own]
+        for name, own in REFERENCES.items()
+        if own in scored and name in estimate.channels and name != "vy"
+    }
     others = {name: (held(name), own) for name, own in measured.items() if not np.isnan(own).any()}
-    covariance_of = tuple(name for name in REFERENCES if name in estimate.covariance_of and (name == "vy" or name in others))
+    covariance_of = tuple(
+        name
+        for name in REFERENCES
+        if name in estimate.covariance_of and (name == "vy" or name in others)
+    )
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
     if covariance is not None:
-        _require_all(covariance.sum(axis=(1, 2)), f"estimator '{estimate.estimator}' has no covariance", span)
-    bands = {name: held(f"band_{name}") for name in ("vy", "sideslip") if f"band_{name}" in estimate.channels}
+        _require_all(
+            covariance.sum(axis=(1, 2)), f"estimator '{estimate.estimator}' has no covariance", span
+        )
+    bands = {
+        name: held(f"band_{name}")
+        for name in ("vy", "sideslip")
+        if f"band_{name}" in estimate.channels
+    }
     innovations = "nis" in estimate.channels and "nis_dof" in estimate.channels
     return Scored(
         time=scored.time,
@@ -252,7 +329,9 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """
     vy = np.concatenate([part.vy for part in parts])
     vy_ref = np.concatenate([part.vy_ref for part in parts])
-    error = np.degrees(np.concatenate([_turned(part.sideslip - part.sideslip_ref) for part in parts]))
+    error = np.degrees(
+        np.concatenate([_turned(part.sideslip - part.sideslip_ref) for part in parts])
+    )
     nonlinear = np.abs(np.concatenate([part.ay for part in parts])) >= NONLINEAR_AY
     variance = float(np.var(vy_ref))
     fvu = float(np.var(vy_ref - vy)) / variance if variance > 0 else float("nan")
@@ -262,9 +341,13 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         "r2": 1.0 - fvu,
         "rmse_sideslip": float(np.sqrt(np.mean(np.square(error)))),
         "mse_sideslip": float(np.mean(np.square(error))),
-        "mse_sideslip_nonlinear": float(np.mean(np.square(error[nonlinear]))) if nonlinear.any() else float("nan"),
+        "mse_sideslip_nonlinear": float(np.mean(np.square(error[nonlinear])))
+        if nonlinear.any()
+        else float("nan"),
         "max_error_sideslip": float(np.abs(error).max()),
-        "max_error_sideslip_nonlinear": float(np.abs(error[nonlinear]).max()) if nonlinear.any() else float("nan"),
+        "max_error_sideslip_nonlinear": float(np.abs(error[nonlinear]).max())
+        if nonlinear.any()
+        else float("nan"),
         "p99_sideslip": float(np.quantile(np.abs(error), 0.99)),
         **_state_accuracy(parts),
         **_consistency(parts),
@@ -276,22 +359,33 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
     errors = part.errors
     missing = [name for name in WEIGHTS if name not in errors]
     if missing:
-        raise DataError(f"weighted errors need estimate and reference of {', '.join(WEIGHTS)}; there is none of {', '.join(missing)}")
-    total: FloatArray = np.sum([weight * size(errors[name]) for name, weight in WEIGHTS.items()], axis=0)
+        raise DataError(
+            f"weighted errors need estimate and reference of {', '.join(WEIGHTS)}; there is none of {', '.join(missing)}"
+        )
+    total: FloatArray = np.sum(
+        [weight * size(errors[name]) for name, weight in WEIGHTS.items()], axis=0
+    )
     return total
 
 
 def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     common = set.intersection(*(set(part.errors) for part in parts))
     figures = {
-        f"rmse_{name}": float(np.sqrt(np.mean(np.square(np.concatenate([part.errors[name] for part in parts])))))
+        f"rmse_{name}": float(
+            np.sqrt(np.mean(np.square(np.concatenate([part.errors[name] for part in parts]))))
+        )
         for name in REFERENCES
         if name in common and name != "vy"
     }
     if common >= set(WEIGHTS):
         absolute = np.concatenate([weighted_errors(part, np.abs) for part in parts])
-        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_errors(part, np.square) for part in parts])))
-        figures |= {"mae_weighted": float(absolute.mean()), "ae99_weighted": float(np.quantile(absolute, 0.99))}
+        figures["mse_weighted"] = float(
+            np.mean(np.concatenate([weighted_errors(part, np.square) for part in parts]))
+        )
+        figures |= {
+            "mae_weighted": float(absolute.mean()),
+            "ae99_weighted": float(np.quantile(absolute, 0.99)),
+        }
     return figures
 
 
@@ -299,13 +393,23 @@ def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
     figures = {}
     kinds = {part.covariance_of for part in parts}
     if len(kinds) == 1 and "vy" in (names := kinds.pop()):
-        errors = np.concatenate([np.stack([part.errors[name] for name in names], axis=1) for part in parts])
-        covariance = np.concatenate([part.covariance for part in parts if part.covariance is not None])
+        errors = np.concatenate(
+            [np.stack([part.errors[name] for name in names], axis=1) for part in parts]
+        )
+        covariance = np.concatenate(
+            [part.covariance for part in parts if part.covariance is not None]
+        )
         row = names.index("vy")
         figures["nees"] = float(np.mean(normalised_error_squared(errors, covariance)))
         for n_sigma in (1, 2):
-            figures[f"coverage_{n_sigma}sigma"] = coverage(errors[:, row], covariance[:, row, row], n_sigma)
-    innovations = [(part.nis, part.nis_dof) for part in parts if part.nis is not None and part.nis_dof is not None]
+            figures[f"coverage_{n_sigma}sigma"] = coverage(
+                errors[:, row], covariance[:, row, row], n_sigma
+            )
+    innovations = [
+        (part.nis, part.nis_dof)
+        for part in parts
+        if part.nis is not None and part.nis_dof is not None
+    ]
     if len(innovations) == len(parts):
         nis, dof = (np.concatenate(columns) for columns in zip(*innovations, strict=True))
         figures["nis"] = normalised_innovation_squared(nis, dof)
@@ -330,7 +434,9 @@ def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> Floa
     proper = np.all(variances > 0, axis=1)
     deviations = np.sqrt(np.where(proper[:, None], variances, 1.0))
     correlation = covariance / (deviations[:, :, None] * deviations[:, None, :])
-    eigenvalues, vectors = np.linalg.eigh(np.where(proper[:, None, None], correlation, np.eye(errors.shape[1])))
+    eigenvalues, vectors = np.linalg.eigh(
+        np.where(proper[:, None, None], correlation, np.eye(errors.shape[1]))
+    )
     definite = proper & np.all(eigenvalues > 0, axis=1)
     whitened = np.einsum("kij,ki->kj", vectors, errors / deviations)
     squared = np.sum(np.square(whitened) / np.where(definite[:, None], eigenvalues, 1.0), axis=1)

@@ -10,7 +10,13 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums
-from vehest.evaluation.significance import CONFIDENCE, Pair, differences_of_blocks, holm, root_intervals
+from vehest.evaluation.significance import (
+    CONFIDENCE,
+    Pair,
+    differences_of_blocks,
+    holm,
+    root_intervals,
+)
 from vehest.trust.bands import effective_blocks
 
 Name = tuple[str, str]  # estimator and variant
@@ -32,7 +38,13 @@ class Comparison:
     @property
     def turned(self) -> Comparison:
         """The second less the first."""
-        verdict: Verdict = "higher" if self.verdict == "lower" else "lower" if self.verdict == "higher" else self.verdict
+        verdict: Verdict = (
+            "higher"
+            if self.verdict == "lower"
+            else "lower"
+            if self.verdict == "higher"
+            else self.verdict
+        )
         return Comparison(-self.difference, -self.high, -self.low, self.p_value, verdict)
 
 
@@ -43,7 +55,9 @@ class Ranking:
     order: Sequence[Name]  # by RMSE over all seeds, the lowest first
     rmse: Mapping[Name, float]  # over all seeds of each
     intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
-    pairs: Mapping[tuple[Name, Name], Comparison]  # (first, second) -> comparison, of every pair that was compared, either way round
+    pairs: Mapping[
+        tuple[Name, Name], Comparison
+    ]  # (first, second) -> comparison, of every pair that was compared, either way round
     n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
     block_seconds: float  # mean length of a block [s]
     effective_blocks: float  # how many equal blocks the best one's squared error is spread over
@@ -51,11 +65,19 @@ class Ranking:
     @property
     def missing_baselines(self) -> list[str]:
         """Those of `BASELINES` that were not compared."""
-        return [baseline for baseline in BASELINES if not any(name[0] == baseline for name in self.order)]
+        return [
+            baseline
+            for baseline in BASELINES
+            if not any(name[0] == baseline for name in self.order)
+        ]
 
     def beats(self, name: Name, baseline: str) -> bool | None:
         """Whether a candidate's RMSE lies below a baseline's; None where that is not told apart or was not compared."""
-        found = [own for (candidate, other), own in self.pairs.items() if candidate == name and other[0] == baseline]
+        found = [
+            own
+            for (candidate, other), own in self.pairs.items()
+            if candidate == name and other[0] == baseline
+        ]
         if not found or found[0].verdict == "not told apart":
             return None
         return found[0].verdict == "lower"
@@ -63,10 +85,21 @@ class Ranking:
     @property
     def winner(self) -> Name | None:
         """The one that may be called best: below every other candidate, `zero` and `static_map`, each by more than chance."""
-        if self.n_blocks < LEAST_BLOCKS or not self.order or self.missing_baselines or self.order[0][0] in BASELINES:
+        if (
+            self.n_blocks < LEAST_BLOCKS
+            or not self.order
+            or self.missing_baselines
+            or self.order[0][0] in BASELINES
+        ):
             return None
-        beaten = all(self.pairs[self.order[0], other].verdict == "lower" for other in self.order[1:])
-        return self.order[0] if beaten and all(self.beats(self.order[0], baseline) for baseline in BASELINES) else None
+        beaten = all(
+            self.pairs[self.order[0], other].verdict == "lower" for other in self.order[1:]
+        )
+        return (
+            self.order[0]
+            if beaten and all(self.beats(self.order[0], baseline) for baseline in BASELINES)
+            else None
+        )
 
     @property
     def not_told_apart(self) -> list[Name]:
@@ -75,7 +108,11 @@ class Ranking:
         return [name for name, own in others if own is not None and own.verdict == "not told apart"]
 
 
-def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
+def rank(
+    segments: Mapping[Name, Sequence[Segments]],
+    rate_hz: float,
+    asked: Sequence[tuple[Name, Name]] = (),
+) -> Ranking:
     """Compare estimators on one test set by RMSE(β).
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`differences_of_blocks`).
@@ -86,22 +123,39 @@ def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Seq
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]
-    losses = {name: np.stack([own.squared_error_sideslip for own in seeds]) for name, seeds in segments.items()}
+    losses = {
+        name: np.stack([own.squared_error_sideslip for own in seeds])
+        for name, seeds in segments.items()
+    }
     per_sample = np.concatenate([own / first.samples for own in losses.values()])
     labels = block_labels(first, per_sample)
     sizes = block_sums(first.samples, labels)
     sums = {name: block_sums(own, labels) for name, own in losses.items()}
-    rmse = {name: float(np.sqrt(own.sum(axis=1).mean() / sizes.sum())) for name, own in sums.items()}
+    rmse = {
+        name: float(np.sqrt(own.sum(axis=1).mean() / sizes.sum())) for name, own in sums.items()
+    }
     order = sorted(rmse, key=lambda name: rmse[name])
     enough = len(sizes) >= LEAST_BLOCKS
     pairs = _pairs(order, asked) if enough else []
-    compared = dict(zip(pairs, _corrected([(sums[one], sums[other]) for one, other in pairs], sizes), strict=True))
+    compared = dict(
+        zip(
+            pairs,
+            _corrected([(sums[one], sums[other]) for one, other in pairs], sizes),
+            strict=True,
+        )
+    )
     intervals = root_intervals([sums[name] for name in order], sizes) if enough else []
     return Ranking(
         order=order,
         rmse=rmse,
-        intervals={name: (own.low, own.high) for name, own in zip(order, intervals, strict=True)} if enough else {},
-        pairs={key: own for (one, other), found in compared.items() for key, own in (((one, other), found), ((other, one), found.turned))},
+        intervals={name: (own.low, own.high) for name, own in zip(order, intervals, strict=True)}
+        if enough
+        else {},
+        pairs={
+            key: own
+            for (one, other), found in compared.items()
+            for key, own in (((one, other), found), ((other, one), found.turned))
+        },
         n_blocks=len(sizes),
         block_seconds=float(sizes.mean()) / rate_hz,
         effective_blocks=effective_blocks(sums[order[0]].mean(axis=0)),
@@ -111,7 +165,12 @@ def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Seq
 def _pairs(order: Sequence[Name], asked: Sequence[tuple[Name, Name]]) -> list[tuple[Name, Name]]:
     """The best with every other, every candidate with every baseline, and those asked for; each pair once."""
     pairs = [(order[0], other) for other in order[1:]]
-    pairs += [(name, other) for name in order for other in order if other[0] in BASELINES and name[0] not in BASELINES]
+    pairs += [
+        (name, other)
+        for name in order
+        for other in order
+        if other[0] in BASELINES and name[0] not in BASELINES
+    ]
     for one, other in asked:
         if one in order and other in order and (other, one) not in pairs:
             pairs.append((one, other))
@@ -126,6 +185,10 @@ def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
     for own, p_value in zip(differences, adjusted, strict=True):
         factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(pairs))
         low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
-        verdict: Verdict = "not told apart" if p_value >= 1.0 - CONFIDENCE else ("lower" if own.value < 0 else "higher")
+        verdict: Verdict = (
+            "not told apart"
+            if p_value >= 1.0 - CONFIDENCE
+            else ("lower" if own.value < 0 else "higher")
+        )
         comparisons.append(Comparison(own.value, low, high, p_value, verdict))
     return comparisons

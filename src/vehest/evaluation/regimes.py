@@ -35,7 +35,10 @@ LEAST_SECONDS = 2.0  # of samples in a regime, below which it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")
 _OF_SAMPLES = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")
 
-AY_BANDS = {f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high) for low, high in itertools.pairwise(AY_EDGES)}
+AY_BANDS = {
+    f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high)
+    for low, high in itertools.pairwise(AY_EDGES)
+}
 """Name of a band of lateral acceleration, ``ay_2_4`` or ``ay_6_`` without upper end -> its ends [m/s²]."""
 
 REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
@@ -58,9 +61,15 @@ def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str
         found["straight"] = size["yaw_rate"] < STRAIGHT_YAW_RATE
         found["turning"] = size["yaw_rate"] >= STRAIGHT_YAW_RATE
     if "ay" in size:
-        found |= {name: (size["ay"] >= low) & (size["ay"] < high) for name, (low, high) in AY_BANDS.items()}
+        found |= {
+            name: (size["ay"] >= low) & (size["ay"] < high)
+            for name, (low, high) in AY_BANDS.items()
+        }
     if own:
-        fast = [np.abs(slope(samples, reference.rate_hz)[inside]) > TRANSIENT[name] for name, samples in own.items()]
+        fast = [
+            np.abs(slope(samples, reference.rate_hz)[inside]) > TRANSIENT[name]
+            for name, samples in own.items()
+        ]
         transient = np.logical_or.reduce(fast)
         found |= {"transient": transient, "steady": ~transient}
     return found
@@ -69,10 +78,14 @@ def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str
 def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
     """Rate of change of a signal, from a line through `SLOPE_SECONDS` around each sample, (T,) [unit/s]; 0 if it is too short."""
     samples = filled(samples)
-    window = min(2 * max(round(0.5 * SLOPE_SECONDS * rate_hz), 1) + 1, len(samples) - (len(samples) + 1) % 2)
+    window = min(
+        2 * max(round(0.5 * SLOPE_SECONDS * rate_hz), 1) + 1, len(samples) - (len(samples) + 1) % 2
+    )
     if window < 3:
         return np.zeros_like(samples)
-    return np.asarray(signal.savgol_filter(samples, window, 1, deriv=1, delta=1.0 / rate_hz), dtype=np.float64)
+    return np.asarray(
+        signal.savgol_filter(samples, window, 1, deriv=1, delta=1.0 / rate_hz), dtype=np.float64
+    )
 
 
 def filled(samples: FloatArray) -> FloatArray:
@@ -86,10 +99,14 @@ def filled(samples: FloatArray) -> FloatArray:
 
 def is_known(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
     """Whether every range tells a regime, and it has `LEAST_SECONDS` of samples in all, at ``rate_hz`` [Hz]."""
-    return all(regime in own for own in masks) and sum(int(own[regime].sum()) for own in masks) >= max(LEAST_SECONDS * rate_hz, 1.0)
+    return all(regime in own for own in masks) and sum(
+        int(own[regime].sum()) for own in masks
+    ) >= max(LEAST_SECONDS * rate_hz, 1.0)
 
 
-def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
+def errors_by_regime(
+    parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float
+) -> dict[str, dict[str, float]]:
     """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at ``rate_hz`` [Hz].
 
     Returns:
@@ -99,7 +116,10 @@ def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]
     found = {}
     for name in (name for name in REGIMES if is_known(name, masks, rate_hz)):
         chosen = [(part, own[name]) for part, own in zip(parts, masks, strict=True)]
-        inside = [Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES)) for part, mask in chosen]
+        inside = [
+            Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES))
+            for part, mask in chosen
+        ]
         figures, count = accuracy(inside), sum(len(part.time) for part in inside)
         found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
     return found

@@ -43,12 +43,16 @@ class Difference:
     root: Interval  # of the square roots of their mean losses, RMSEs where losses are squared errors; NaN where a loss is negative
 
 
-def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
+def difference_of_blocks(
+    first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000
+) -> Difference:
     """`differences_of_blocks` of one pair."""
     return differences_of_blocks([(first, second)], sizes, n_resamples=n_resamples)[0]
 
 
-def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000) -> list[Difference]:
+def differences_of_blocks(
+    pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000
+) -> list[Difference]:
     """Compare pairs of estimators on the same samples; all pairs see the same draws.
 
     Each resample draws blocks with replacement, the same for both estimators, since what is difficult for one is for the other; and
@@ -94,7 +98,9 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
     return root_intervals([sums], sizes, n_resamples=n_resamples)[0]
 
 
-def root_intervals(candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000) -> list[Interval]:
+def root_intervals(
+    candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000
+) -> list[Interval]:
     """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
 
     Blocks and seeds are drawn as in `differences_of_blocks`; the interval is symmetric on a logarithmic axis, on which the distribution of
@@ -110,7 +116,9 @@ def root_intervals(candidates: Sequence[FloatArray], sizes: FloatArray, *, n_res
     for sums, drawn in zip(candidates, _resampled(pairs, sizes, n_resamples), strict=True):
         value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
         if value > 0:
-            dof = _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)])
+            dof = _degrees_of_freedom(
+                [sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]
+            )
             found.append(_logarithmic(value, drawn[2], dof))
         else:
             found.append(Interval(value, value, value, 1.0))
@@ -118,7 +126,13 @@ def root_intervals(candidates: Sequence[FloatArray], sizes: FloatArray, *, n_res
 
 
 def unexplained_interval(
-    squared_error: FloatArray, error: FloatArray, squared: FloatArray, reference: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000
+    squared_error: FloatArray,
+    error: FloatArray,
+    squared: FloatArray,
+    reference: FloatArray,
+    sizes: FloatArray,
+    *,
+    n_resamples: int = 4000,
 ) -> Interval:
     """The fraction of variance unexplained with its interval, as `root_interval`; all arguments are sums over blocks, (B,).
 
@@ -157,7 +171,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:
     """How often each block is drawn, (n, n_blocks): n_blocks - 1 draws with replacement."""
-    counts: FloatArray = generator.multinomial(n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n).astype(np.float64)
+    counts: FloatArray = generator.multinomial(
+        n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n
+    ).astype(np.float64)
     return counts
 
 
@@ -179,30 +195,47 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
                     continue
                 for side, own in enumerate(pair):
                     if (id(own), side) not in known:
-                        losses = np.take_along_axis(counts @ own.T / (counts @ sizes)[:, None], seeds[side], axis=1)
+                        losses = np.take_along_axis(
+                            counts @ own.T / (counts @ sizes)[:, None], seeds[side], axis=1
+                        )
                         fewer = losses[:, : max(len(own) - 1, 1)]
-                        known[id(own), side] = fewer.mean(axis=1), np.median(losses if len(own) > 2 else fewer, axis=1)
-                (first, first_median), (second, second_median) = (known[id(own), side] for side, own in enumerate(pair))
+                        known[id(own), side] = (
+                            fewer.mean(axis=1),
+                            np.median(losses if len(own) > 2 else fewer, axis=1),
+                        )
+                (first, first_median), (second, second_median) = (
+                    known[id(own), side] for side, own in enumerate(pair)
+                )
                 with np.errstate(invalid="ignore"):
-                    drawn[position, :, part] = first - second, first_median - second_median, np.sqrt(first) - np.sqrt(second)
+                    drawn[position, :, part] = (
+                        first - second,
+                        first_median - second_median,
+                        np.sqrt(first) - np.sqrt(second),
+                    )
     return drawn
 
 
-def _degrees_of_freedom(sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]) -> float:
+def _degrees_of_freedom(
+    sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]
+) -> float:
     """Welch-Satterthwaite over the variance between blocks and that between seeds of either estimator."""
     n_blocks, difference = len(sizes), means[0].mean() - means[1].mean()
     residuals = (sums[0].mean(axis=0) - sums[1].mean(axis=0) - difference * sizes) / sizes.mean()
     parts = [(float(residuals.var(ddof=1)) / n_blocks, n_blocks - 1)]
     parts += [(float(own.var(ddof=1)) / len(own), len(own) - 1) for own in means if len(own) > 1]
     spread = sum(variance**2 / free for variance, free in parts)
-    return sum(variance for variance, _ in parts) ** 2 / spread if spread > 0 else float(n_blocks - 1)
+    return (
+        sum(variance for variance, _ in parts) ** 2 / spread if spread > 0 else float(n_blocks - 1)
+    )
 
 
 def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
     error = float(np.std(drawn))
     half = float(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0)) * error
     ratio = abs(value) / error if error > 0 else (np.inf if value else 0.0)
-    return Interval(value, value - half, value + half, 2.0 * float(scipy.special.stdtr(dof, -ratio)), error, dof)
+    return Interval(
+        value, value - half, value + half, 2.0 * float(scipy.special.stdtr(dof, -ratio)), error, dof
+    )
 
 
 def _logarithmic(value: float, drawn: FloatArray, dof: float) -> Interval:

@@ -39,10 +39,14 @@ UNITS = {
 _CLOCK = 1e-6  # s, within which times are the same
 
 Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
-Flags = tuple[FloatArray, FloatArray]  # (K,) as the errors: half width of the 90 % band of β [rad], NaN for none; health 0, 1 or 2
+Flags = tuple[
+    FloatArray, FloatArray
+]  # (K,) as the errors: half width of the 90 % band of β [rad], NaN for none; health 0, 1 or 2
 
 
-def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]) -> dict[str, dict[str, float]]:
+def errors_under_fault(
+    parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]
+) -> dict[str, dict[str, float]]:
     """Subset -> metric -> value, over all parts together; a subset without samples is left out.
 
     Args:
@@ -52,7 +56,10 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
     """
     found = {}
     pairs = list(zip(parts, windows, strict=True))
-    during = [(part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK) for part, window in pairs]
+    during = [
+        (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
+        for part, window in pairs
+    ]
     after = [part.time >= window[1] + SETTLED_SECONDS - _CLOCK for part, window in pairs]
     for subset, masks in ((FAULTED, during), (AFTER, after)):
         if any(mask.any() for mask in masks):
@@ -61,7 +68,9 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
     return found
 
 
-def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
+def flags_under_fault(
+    parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float
+) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together, at ``rate_hz`` [Hz].
 
     ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
@@ -87,13 +96,18 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flags], windows
     figures |= {"coverage_90_unflagged": float(held[calm].mean())} if calm.any() else {}
     figures |= {"detection_delay": float(np.mean(found))} if found else {}
     if delays:
-        figures |= {"missed_detections": (len(delays) - len(found)) / len(delays), "max_error_sideslip_undetected": max(undetected)}
+        figures |= {
+            "missed_detections": (len(delays) - len(found)) / len(delays),
+            "max_error_sideslip_undetected": max(undetected),
+        }
     return figures
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
     def over_all(error_of: Callable[[Scored], FloatArray]) -> FloatArray:
-        return np.concatenate([error_of(part)[mask] for part, mask in zip(parts, masks, strict=True)])
+        return np.concatenate(
+            [error_of(part)[mask] for part, mask in zip(parts, masks, strict=True)]
+        )
 
     vy = over_all(lambda part: part.vy - part.vy_ref)
     sideslip = np.degrees(over_all(lambda part: part.sideslip - part.sideslip_ref))
@@ -114,7 +128,9 @@ def detection_delay(flagged: NDArray[np.bool_], onset: int, end: int, rate_hz: f
     return (int(found[0]) + 1) / rate_hz if len(found) else math.inf
 
 
-def error_while_undetected(error: FloatArray, flagged: NDArray[np.bool_], onset: int, end: int) -> float:
+def error_while_undetected(
+    error: FloatArray, flagged: NDArray[np.bool_], onset: int, end: int
+) -> float:
     """Largest size of the error from a fault's onset to its first flag, or to ``end``; 0 if it is flagged at once.
 
     ``error``, in which NaN does not count, and ``flagged`` are (T,); ``onset`` is the index of the first faulty sample.

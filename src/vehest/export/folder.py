@@ -25,8 +25,21 @@ LEAST_DIGITS = 8.0  # roundings of a float, that a channel's innovations have to
 OWN = "vehest_estimator.h"
 """The file that shows a folder to be an export."""
 FILES = frozenset(
-    {f"vehest_{part}.{ending}" for part in ("types", "method", "health", "estimator") for ending in ("h", "c")}
-    | {"main.c", "Makefile", "test_vectors.csv", "expected.csv", "README.md", "main", "outcome.csv", "sizes"}
+    {
+        f"vehest_{part}.{ending}"
+        for part in ("types", "method", "health", "estimator")
+        for ending in ("h", "c")
+    }
+    | {
+        "main.c",
+        "Makefile",
+        "test_vectors.csv",
+        "expected.csv",
+        "README.md",
+        "main",
+        "outcome.csv",
+        "sizes",
+    }
 )
 """All that an export and its Makefile write."""
 
@@ -65,10 +78,18 @@ def export_model(
     if precision == "float":
         refuse_unresolved(trust)
     files = program_files(stepper, kind, estimator.full_title)
-    files["README.md"] = readme(stepper, kind, drive, has_trust=trust is not None, elsewhere=elsewhere)
+    files["README.md"] = readme(
+        stepper, kind, drive, has_trust=trust is not None, elsewhere=elsewhere
+    )
     exact = GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere)
-    times, samples = drive_for(exact) if drive is None else (drive.time, {name: drive[name] for name in exact._channels})
-    files["test_vectors.csv"] = table_text(("time", *samples), np.column_stack([times, *samples.values()]))
+    times, samples = (
+        drive_for(exact)
+        if drive is None
+        else (drive.time, {name: drive[name] for name in exact._channels})
+    )
+    files["test_vectors.csv"] = table_text(
+        ("time", *samples), np.column_stack([times, *samples.values()])
+    )
     files["expected.csv"] = table_text(COLUMNS, replayed(exact, times, samples))
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
@@ -76,18 +97,34 @@ def export_model(
             (aside / name).write_text(text, encoding="utf-8")
 
 
-def readme(stepper: GuardedStepper, precision: Precision, drive: Recording | None = None, *, has_trust: bool, elsewhere: bool) -> str:
+def readme(
+    stepper: GuardedStepper,
+    precision: Precision,
+    drive: Recording | None = None,
+    *,
+    has_trust: bool,
+    elsewhere: bool,
+) -> str:
     """What people need to know of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
-    reasons = {kind: text for kind, (text, _) in health.REASONS.items() if kind and kind not in health.RETIRED}
+    reasons = {
+        kind: text
+        for kind, (text, _) in health.REASONS.items()
+        if kind and kind not in health.RETIRED
+    }
     context |= {
         "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
         "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
-        "reasons": sorted((kind, text.format(channel="CHANNEL", partner="PARTNER")) for kind, text in reasons.items()),
+        "reasons": sorted(
+            (kind, text.format(channel="CHANNEL", partner="PARTNER"))
+            for kind, text in reasons.items()
+        ),
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
-        "vectors": f"{SECONDS:g} s of a drive with faults of every kind" if drive is None else f"{drive.duration:g} s of a recorded drive",
+        "vectors": f"{SECONDS:g} s of a drive with faults of every kind"
+        if drive is None
+        else f"{drive.duration:g} s of a recorded drive",
         "tolerance": f"{TOLERANCES[precision]:.0e}",
         "kind": precision,
     }
@@ -102,8 +139,13 @@ def refuse_unresolved(trust: Trust | None) -> None:
     if trust is None or trust.health is None:
         return
     own = trust.health
-    for name, deviation, largest, weights in zip(own.channels, own.deviation, own.largest, own.precision, strict=True):
-        if max(weights) > 0.0 and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest:
+    for name, deviation, largest, weights in zip(
+        own.channels, own.deviation, own.largest, own.precision, strict=True
+    ):
+        if (
+            max(weights) > 0.0
+            and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest
+        ):
             raise ConfigurationError(
                 f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
                 f"resolve; export with --precision double"

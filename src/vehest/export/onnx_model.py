@@ -40,12 +40,16 @@ def write_onnx(estimator: Estimator, path: str | Path) -> None:
     Raises `ConfigurationError`: the estimator is no network. Raises `MissingError`: onnx or onnxscript is not installed.
     """
     if estimator.name not in NETWORKS:
-        raise ConfigurationError(f"estimator '{estimator.name}' is no network that ONNX could hold; these are: {', '.join(NETWORKS)}")
+        raise ConfigurationError(
+            f"estimator '{estimator.name}' is no network that ONNX could hold; these are: {', '.join(NETWORKS)}"
+        )
     try:
         import onnx
         from onnxscript import ir
     except ImportError:
-        raise MissingError("ONNX files need onnx and onnxscript: pip install 'vehest[export]'") from None
+        raise MissingError(
+            "ONNX files need onnx and onnxscript: pip install 'vehest[export]'"
+        ) from None
     step = _STEPS[estimator.name](estimator)
     sample = torch.zeros(len(estimator.channels), dtype=next(step.parameters()).dtype)
     states = {name: start.to(sample.dtype) for name, start in step.starts.items()}
@@ -64,13 +68,17 @@ def write_onnx(estimator: Estimator, path: str | Path) -> None:
         finally:
             logging.disable(logging.NOTSET)
     assert program is not None
-    ir.passes.common.ClearMetadataAndDocStringPass()(program.model)  # where in the sources each node comes from
+    ir.passes.common.ClearMetadataAndDocStringPass()(
+        program.model
+    )  # where in the sources each node comes from
     about = {
         "estimator": estimator.name,
         "variant": estimator.variant,
         "rate_hz": repr(estimator.settings.rate_hz),
         "horizon_steps": str(estimator.horizon_steps),
-        "channels": json.dumps({name: channel(name).unit for name in estimator.channels}, ensure_ascii=False),
+        "channels": json.dumps(
+            {name: channel(name).unit for name in estimator.channels}, ensure_ascii=False
+        ),
         "outputs": json.dumps({name: _UNITS[name] for name in step.outputs}),
         **{f"start_{name}": json.dumps(start.tolist()) for name, start in states.items()},
         **({"licence": " ".join(estimator.notice)} if estimator.notice else {}),
@@ -89,7 +97,9 @@ class _Step(nn.Module):
         starts: states before the first sample, by name.
     """
 
-    def __init__(self, network: nn.Module, outputs: tuple[str, ...], starts: dict[str, Tensor]) -> None:
+    def __init__(
+        self, network: nn.Module, outputs: tuple[str, ...], starts: dict[str, Tensor]
+    ) -> None:
         super().__init__()
         self.network: Any = network
         self.outputs, self.starts = outputs, starts
@@ -100,9 +110,15 @@ class _WindowStep(_Step):
 
     def __init__(self, estimator: WindowedEstimator) -> None:
         network = copy.deepcopy(estimator.network)
-        if isinstance(network, KinematicsStructuredNetwork):  # a plain number would be rounded to float
+        if isinstance(
+            network, KinematicsStructuredNetwork
+        ):  # a plain number would be rounded to float
             network.step = torch.tensor(network.step, dtype=network.gamma.dtype)  # type: ignore[assignment]
-        super().__init__(network, ("vy",), {"window": torch.full((estimator.settings.window, len(estimator.channels)), torch.nan)})
+        super().__init__(
+            network,
+            ("vy",),
+            {"window": torch.full((estimator.settings.window, len(estimator.channels)), torch.nan)},
+        )
 
     def forward(self, sample: Tensor, window: Tensor) -> tuple[Tensor, ...]:
         window = torch.cat([window[1:], sample.unsqueeze(0)])
@@ -114,12 +130,16 @@ class _VelocityStep(_Step):
 
     def __init__(self, estimator: RecurrentVelocityEstimator, **starts: int) -> None:
         s = estimator.settings
-        super().__init__(estimator.network, s.outputs, {name: torch.zeros(size) for name, size in starts.items()})
+        super().__init__(
+            estimator.network, s.outputs, {name: torch.zeros(size) for name, size in starts.items()}
+        )
         self.seen = [estimator.channels.index(name) for name in s.inputs]
 
     def _driven(self, sample: Tensor) -> tuple[Tensor, ...]:
         """Arguments of a cell besides its state: the standardised sample, and weights."""
-        return ((sample[self.seen] - self.network.input_mean) / self.network.input_scale)[None], *self.network.recurrent.parameters()
+        return ((sample[self.seen] - self.network.input_mean) / self.network.input_scale)[
+            None
+        ], *self.network.recurrent.parameters()
 
     def _velocities(self, standardised: Tensor) -> tuple[Tensor, ...]:
         return (standardised * self.network.output_scale + self.network.output_mean).unbind()
@@ -130,7 +150,9 @@ class _GruStep(_VelocityStep):
 
     def __init__(self, estimator: VelocityGru) -> None:
         super().__init__(estimator, h=estimator.settings.n_states)
-        self.register_buffer("slope", self.network.output_mean.new_tensor([estimator.settings.negative_slope]))
+        self.register_buffer(
+            "slope", self.network.output_mean.new_tensor([estimator.settings.negative_slope])
+        )
 
     def forward(self, sample: Tensor, h: Tensor) -> tuple[Tensor, ...]:
         x, *weights = self._driven(sample)
@@ -147,14 +169,23 @@ class _LstmStep(_VelocityStep):
         s = estimator.settings
         super().__init__(estimator, h=s.n_states, c=s.n_states, y=len(s.outputs), started=1)
         known = [name in estimator.channels and name != "vy" for name in s.outputs]
-        self.measured = [estimator.channels.index(name) if own else 0 for name, own in zip(s.outputs, known, strict=True)]
+        self.measured = [
+            estimator.channels.index(name) if own else 0
+            for name, own in zip(s.outputs, known, strict=True)
+        ]
         self.register_buffer("known", self.network.output_mean.new_tensor(known))
 
-    def forward(self, sample: Tensor, h: Tensor, c: Tensor, y: Tensor, started: Tensor) -> tuple[Tensor, ...]:
-        first = (sample[self.measured] * self.known - self.network.output_mean) / self.network.output_scale
+    def forward(
+        self, sample: Tensor, h: Tensor, c: Tensor, y: Tensor, started: Tensor
+    ) -> tuple[Tensor, ...]:
+        first = (
+            sample[self.measured] * self.known - self.network.output_mean
+        ) / self.network.output_scale
         x, *weights = self._driven(sample)
         h, c = (own[0] for own in torch.lstm_cell(x, (h[None], c[None]), *weights))
-        hidden = torch.relu(self.network.dense(torch.cat([h, torch.where(started > 0.0, y, first)])))
+        hidden = torch.relu(
+            self.network.dense(torch.cat([h, torch.where(started > 0.0, y, first)]))
+        )
         y = self.network.read_out(hidden)
         return *self._velocities(y), h, c, y, torch.ones_like(started)
 
@@ -170,7 +201,9 @@ class _SampleStep(_Step):
         w1, b1, w2, b2, w3, b3 = (parameter[0] for parameter in self.network.parameters())
         hidden = torch.relu(torch.relu(self.network.scaled(sample) @ w1 + b1) @ w2 + b2)
         sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-STEEPEST, STEEPEST)
-        return sample[self.speed] * torch.sin(sideslip) / torch.cos(sideslip), sideslip  # onnxruntime has no Tan of double
+        return sample[self.speed] * torch.sin(sideslip) / torch.cos(
+            sideslip
+        ), sideslip  # onnxruntime has no Tan of double
 
 
 _STEPS: dict[str, Any] = {

@@ -20,12 +20,27 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.export.rendering import Precision, ascii_only, braced, limit, render, render_block, truths, whole
+from vehest.export.rendering import (
+    Precision,
+    ascii_only,
+    braced,
+    limit,
+    render,
+    render_block,
+    truths,
+    whole,
+)
 from vehest.trust import bands as band_rules
 from vehest.trust import health_kernel, verdict, watch
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.front_end import CUTOFF, FrontEnd
-from vehest.trust.guard import BRIDGED_SECONDS, ENDLESS, STANDSTILL_SPEED, STANDSTILL_YAW_RATE, Guard
+from vehest.trust.guard import (
+    BRIDGED_SECONDS,
+    ENDLESS,
+    STANDSTILL_SPEED,
+    STANDSTILL_YAW_RATE,
+    Guard,
+)
 from vehest.trust.health_kernel import Layout, Model
 from vehest.trust.named_arrays import views
 
@@ -47,7 +62,9 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
     Raises `ConfigurationError`: the family has no C, or the estimator is not causal or not fitted.
     """
     if not estimator.template:
-        raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}")
+        raise ConfigurationError(
+            f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}"
+        )
     estimator.online()  # raises where it is not causal, or not fitted
     path = f"methods/{estimator.template}.c.j2"
     beside = Path(str(sys.modules[type(estimator).__module__].__file__)).parent
@@ -60,7 +77,11 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
         "skippable": estimator.skippable,
         "channels": channels_of(estimator),
         **estimator.c_values(),
-        "refuses_nan": [name for name in estimator.channels if "NaN" in estimator.refuses and name not in estimator.skippable],
+        "refuses_nan": [
+            name
+            for name in estimator.channels
+            if "NaN" in estimator.refuses and name not in estimator.skippable
+        ],
         "refuses_infinite": estimator.channels if "infinite" in estimator.refuses else (),
         "notes": estimator.notice,
     }
@@ -92,7 +113,12 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     """
     files = method_files(stepper.estimator, precision)
     context = context_of(stepper, precision, title)
-    wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["h"] is not None else [])]
+    wanted = [
+        "types.h",
+        "estimator.h",
+        "estimator.c",
+        *(["health.h", "health.c"] if context["h"] is not None else []),
+    ]
     files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
     values = {
         "names": context["names"],
@@ -101,7 +127,9 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
         "notes": context["notes"],
         "sources": sorted(name for name in files if name.endswith(".c")),
     }
-    files["main.c"] = render("main.c.j2", "double", **values)  # files hold double, whatever the model computes in
+    files["main.c"] = render(
+        "main.c.j2", "double", **values
+    )  # files hold double, whatever the model computes in
     files["Makefile"] = render("makefile.j2", "double", **values)
     return files
 
@@ -157,7 +185,12 @@ def guard_table(guard: Guard) -> dict[str, Any]:
     """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged and that a new level has to stand."""
     runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard._limits[:, 3]]
     limits = _endless(guard._limits[:, [0, 1, 2, 4, 5]]).tolist()
-    return {"limits": limits, "runs": runs, "bridged": int(guard._settings[2]), "persists": int(guard._settings[3])}
+    return {
+        "limits": limits,
+        "runs": runs,
+        "bridged": int(guard._settings[2]),
+        "persists": int(guard._settings[3]),
+    }
 
 
 def _endless(values: FloatArray) -> FloatArray:
@@ -183,7 +216,10 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
     packed = stepper._monitor._bands
     if packed is None:
         return None
-    head, terms = packed.numbers[: band_rules._HEAD], packed.numbers[band_rules._HEAD :].reshape(3, -1)
+    head, terms = (
+        packed.numbers[: band_rules._HEAD],
+        packed.numbers[band_rules._HEAD :].reshape(3, -1),
+    )
     return {
         "factor_vy": head[0],
         "factor_sideslip": head[1],

@@ -26,7 +26,18 @@ LINE = 110  # characters of a line of a table
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _BLANK = re.compile(r"\n{3,}")
-_ASCII = {"²": "^2", "³": "^3", "·": "*", "°": "deg", "ω": "omega", "β": "beta", "δ": "delta", "ä": "ae", "ö": "oe", "ü": "ue"}
+_ASCII = {
+    "²": "^2",
+    "³": "^3",
+    "·": "*",
+    "°": "deg",
+    "ω": "omega",
+    "β": "beta",
+    "δ": "delta",
+    "ä": "ae",
+    "ö": "oe",
+    "ü": "ue",
+}
 
 
 def render(template: str, precision: Precision, beside: Path | None = None, **values: Any) -> str:
@@ -42,7 +53,9 @@ def render(template: str, precision: Precision, beside: Path | None = None, **va
     return typed(_BLANK.sub("\n\n", text), precision)
 
 
-def render_block(template: str, block: str, precision: Precision, beside: Path | None = None, **values: Any) -> str:
+def render_block(
+    template: str, block: str, precision: Precision, beside: Path | None = None, **values: Any
+) -> str:
     """The text of one block of a template; see `render`."""
     found = _environment(precision, beside).get_template(template)
     if block not in found.blocks:
@@ -56,7 +69,9 @@ def typed(source: str, precision: Precision) -> str:
     if precision == "double":
         return source
     pieces = _COMMENT.split(source)
-    return "".join(piece if piece.startswith("/*") else _FLOATING.sub(r"\1f", piece) for piece in pieces)
+    return "".join(
+        piece if piece.startswith("/*") else _FLOATING.sub(r"\1f", piece) for piece in pieces
+    )
 
 
 def literal(value: float, precision: Precision) -> str:
@@ -67,7 +82,9 @@ def literal(value: float, precision: Precision) -> str:
     with np.errstate(over="ignore"):
         number = float(np.float32(value)) if precision == "float" else float(value)
     if not math.isfinite(number):
-        raise ConfigurationError(f"the model holds {value}, which is no {precision} number; fit it anew, or export with precision double")
+        raise ConfigurationError(
+            f"the model holds {value}, which is no {precision} number; fit it anew, or export with precision double"
+        )
     text = f"{number:.9g}" if precision == "float" else repr(number)
     return text if any(mark in text for mark in ".e") else f"{text}.0"
 
@@ -76,7 +93,13 @@ def limit(value: float, precision: Precision) -> str:
     """A literal of a number that may be infinite; what a float cannot hold becomes infinite or 0."""
     value = float(value)
     if precision == "float":
-        value = math.copysign(math.inf, value) if abs(value) > LARGEST_FLOAT else 0.0 if abs(value) < LEAST_FLOAT else value
+        value = (
+            math.copysign(math.inf, value)
+            if abs(value) > LARGEST_FLOAT
+            else 0.0
+            if abs(value) < LEAST_FLOAT
+            else value
+        )
     if math.isinf(value):
         return "VEHEST_INFINITY" if value > 0 else "-VEHEST_INFINITY"
     return literal(value, precision)
@@ -121,11 +144,20 @@ def ascii_only(text: str) -> str:
 
 @cache
 def _environment(precision: Precision, beside: Path | None) -> Environment:
-    from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, PrefixLoader, StrictUndefined
+    from jinja2 import (
+        ChoiceLoader,
+        Environment,
+        FileSystemLoader,
+        PackageLoader,
+        PrefixLoader,
+        StrictUndefined,
+    )
 
     own = PackageLoader("vehest.export")
     environment = Environment(
-        loader=ChoiceLoader([own, PrefixLoader({"methods": FileSystemLoader(beside)})]) if beside else own,
+        loader=ChoiceLoader([own, PrefixLoader({"methods": FileSystemLoader(beside)})])
+        if beside
+        else own,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -133,7 +165,9 @@ def _environment(precision: Precision, beside: Path | None) -> Environment:
     )
     environment.filters |= {
         "real": partial(literal, precision=precision),
-        "table": lambda values: braced(np.asarray(values, np.float64), partial(literal, precision=precision)),
+        "table": lambda values: braced(
+            np.asarray(values, np.float64), partial(literal, precision=precision)
+        ),
         "ascii": ascii_only,
         "unit": lambda name: ascii_only(CHANNELS[name].unit),
     }

@@ -19,7 +19,9 @@ COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
 RADIUS = 0.3  # m, of a wheel where nothing was learnt
 
 
-def replayed(stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, FloatArray]) -> FloatArray:
+def replayed(
+    stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, FloatArray]
+) -> FloatArray:
     """What a stepper says after each row: `COLUMNS`, (T, 6); NaN where it says nothing.
 
     Args:
@@ -31,7 +33,9 @@ def replayed(stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, F
     for k, time in enumerate(times.tolist()):
         sample = {name: float(values[k]) for name, values in samples.items()}
         said = stepper.step(sample, None if math.isnan(time) else time)
-        found[k] = [said.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS]
+        found[k] = [
+            said.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS
+        ]
     return found
 
 
@@ -68,7 +72,9 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
     if stepper._front is None or not len(
         stepper._front._sections
     ):  # behind a low-pass it stands still once digits run out: sooner in float
-        samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][round(5.0 * rate)]
+        samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][
+            round(5.0 * rate)
+        ]
     samples[names[-1]][round(6.5 * rate) : round(7.5 * rate)] *= 1.6
     kept = np.ones(steps, bool)
     kept[round(8.0 * rate) : round(8.03 * rate) + 1] = False
@@ -97,7 +103,9 @@ def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str
         else:
             values = usual[name] + 0.05 * size * np.sin(1.3 * times + number)
         low, high = limits[number]
-        found[name] = np.clip(values + 0.002 * size * _noise(len(times), number), 0.9 * low, 0.9 * high)
+        found[name] = np.clip(
+            values + 0.002 * size * _noise(len(times), number), 0.9 * low, 0.9 * high
+        )
     return found
 
 
@@ -105,11 +113,22 @@ def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]
     """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
     names, table = stepper._channels, health_table(stepper._monitor._health)
     if table is not None:
-        return dict(zip(names, table["largest"].tolist(), strict=True)), dict(zip(names, table["usual"].tolist(), strict=True))
+        return dict(zip(names, table["largest"].tolist(), strict=True)), dict(
+            zip(names, table["usual"].tolist(), strict=True)
+        )
     known = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 8.0, "steer": 0.1, "handwheel": 1.5}
-    sizes = {name: known.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high))) for name in names}
-    speeds = {name: known["vx"] / RADIUS for name in names if name == "motor_speed" or name.startswith("wheel_speed")}
-    return {**sizes, **speeds}, {name: speeds.get(name, known["vx"] if name == "vx" else 0.0) for name in names}
+    sizes = {
+        name: known.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high)))
+        for name in names
+    }
+    speeds = {
+        name: known["vx"] / RADIUS
+        for name in names
+        if name == "motor_speed" or name.startswith("wheel_speed")
+    }
+    return {**sizes, **speeds}, {
+        name: speeds.get(name, known["vx"] if name == "vx" else 0.0) for name in names
+    }
 
 
 def _noise(n: int, seed: int) -> FloatArray:

@@ -40,7 +40,9 @@ def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray
     Source: Rauch, Tung & Striebel 1965.
     """
     ahead = filtered.predicted
-    gains = np.linalg.solve(ahead.covariance[1:], model.transition[:-1] @ filtered.filtered.covariance[:-1]).transpose(0, 2, 1)
+    gains = np.linalg.solve(
+        ahead.covariance[1:], model.transition[:-1] @ filtered.filtered.covariance[:-1]
+    ).transpose(0, 2, 1)
     means = filtered.filtered.mean.copy()
     for k in range(len(means) - 2, -1, -1):
         means[k] += gains[k] @ (means[k + 1] - ahead.mean[k + 1])

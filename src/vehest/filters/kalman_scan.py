@@ -38,19 +38,33 @@ def kalman_scan(
     after the other (Bierman 1977).
     """
     if measurements.ndim != 2 or len(measurements) == 0:
-        raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
+        raise ValueError(
+            f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}"
+        )
     (steps, m), n = measurements.shape, model.transition.shape[-1]
     shapes = ((n, n), (n,), (n, n), (m, n), (m,), (m,))
-    parts = [_contiguous(part, (steps, *shape), name) for name, part, shape in zip(LinearModel._fields, model, shapes, strict=True)]
+    parts = [
+        _contiguous(part, (steps, *shape), name)
+        for name, part, shape in zip(LinearModel._fields, model, shapes, strict=True)
+    ]
     y = _contiguous(measurements, (steps, m), "measurements").copy()
-    start = _contiguous(initial.mean, (n,), "initial.mean"), _contiguous(initial.covariance, (n, n), "initial.covariance")
+    start = (
+        _contiguous(initial.mean, (n,), "initial.mean"),
+        _contiguous(initial.covariance, (n, n), "initial.covariance"),
+    )
     limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
-    predicted, filtered = (Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2))
+    predicted, filtered = (
+        Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2)
+    )
     innovation, covariance = np.empty((steps, m)), np.empty((steps, m, m))
     gated = limit, patience, np.zeros(m, np.int64) if refused is None else refused
-    failed = _scan(*parts, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gated)
+    failed = _scan(
+        *parts, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gated
+    )
     if failed >= 0:
-        raise np.linalg.LinAlgError(f"the variance of an innovation is not positive at sample {failed}")
+        raise np.linalg.LinAlgError(
+            f"the variance of an innovation is not positive at sample {failed}"
+        )
     return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y))
 
 
@@ -65,13 +79,39 @@ def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatA
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovation_cov, limit, patience, refused):  # type: ignore[no-untyped-def]
+def _scan(  # type: ignore[no-untyped-def]
+    A,
+    b,
+    Q,
+    C,
+    d,
+    R,
+    y,
+    start,
+    predicted,
+    filtered,
+    innovation,
+    innovation_cov,
+    limit,
+    patience,
+    refused,
+):
     """Write states and innovations; returns the sample at which an innovation has no positive variance, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
-    (prior_mean, prior_cov), (post_mean, post_cov), (steps, m), n = predicted, filtered, y.shape, A.shape[1]
-    known, of_states, left, gain = np.empty(m, np.bool_), np.empty((m, n)), np.empty((n, n)), np.empty(n)
+    (prior_mean, prior_cov), (post_mean, post_cov), (steps, m), n = (
+        predicted,
+        filtered,
+        y.shape,
+        A.shape[1],
+    )
+    known, of_states, left, gain = (
+        np.empty(m, np.bool_),
+        np.empty((m, n)),
+        np.empty((n, n)),
+        np.empty(n),
+    )
     for k in range(steps):
         x, P, S = prior_mean[k], prior_cov[k], innovation_cov[k]
         for i in range(n):
@@ -85,7 +125,9 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                 return k
         for i in range(n):
             for j in range(n):
-                P[i, j] = start[1][i, j] if k == 0 else Q[k - 1, i, j] + _row_times(left, i, A[k - 1], j)
+                P[i, j] = (
+                    start[1][i, j] if k == 0 else Q[k - 1, i, j] + _row_times(left, i, A[k - 1], j)
+                )
         if k > 0:
             make_symmetric(P)
         for i in range(m):  # innovations given the samples before, all measurements together
@@ -95,17 +137,25 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                 error -= C[k, i, j] * x[j]
                 variance += of_states[i, j] * C[k, i, j]
             known[i] = not math.isnan(y[k, i])
-            if limit < math.inf and known[i] and refuses(error, variance, limit, patience, refused, i):
+            if (
+                limit < math.inf
+                and known[i]
+                and refuses(error, variance, limit, patience, refused, i)
+            ):
                 y[k, i], known[i] = math.nan, False
             innovation[k, i], S[i, i] = (error, variance) if known[i] else (0.0, 1.0)
             for j in range(i):
-                S[i, j] = S[j, i] = _row_times(of_states, i, C[k], j) if known[i] and known[j] else 0.0
+                S[i, j] = S[j, i] = (
+                    _row_times(of_states, i, C[k], j) if known[i] and known[j] else 0.0
+                )
         mean, cov = post_mean[k], post_cov[k]
         for i in range(n):
             mean[i] = x[i]
             for j in range(n):
                 cov[i, j] = P[i, j]
-        for c in range(m - 1, -1, -1):  # one after the other, since their noise is independent; the yaw rate before ay keeps more digits
+        for c in range(
+            m - 1, -1, -1
+        ):  # one after the other, since their noise is independent; the yaw rate before ay keeps more digits
             if not known[c]:
                 continue
             error, variance = y[k, c] - d[k, c], R[k, c]

@@ -29,14 +29,20 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
     """
     count, shape = scipy.signal.kaiserord(STOP_BAND_DB, 0.5 * cutoff)
     taps = scipy.signal.firwin(count | 1, cutoff, window=("kaiser", shape), pass_zero=False)
-    passed = [np.convolve(samples, taps, "valid") for samples in series if len(samples) >= len(taps)]
-    known = np.concatenate([values[~np.isnan(values)] for values in passed]) if passed else np.empty(0)
+    passed = [
+        np.convolve(samples, taps, "valid") for samples in series if len(samples) >= len(taps)
+    ]
+    known = (
+        np.concatenate([values[~np.isnan(values)] for values in passed]) if passed else np.empty(0)
+    )
     if not len(known):
         raise ValueError(f"{len(taps)} samples without a gap are needed to read a noise level")
     return float(np.std(known))
 
 
-def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], least: int, share: float = 0.1) -> float:
+def quiet_level(
+    series: Sequence[FloatArray], activity: Sequence[FloatArray], least: int, share: float = 0.1
+) -> float:
     """Standard deviation of several recordings of one signal while little else happens, taken together.
 
     Recordings are cut into pieces; those count in which another signal deviates least from a straight line, and in them what the signal
@@ -57,10 +63,15 @@ def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], le
     def pieces(samples: FloatArray) -> FloatArray:
         return samples[: len(samples) - len(samples) % least].reshape(-1, least)
 
-    own, others = (np.concatenate([pieces(samples) for samples in signals]) for signals in (series, activity))
+    own, others = (
+        np.concatenate([pieces(samples) for samples in signals]) for signals in (series, activity)
+    )
     known = ~(np.isnan(own).any(1) | np.isnan(others).any(1))
     if not known.any():
         raise ValueError(f"no stretch of {least} samples without a gap")
-    left, moved = (np.square(scipy.signal.detrend(values[known], axis=1)).sum(1) / (least - 2) for values in (own, others))
+    left, moved = (
+        np.square(scipy.signal.detrend(values[known], axis=1)).sum(1) / (least - 2)
+        for values in (own, others)
+    )
     quietest = np.argsort(moved, kind="stable")[: max(1, round(share * len(moved)))]
     return float(np.sqrt(left[quietest].mean()))

@@ -46,7 +46,9 @@ class ConstantNoise(nn.Module):
             if not self.learnt.all():
                 covariance = covariance.diagonal().diag()
             self.unit.copy_(pace * covariance.diagonal().sqrt())
-            self.factor.copy_((torch.linalg.cholesky(covariance) / self.unit.unsqueeze(-1))[_lower(self.n)])
+            self.factor.copy_(
+                (torch.linalg.cholesky(covariance) / self.unit.unsqueeze(-1))[_lower(self.n)]
+            )
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
@@ -93,7 +95,10 @@ class StateDependentNoise(nn.Module):
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""
-        factor = nn.functional.linear(state / self.state_unit, self.weight, self.offset) * self.unit[_lower(self.constant.n)[0]]
+        factor = (
+            nn.functional.linear(state / self.state_unit, self.weight, self.offset)
+            * self.unit[_lower(self.constant.n)[0]]
+        )
         factor = factor * self.constant.learnt
         return self.constant(state, inputs) + SCALE * _product(factor, self.constant.n, 0.0)
 
@@ -131,10 +136,16 @@ def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf)
         least_entropy: see `with_entropy` [nat]; none: entropy as it is.
     """
     unit = noise.unit[_lower(noise.constant.n)[0]]
-    parts = (noise.constant(noise.state_unit, noise.state_unit), noise.weight / noise.state_unit * unit[:, None], noise.offset * unit)
+    parts = (
+        noise.constant(noise.state_unit, noise.state_unit),
+        noise.weight / noise.state_unit * unit[:, None],
+        noise.offset * unit,
+    )
     constant, weight, offset = (part.detach().contiguous().numpy() for part in parts)
     scalar = constant.dtype.type
-    return CompiledNoise(_covariances, (constant, weight, offset, scalar(SCALE), scalar(least_entropy)))
+    return CompiledNoise(
+        _covariances, (constant, weight, offset, scalar(SCALE), scalar(least_entropy))
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -57,24 +57,57 @@ class Tape(NamedTuple):
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
     """A tape for n states and m measurements."""
     points = 2 * n + 1
-    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), ()]
+    shapes: list[tuple[int, ...]] = [
+        (n,),
+        (n, n),
+        (n,),
+        (n, n),
+        (points, n),
+        (points, m),
+        (m,),
+        (m, m),
+        (n, m),
+        (),
+    ]
     made = [room((steps, *shape, sequences), dtype) for shape in shapes]
-    return Tape(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))  # type: ignore[call-arg]
+    return Tape(
+        *made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_)
+    )  # type: ignore[call-arg]
 
 
 def forward_scratch(tape: Tape) -> tuple[Any, ...]:
     """What `forward` works with: each call has its own, so that no two threads write to one line of a cache at every step."""
     points, covariance, spread = tape.moved[0], tape.prior_covariance[0], tape.own[0]
     lost = np.empty(points.shape[-1:], np.bool_)
-    *drawn, made, made_spread = (room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread))
+    *drawn, made, made_spread = (
+        room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread)
+    )
     return tuple(drawn), lost, made, made_spread
 
 
 def backward_scratch(tape: Tape) -> tuple[Any, ...]:
     """What `backward` works with, likewise; the last two become the gradients of the initial mean and covariance."""
-    points, expected, mean, covariance = tape.moved[0], tape.expected[0], tape.post_mean[0], tape.post_covariance[0]
+    points, expected, mean, covariance = (
+        tape.moved[0],
+        tape.expected[0],
+        tape.post_mean[0],
+        tape.post_covariance[0],
+    )
     states = (mean, covariance)
-    shapes = [part.shape for part in (points, covariance, covariance, points, points, points, expected, *states, *states)]
+    shapes = [
+        part.shape
+        for part in (
+            points,
+            covariance,
+            covariance,
+            points,
+            points,
+            points,
+            expected,
+            *states,
+            *states,
+        )
+    ]
     made = [room(shape, points.dtype) for shape in shapes]
     return tuple(made[:3]), np.empty(points.shape[-1:], np.bool_), *made[3:]
 
@@ -89,10 +122,18 @@ def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
     return CompileResultWAP(function.overloads[kinds])
 
 
-FORWARD, BACKWARD = (points_of, moments_of, gate_of, update_of), (points_of, update_adjoint, points_adjoint, moments_adjoint)
-Forward = namedtuple("Forward", ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"))
+FORWARD, BACKWARD = (
+    (points_of, moments_of, gate_of, update_of),
+    (points_of, update_adjoint, points_adjoint, moments_adjoint),
+)
+Forward = namedtuple(
+    "Forward",
+    ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"),
+)
 """What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given; numba warns of a plain tuple of these."""
-Backward = namedtuple("Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car"))
+Backward = namedtuple(
+    "Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car")
+)
 """What `backward` calls, likewise: `BACKWARD` and the model's adjoints."""
 
 
@@ -103,7 +144,23 @@ def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultW
 
 
 @compiled
-def forward(calls, at_state, car_at, at_prior, car_of, setting, tape, y, u, noise, refused, scratch, halves, first, end):  # type: ignore[no-untyped-def]
+def forward(  # type: ignore[no-untyped-def]
+    calls,
+    at_state,
+    car_at,
+    at_prior,
+    car_of,
+    setting,
+    tape,
+    y,
+    u,
+    noise,
+    refused,
+    scratch,
+    halves,
+    first,
+    end,
+):
     """Halves of steps: half 2k moves the states to sample k of the tape, half 2k + 1 takes in the measurement there.
 
     ``noise`` is that of the process and that of measurements, (T, k, k, B), or where there is a function ``at…``, what that writes:
@@ -114,16 +171,31 @@ def forward(calls, at_state, car_at, at_prior, car_of, setting, tape, y, u, nois
         k = half // 2
         if half % 2 == 0:
             mean, inputs = tape.post_mean[k - 1], u[k - 1]
-            calls.points_of(mean, tape.post_covariance[k - 1], rules, drawn, tape.repaired[k], first, end)
+            calls.points_of(
+                mean, tape.post_covariance[k - 1], rules, drawn, tape.repaired[k], first, end
+            )
             calls.transition(drawn[0], inputs, car, tape.moved[k], first, end)
             if at_state is None:
                 added = noise[0][k - 1]
             else:
                 at_state(mean, inputs, car_at, made_process, first, end)
                 added = made_process
-            calls.moments_of(tape.moved[k], added, rules, tape.prior_mean[k], tape.prior_covariance[k], first, end)
+            calls.moments_of(
+                tape.moved[k],
+                added,
+                rules,
+                tape.prior_mean[k],
+                tape.prior_covariance[k],
+                first,
+                end,
+            )
         else:
-            mean, inputs, expected, repaired = tape.prior_mean[k], u[k], tape.expected[k], tape.repaired[k]
+            mean, inputs, expected, repaired = (
+                tape.prior_mean[k],
+                u[k],
+                tape.expected[k],
+                tape.repaired[k],
+            )
             calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
             for b in range(first, end):
                 repaired[b] |= lost[b]
@@ -134,10 +206,23 @@ def forward(calls, at_state, car_at, at_prior, car_of, setting, tape, y, u, nois
                 at_prior(mean, inputs, car_of, made_spread, first, end)
                 added = made_spread
             if setting.gated:
-                calls.gate_of(expected, added, rules, setting.limit, setting.patience, y[k], refused, tape.gone[k], first, end)
+                calls.gate_of(
+                    expected,
+                    added,
+                    rules,
+                    setting.limit,
+                    setting.patience,
+                    y[k],
+                    refused,
+                    tape.gone[k],
+                    first,
+                    end,
+                )
             post = tape.post_mean[k], tape.post_covariance[k]
             kept = tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]
-            calls.update_of(mean, drawn, expected, y[k], added, rules, post, kept, repaired, first, end)
+            calls.update_of(
+                mean, drawn, expected, y[k], added, rules, post, kept, repaired, first, end
+            )
 
 
 @compiled
@@ -150,35 +235,75 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
         gradients: those of the model's parameters are added.
     """
     process_bar, spread_bar, y_bar, mean_up, covariance_up = bars
-    drawn, lost, points_bar, through, moved_bar, expected_bar, post_mean_bar, post_covariance_bar, mean_bar, covariance_bar = scratch
+    (
+        drawn,
+        lost,
+        points_bar,
+        through,
+        moved_bar,
+        expected_bar,
+        post_mean_bar,
+        post_covariance_bar,
+        mean_bar,
+        covariance_bar,
+    ) = scratch
     car, rules, points, factor = calls.car, setting.rules, drawn[0], drawn[1]
     _clear(post_mean_bar, first, end)
     _clear(post_covariance_bar, first, end)
     for k in range(len(y) - 1, -1, -1):
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
-        mean, kept = tape.prior_mean[k], (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k])
+        mean, kept = (
+            tape.prior_mean[k],
+            (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]),
+        )
         calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
         post_bars, prior_bars = (post_mean_bar, post_covariance_bar), (mean_bar, covariance_bar)
         other_bars = points_bar, expected_bar, spread_bar[k], y_bar[k]
-        calls.update(mean, points, tape.expected[k], y[k], rules, kept, post_bars, prior_bars, other_bars, first, end)
+        calls.update(
+            mean,
+            points,
+            tape.expected[k],
+            y[k],
+            rules,
+            kept,
+            post_bars,
+            prior_bars,
+            other_bars,
+            first,
+            end,
+        )
         calls.observation(points, u[k], car, expected_bar, through, gradients, first, end)
         _add(points_bar, through, first, end)
         calls.points(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end)
         if k == 0:
             break
-        calls.moments(tape.moved[k], rules, mean_bar, covariance_bar, moved_bar, process_bar[k - 1], first, end)
+        calls.moments(
+            tape.moved[k],
+            rules,
+            mean_bar,
+            covariance_bar,
+            moved_bar,
+            process_bar[k - 1],
+            first,
+            end,
+        )
         mean = tape.post_mean[k - 1]
         calls.points_of(mean, tape.post_covariance[k - 1], rules, drawn, lost, first, end)
         calls.transition(points, u[k - 1], car, moved_bar, points_bar, gradients, first, end)
         _clear(post_mean_bar, first, end)
         _clear(post_covariance_bar, first, end)
-        calls.points(mean, factor, rules, points_bar, post_mean_bar, post_covariance_bar, first, end)
+        calls.points(
+            mean, factor, rules, points_bar, post_mean_bar, post_covariance_bar, first, end
+        )
 
 
 @compiled
 def _add(total, values, first, end):  # type: ignore[no-untyped-def]
-    rows, added = total.reshape(-1, total.shape[total.ndim - 1]), values.reshape(-1, total.shape[total.ndim - 1])
+    rows, added = (
+        total.reshape(-1, total.shape[total.ndim - 1]),
+        values.reshape(-1, total.shape[total.ndim - 1]),
+    )
     for row in range(rows.shape[0]):
         for b in range(first, end):
             rows[row, b] += added[row, b]

@@ -68,10 +68,14 @@ class PointModel:
 
     entries: Sequence[Any]
     car: Any = None  # what all are given
-    is_compiled = False  # whether the entries are, so that the loop over samples runs without Python
+    is_compiled = (
+        False  # whether the entries are, so that the loop over samples runs without Python
+    )
     kept = 0
     parameters: Sequence[Tensor] = ()  # what gradients are wanted for
-    lower: Sequence[float] | None = None  # smallest possible value of each state, (n,); none: everything is possible
+    lower: Sequence[float] | None = (
+        None  # smallest possible value of each state, (n,); none: everything is possible
+    )
 
     def working(self) -> AbstractContextManager[object]:
         """What the entries are called within, by one thread for all."""
@@ -93,26 +97,48 @@ class TorchModel(PointModel):
     """
 
     def __init__(
-        self, transition: Function, observation: Function, parameters: Sequence[Tensor] = (), lower: Sequence[float] | None = None
+        self,
+        transition: Function,
+        observation: Function,
+        parameters: Sequence[Tensor] = (),
+        lower: Sequence[float] | None = None,
     ) -> None:
         self.parameters = [parameter for parameter in parameters if parameter.requires_grad]
         self.lower = lower
-        self.entries = [partial(how, function) for how in (self._value, self._adjoint) for function in (transition, observation)]
+        self.entries = [
+            partial(how, function)
+            for how in (self._value, self._adjoint)
+            for function in (transition, observation)
+        ]
 
     @staticmethod
-    def _value(function: Function, points: Array, inputs: Array, car: Any, out: Array, first: int, end: int) -> None:
+    def _value(
+        function: Function, points: Array, inputs: Array, car: Any, out: Array, first: int, end: int
+    ) -> None:
         with torch.no_grad():
             value = function(*_of_torch(points, inputs, first, end))
         out[..., first:end] = value.movedim(0, -1).numpy()
 
     def _adjoint(
-        self, function: Function, points: Array, inputs: Array, car: Any, up: Array, out: Array, gradients: Sequence[Array], *ends: int
+        self,
+        function: Function,
+        points: Array,
+        inputs: Array,
+        car: Any,
+        up: Array,
+        out: Array,
+        gradients: Sequence[Array],
+        *ends: int,
     ) -> None:
         with torch.enable_grad():
             state, held = _of_torch(points, inputs, *ends)
             upstream = torch.from_numpy(_apart(up, *ends))
             own = torch.autograd.grad(
-                function(state.requires_grad_(), held), [state, *self.parameters], upstream, allow_unused=True, materialize_grads=True
+                function(state.requires_grad_(), held),
+                [state, *self.parameters],
+                upstream,
+                allow_unused=True,
+                materialize_grads=True,
             )
         for gradient, part in zip(gradients, own[1:], strict=True):
             gradient += part.numpy()
@@ -120,7 +146,9 @@ class TorchModel(PointModel):
 
 
 def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tensor, Tensor]:
-    return torch.from_numpy(_apart(points, first, end)), torch.from_numpy(_apart(inputs, first, end)).unsqueeze(-2)
+    return torch.from_numpy(_apart(points, first, end)), torch.from_numpy(
+        _apart(inputs, first, end)
+    ).unsqueeze(-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +164,17 @@ StepNoise = Array | CompiledNoise
 """Of one sample: (1, k, k), or at the state."""
 
 
-def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
+def _setting(
+    model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None
+) -> Setting:
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
-    return Setting((np.array(rule, dtype), lower, dtype(MARGIN), repair), gate is not None, dtype(limit), patience)
+    return Setting(
+        (np.array(rule, dtype), lower, dtype(MARGIN), repair),
+        gate is not None,
+        dtype(limit),
+        patience,
+    )
 
 
 def unscented_scan(
@@ -178,31 +213,58 @@ def unscented_scan(
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky factor: Murray 2016, arXiv 1602.07527.
     """
     if measurements.dim() != 3 or not measurements.shape[1]:
-        raise ValueError(f"measurements must be of shape (B, T, m) with T > 0, not {tuple(measurements.shape)}")
+        raise ValueError(
+            f"measurements must be of shape (B, T, m) with T > 0, not {tuple(measurements.shape)}"
+        )
     if inputs.shape[:-1] != measurements.shape[:-1]:
-        raise ValueError(f"inputs of shape {tuple(inputs.shape)} do not fit measurements of shape {tuple(measurements.shape)}")
+        raise ValueError(
+            f"inputs of shape {tuple(inputs.shape)} do not fit measurements of shape {tuple(measurements.shape)}"
+        )
     sequences, steps, m = measurements.shape
     n = initial.mean.shape[-1]
     try:
-        mean, covariance = initial.mean.expand(sequences, n), initial.covariance.expand(sequences, n, n)
+        mean, covariance = (
+            initial.mean.expand(sequences, n),
+            initial.covariance.expand(sequences, n, n),
+        )
     except RuntimeError:
-        raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
+        raise ValueError(
+            f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences"
+        ) from None
     dtype = np.float32 if measurements.dtype == torch.float32 else np.float64
     setting = _setting(model, rule, n, dtype, repair, gate)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
-        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
+        noise.expand(sequences, steps, size, size)
+        if isinstance(noise, Tensor)
+        else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
     tape = tape_of(steps, sequences, n, m, dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        model,
+        setting,
+        share or _alone,
+        tape,
+        functions,
+        measurements,
+        inputs,
+        mean,
+        covariance,
+        *tensors,
+        *model.parameters,
     )
     outside = (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)
     prior_mean, prior_covariance, innovation, own = (_by_sequence(values) for values in outside)
     measured = ~(torch.isnan(measurements) | _by_sequence(tape.gone))
-    filtered = Filtered(Gaussian(prior_mean, prior_covariance), Gaussian(post_mean, post_covariance), innovation, own, measured)
+    filtered = Filtered(
+        Gaussian(prior_mean, prior_covariance),
+        Gaussian(post_mean, post_covariance),
+        innovation,
+        own,
+        measured,
+    )
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
 
@@ -243,9 +305,19 @@ class UnscentedStepper:
         self._inputs: Array | None = None
         self._runs: dict[CompiledNoise | None, Callable[..., None]] = {}
         self._scratch = forward_scratch(tape)
-        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, :, 0], tape.own[0, :, :, 0], tape.gain[0, :, :, 0]
+        self.innovation, self.innovation_covariance, self.gain = (
+            tape.innovation[0, :, 0],
+            tape.own[0, :, :, 0],
+            tape.gain[0, :, :, 0],
+        )
 
-    def step(self, measurement: Array, inputs: Array, process_noise: StepNoise, observation_noise: StepNoise) -> Array:
+    def step(
+        self,
+        measurement: Array,
+        inputs: Array,
+        process_noise: StepNoise,
+        observation_noise: StepNoise,
+    ) -> Array:
         """The filtered mean, (n,), valid until the next step.
 
         Args:
@@ -269,12 +341,27 @@ class UnscentedStepper:
         self._run(1, measurement, inputs, observation_noise)
 
     def _run(self, half: int, measurement: Array, inputs: Array, noise: StepNoise) -> None:
-        given, at = (noise[0], None) if isinstance(noise, np.ndarray) else (self.innovation_covariance, noise)
+        given, at = (
+            (noise[0], None)
+            if isinstance(noise, np.ndarray)
+            else (self.innovation_covariance, noise)
+        )
         y, u, given = (_alone_by_time(part) for part in (measurement, inputs, given))
         if at not in self._runs:
             self._runs[at] = _forward_by(self._model, (at, at))
         with self._model.working():
-            self._runs[at](self._setting, self._tape, y, u, (given, given), self._refused, self._scratch, (half, half + 1), 0, 1)
+            self._runs[at](
+                self._setting,
+                self._tape,
+                y,
+                u,
+                (given, given),
+                self._refused,
+                self._scratch,
+                (half, half + 1),
+                0,
+                1,
+            )
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -285,7 +372,9 @@ def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
 
 class _Moved(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
+    ) -> Tensor:
         points, held = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
         ctx.kept, out = (model, points, held[0]), room(points.shape, points.dtype)
         with model.working():
@@ -295,9 +384,15 @@ class _Moved(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         model, points, inputs = ctx.kept
-        gradients = [np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters]
+        gradients = [
+            np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters
+        ]
         with model.working():
-            given = _by_time(upstream[0].unsqueeze(1)), room(points.shape, points.dtype), model.learnt(gradients)
+            given = (
+                _by_time(upstream[0].unsqueeze(1)),
+                room(points.shape, points.dtype),
+                model.learnt(gradients),
+            )
             model.entries[2](points, inputs, model.car, *given, 0, points.shape[-1])
         return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
 
@@ -321,12 +416,24 @@ class _Scan(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         ctx.set_materialize_grads(False)
         kept = model.kept * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
-        y, u, noises = _by_time(measurements), _by_time(inputs, kept), (_by_time(process), _by_time(observation))
-        tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
+        y, u, noises = (
+            _by_time(measurements),
+            _by_time(inputs, kept),
+            (_by_time(process), _by_time(observation)),
+        )
+        tape.prior_mean[0], tape.prior_covariance[0] = (
+            _beside(mean.detach().numpy()),
+            _beside(covariance.detach().numpy()),
+        )
         refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
         run = _forward_by(model, functions, (tape, u[0]))
         with model.working():
-            share(lambda *own: run(setting, tape, y, u, noises, refused, forward_scratch(tape), halves, *own), len(measurements))
+            share(
+                lambda *own: run(
+                    setting, tape, y, u, noises, refused, forward_scratch(tape), halves, *own
+                ),
+                len(measurements),
+            )
         ctx.kept = (model, setting, share, tape, functions, y, u)
         return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
@@ -334,53 +441,93 @@ class _Scan(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         model, setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
-            raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
+            raise RuntimeError(
+                "noise that is a function of the estimate has no gradients; give it as a tensor"
+            )
         noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
         noises[0][-1] = 0  # no step leads on from the last sample
-        measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
+        measured, mean, covariance = (
+            np.empty_like(part)
+            for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0])
+        )
         posts = zip(upstream, (tape.post_mean, tape.post_covariance), strict=True)
-        bars = (*noises, measured, *(room(own.shape, own.dtype, np.zeros) if part is None else _by_time(part) for part, own in posts))
+        bars = (
+            *noises,
+            measured,
+            *(
+                room(own.shape, own.dtype, np.zeros) if part is None else _by_time(part)
+                for part, own in posts
+            ),
+        )
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
-            gradients[first] = [np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters]
+            gradients[first] = [
+                np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters
+            ]
             run, own = _backward_by(model, tape, u, gradients[first])
             scratch = backward_scratch(tape)
             run(setting, tape, y, u, bars, scratch, own, first, end)
-            mean[:, first:end], covariance[:, :, first:end] = (part[..., first:end] for part in scratch[-2:])
+            mean[:, first:end], covariance[:, :, first:end] = (
+                part[..., first:end] for part in scratch[-2:]
+            )
 
         with model.working():
             share(work, y.shape[-1])
-        summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
+        summed = [
+            torch.from_numpy(np.asarray(sum(parts)))
+            for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)
+        ]
         y_bar, *noise_bars = (_by_sequence(part) for part in (measured, *noises))
         first_bars = (torch.from_numpy(_apart(part)) for part in (mean, covariance))
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
-def _forward_by(model: PointModel, functions: Sequence[CompiledNoise | None], like: tuple[Tape, Array] | None = None) -> Any:
+def _forward_by(
+    model: PointModel,
+    functions: Sequence[CompiledNoise | None],
+    like: tuple[Tape, Array] | None = None,
+) -> Any:
     """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs, (p, B), where both are compiled."""
     entries, at_states = [*model.entries[:2]], [at and at.entry for at in functions]
     loop, steps = getattr(forward, "py_func", forward), cast(tuple[Any, ...], FORWARD)
     if like and model.is_compiled and not config.DISABLE_JIT:
         (tape, inputs), loop, steps = like, forward, steps_by_address(FORWARD, like[1].dtype)
         given = (tape.moved[0], inputs, model.car), (tape.post_mean[0], inputs)
-        entries = [by_address(entry, *given[0], out, 0, 0) for entry, out in zip(entries, (tape.moved[0], tape.expected[0]), strict=True)]
-        at_states = [at and by_address(at.entry, *given[1], at.car, tape.post_covariance[0], 0, 0) for at in functions]
-    noises = [part for at, entry in zip(functions, at_states, strict=True) for part in (entry, at and at.car)]
+        entries = [
+            by_address(entry, *given[0], out, 0, 0)
+            for entry, out in zip(entries, (tape.moved[0], tape.expected[0]), strict=True)
+        ]
+        at_states = [
+            at and by_address(at.entry, *given[1], at.car, tape.post_covariance[0], 0, 0)
+            for at in functions
+        ]
+    noises = [
+        part
+        for at, entry in zip(functions, at_states, strict=True)
+        for part in (entry, at and at.car)
+    ]
     return partial(loop, Forward._make((*steps, *entries, model.car)), *noises)
 
 
-def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
+def _backward_by(
+    model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]
+) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
     own = model.learnt(gradients)
     if not model.is_compiled or config.DISABLE_JIT:
-        return partial(getattr(backward, "py_func", backward), Backward._make((*BACKWARD, *model.entries[2:], model.car))), own
+        return partial(
+            getattr(backward, "py_func", backward),
+            Backward._make((*BACKWARD, *model.entries[2:], model.car)),
+        ), own
     points, inputs = tape.moved[0], u[0]
     called = [
         by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
-    return partial(backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))), own
+    return partial(
+        backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))
+    ), own
 
 
 def _beside(values: Array) -> Array:

@@ -37,7 +37,13 @@ ARGUMENTS: dict[str, Any] = {
     "limit": 0,
 }
 """Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have three dimensions."""
-piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
+piece = numba.njit(
+    forceinline=True,
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+    error_model="numpy",
+    boundscheck=False,
+)
 
 
 def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
@@ -128,7 +134,11 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
                 _put(P, (1 + j) * n + i, choose(nothing == 0, most(c + offset, lower[i]), nothing))
-                _put(P, (1 + n + j) * n + i, choose(nothing == 0, most(c - offset, lower[i]), nothing))
+                _put(
+                    P,
+                    (1 + n + j) * n + i,
+                    choose(nothing == 0, most(c - offset, lower[i]), nothing),
+                )
         _write(A, covariance, b, end)
         _write(L, factor, b, end)
         _write(P, points, b, end)
@@ -138,7 +148,13 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
 def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `points_of`; what a repair added counts as constant."""
     n, (rule, lower, _, _) = mean.shape[0], rules
-    L, below, inner, x_bar, A_bar = _rows(n * n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(n, mean), _rows(n * n, mean)
+    L, below, inner, x_bar, A_bar = (
+        _rows(n * n, mean),
+        _rows(n * n, mean),
+        _rows(n * n, mean),
+        _rows(n, mean),
+        _rows(n * n, mean),
+    )
     for b in range(first, end, width(mean)):
         _read(factor, L, b)
         _read(covariance_bar, A_bar, b)
@@ -149,7 +165,9 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
                 up = choose(c + offset >= lower[i], at_row(points_bar, (1 + j) * n + i, b), nothing)
-                down = choose(c - offset >= lower[i], at_row(points_bar, (1 + n + j) * n + i, b), nothing)
+                down = choose(
+                    c - offset >= lower[i], at_row(points_bar, (1 + n + j) * n + i, b), nothing
+                )
                 bar += up + down
                 _put(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
             _put(x_bar, i, bar)
@@ -211,7 +229,12 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
             centre = _deviations(values, b, n, rule, deviation, i)
             _put(through, i, choose(centre >= lower[i], at_row(mean_bar, i, b), centre * 0))
             for j in range(n):
-                _put(whole, i * n + j, half * (at_row(covariance_bar, i * n + j, b) + at_row(covariance_bar, j * n + i, b)))
+                _put(
+                    whole,
+                    i * n + j,
+                    half
+                    * (at_row(covariance_bar, i * n + j, b) + at_row(covariance_bar, j * n + i, b)),
+                )
         for s in range(count):
             weight = two * (rule[2] if s == 0 else rule[3])
             for i in range(n):
@@ -224,7 +247,11 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
             for s in range(count):
                 left -= _own(V_bar, s * n + i)
             for s in range(count):
-                _put(V_bar, s * n + i, _own(V_bar, s * n + i) + (rule[1] if s == 0 else rule[3]) * left)
+                _put(
+                    V_bar,
+                    s * n + i,
+                    _own(V_bar, s * n + i) + (rule[1] if s == 0 else rule[3]) * left,
+                )
         _write(V_bar, values_bar, b, end)
         _write(whole, noise_bar, b, end)
 
@@ -249,8 +276,17 @@ def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, en
             total = centre * 0
             for s in range(1, count):
                 total += (expected[s, i, b] - centre) * (expected[s, i, b] - centre)
-            total = other * total + centre_covariance * (expected[0, i, b] - centre) * (expected[0, i, b] - centre)
-            if refuses(y[i, b] - centre, max(total, centre * 0) + noise[i, i, b], limit, patience, refused[b], i):
+            total = other * total + centre_covariance * (expected[0, i, b] - centre) * (
+                expected[0, i, b] - centre
+            )
+            if refuses(
+                y[i, b] - centre,
+                max(total, centre * 0) + noise[i, i, b],
+                limit,
+                patience,
+                refused[b],
+                i,
+            ):
                 y[i, b] = np.nan
                 gone[i, b] = True
 
@@ -267,7 +303,13 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
     count, m = expected.shape[:2]
     n, lanes = mean.shape[0], width(mean)
     error, spread, deviation = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean)
-    cross, factor, K, S, flags = _rows(n * m, mean), _rows(m * m, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(1, mean)
+    cross, factor, K, S, flags = (
+        _rows(n * m, mean),
+        _rows(m * m, mean),
+        _rows(n * m, mean),
+        _rows(m * m, mean),
+        _rows(1, mean),
+    )
     x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
@@ -362,7 +404,9 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
         for j in range(i + 1):
             left = half * (at_row(covariance, i * n + j, b) + at_row(covariance, j * n + i, b))
             for c in range(m):
-                taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(gain, j * m + c) * _own(cross, i * m + c)
+                taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(
+                    gain, j * m + c
+                ) * _own(cross, i * m + c)
                 left -= half * taken
             _put(post_covariance, i * n + j, left)
             _put(post_covariance, j * n + i, left)
@@ -384,18 +428,42 @@ def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end):  # type: ignore[no-untyped-def]
+def update_adjoint(  # type: ignore[no-untyped-def]
+    mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end
+):
     """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
-    (rule, lower, _, _), (innovation, own, gain, centre), (post_mean_bar, post_covariance_bar) = rules, kept, post_bars
-    (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = prior_bars, other_bars
+    (rule, lower, _, _), (innovation, own, gain, centre), (post_mean_bar, post_covariance_bar) = (
+        rules,
+        kept,
+        post_bars,
+    )
+    (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = (
+        prior_bars,
+        other_bars,
+    )
     count, m = expected.shape[:2]
     n = mean.shape[0]
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
-    off, spread, deviation, error = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean), _rows(m, mean)
+    off, spread, deviation, error = (
+        _rows(m, mean),
+        _rows(count * m, mean),
+        _rows(count * n, mean),
+        _rows(m, mean),
+    )
     P, S, K = _rows(n * n, mean), _rows(m * m, mean), _rows(n * m, mean)
     factor, solved, pulled = _rows(m * m, mean), _rows(m, mean), _rows(m, mean)
-    through, cross_bar, own_bar, R_bar = _rows(n, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(m * m, mean)
-    x_bar, z_bar, V_bar, E_bar = _rows(n, mean), _rows(m, mean), _rows(count * n, mean), _rows(count * m, mean)
+    through, cross_bar, own_bar, R_bar = (
+        _rows(n, mean),
+        _rows(n * m, mean),
+        _rows(m * m, mean),
+        _rows(m * m, mean),
+    )
+    x_bar, z_bar, V_bar, E_bar = (
+        _rows(n, mean),
+        _rows(m, mean),
+        _rows(count * n, mean),
+        _rows(count * m, mean),
+    )
     for b in range(first, end, width(mean)):
         _spread(expected, points, mean, y, b, rule, off, spread, deviation)
         _read(innovation, error, b)
@@ -406,7 +474,15 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
             state = _moved(mean, K, error, i, m, b)
             _put(through, i, choose(state >= lower[i], at_row(post_mean_bar, i, b), state * 0))
             for j in range(n):
-                _put(P, i * n + j, half * (at_row(post_covariance_bar, i * n + j, b) + at_row(post_covariance_bar, j * n + i, b)))
+                _put(
+                    P,
+                    i * n + j,
+                    half
+                    * (
+                        at_row(post_covariance_bar, i * n + j, b)
+                        + at_row(post_covariance_bar, j * n + i, b)
+                    ),
+                )
         _cholesky(S, factor, m)
         _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
@@ -423,13 +499,19 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
                 _put(cross_bar, i * m + c, bar)
         for c in range(m):
             for d in range(m):
-                bar = -half * (_own(pulled, c) * _own(solved, d) + _own(pulled, d) * _own(solved, c))
+                bar = -half * (
+                    _own(pulled, c) * _own(solved, d) + _own(pulled, d) * _own(solved, c)
+                )
                 for i in range(n):
                     for j in range(n):
                         bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
                 _put(own_bar, c * m + d, bar)
                 one, other = at_row(y, c, b), at_row(y, d, b)
-                _put(R_bar, c * m + d, choose(one == one, choose(other == other, bar, bar * 0), bar * 0))
+                _put(
+                    R_bar,
+                    c * m + d,
+                    choose(one == one, choose(other == other, bar, bar * 0), bar * 0),
+                )
         for i in range(n):
             left = _own(through, i)
             for s in range(count):
@@ -453,7 +535,11 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
                 _put(E_bar, s * m + c, bar)
                 left -= bar
             for s in range(count):
-                _put(E_bar, s * m + c, _own(E_bar, s * m + c) + (rule[1] if s == 0 else rule[3]) * left)
+                _put(
+                    E_bar,
+                    s * m + c,
+                    _own(E_bar, s * m + c) + (rule[1] if s == 0 else rule[3]) * left,
+                )
         _write(x_bar, mean_bar, b, end)
         _write(P, covariance_bar, b, end)
         _write(V_bar, points_bar, b, end)
@@ -555,4 +641,8 @@ def _cholesky_adjoint(L, L_bar, inner, A_bar, n):  # type: ignore[no-untyped-def
             _put(inner, i * n + j, bar / _own(L, j * n + j))
     for i in range(n):
         for j in range(n):
-            _put(A_bar, i * n + j, _own(A_bar, i * n + j) + half * (_own(inner, i * n + j) + _own(inner, j * n + i)))
+            _put(
+                A_bar,
+                i * n + j,
+                _own(A_bar, i * n + j) + half * (_own(inner, i * n + j) + _own(inner, j * n + i)),
+            )

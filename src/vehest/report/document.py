@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.data.errors import printable
-from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
+from vehest.report.style import (
+    MISSING,
+    REFERENCE_COLOUR,
+    decimals_for,
+    fixed,
+    on_dark,
+    paper_style,
+    significant,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +51,9 @@ class Column:
     """How a column of a table is shown; its CSV file keeps every digit."""
 
     header: str  # what it is called, unit included
-    digits: int = 3  # significant digits of its typical value, from which the decimals of all follow
+    digits: int = (
+        3  # significant digits of its typical value, from which the decimals of all follow
+    )
     decimals: int | None = None  # decimals of every value, instead of ``digits``
     each: bool = False  # every value has its own decimals, as in a column of different units
     # columns of the frame with a value and the ends of its interval; the page draws them into the cells, and sorts by the value
@@ -88,22 +98,32 @@ class Document:
     """A report; raises `ValueError` where two tables or two figures share a name, or a name is no file name."""
 
     title: str  # plain text
-    blocks: Sequence[Block]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
+    blocks: Sequence[
+        Block
+    ]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
     # name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    open_blocks: int | None = None  # how many of the first blocks the page shows; sections after them are folded, with None none
+    open_blocks: int | None = (
+        None  # how many of the first blocks the page shows; sections after them are folded, with None none
+    )
 
     def __post_init__(self) -> None:
         for kind in (Table, Figure):
-            names = [block.name for block in self.blocks if isinstance(block, kind)] + (list(self.data) if kind is Table else [])
+            names = [block.name for block in self.blocks if isinstance(block, kind)] + (
+                list(self.data) if kind is Table else []
+            )
             for name in names:
                 if not _NAME.fullmatch(name):
                     raise ValueError(f"'{name}' cannot name a file of a report")
                 if names.count(name) > 1:
-                    raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
+                    raise ValueError(
+                        f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'"
+                    )
 
 
-def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()) -> None:
+def write_documents(
+    documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()
+) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
@@ -113,7 +133,11 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page:
         ValueError: tables or figures of two documents share a name, or a name is no file name.
     """
     blocks = [block for document in documents.values() for block in document.blocks]
-    Document("all pages", blocks, {name: frame for document in documents.values() for name, frame in document.data.items()})
+    Document(
+        "all pages",
+        blocks,
+        {name: frame for document in documents.values() for name, frame in document.data.items()},
+    )
     for name, document in documents.items():
         if not _NAME.fullmatch(name):
             raise ValueError(f"'{name}' cannot name a file of a report")
@@ -121,7 +145,12 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page:
 
 
 def write_document(
-    document: Document, folder: Path, *, page: bool = True, name: str = "report", on_page: Sequence[str | Table] = ()
+    document: Document,
+    folder: Path,
+    *,
+    page: bool = True,
+    name: str = "report",
+    on_page: Sequence[str | Table] = (),
 ) -> None:
     """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html`` where ``page`` is set.
 
@@ -146,10 +175,14 @@ def write_document(
             (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
             images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    (folder / f"{name}.md").write_bytes(_markdown(document, numbers).encode("utf-8", "backslashreplace"))
+    (folder / f"{name}.md").write_bytes(
+        _markdown(document, numbers).encode("utf-8", "backslashreplace")
+    )
     if page:
         whole = replace(document, blocks=[*document.blocks, *on_page])
-        (folder / f"{name}.html").write_bytes(_page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace"))
+        (folder / f"{name}.html").write_bytes(
+            _page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace")
+        )
 
 
 def as_text(name: str) -> str:
@@ -177,17 +210,29 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
-        texts = (MISSING if value is None or value != value else printable(str(value)) for value in values.tolist())
+        texts = (
+            MISSING if value is None or value != value else printable(str(value))
+            for value in values.tolist()
+        )
         columns.append(_number_cells(values.tolist(), column) if is_number else list(texts))
-    return [printable(column.header) for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
+    return (
+        [printable(column.header) for column in shown.values()],
+        [list(row) for row in zip(*columns, strict=True)],
+        numeric,
+    )
 
 
 def _number_cells(values: list[Any], column: Column) -> list[str]:
     if all(isinstance(value, int) for value in values):
         return [fixed(value, 0) for value in values]
-    numbers = [float(value) if value is not None and value == value else math.nan for value in values]
+    numbers = [
+        float(value) if value is not None and value == value else math.nan for value in values
+    ]
     if column.each:
-        return [fixed(number, 0) if number.is_integer() else significant(number, column.digits) for number in numbers]
+        return [
+            fixed(number, 0) if number.is_integer() else significant(number, column.digits)
+            for number in numbers
+        ]
     decimals = decimals_for(numbers, column.digits) if column.decimals is None else column.decimals
     return [fixed(number, decimals) for number in numbers]
 
@@ -212,7 +257,9 @@ def png_of(figure: MatplotlibFigure) -> bytes:
     with paper_style():
         figure.savefig(buffer, format="png", dpi=PNG_DPI)
     with Image.open(buffer) as image:
-        few = image.convert("RGB").quantize(PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few = image.convert("RGB").quantize(
+            PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
         few.save(small, format="png", optimize=True, dpi=(PNG_DPI, PNG_DPI))
     return small.getvalue()
 
@@ -221,7 +268,9 @@ def svg_of(figure: MatplotlibFigure) -> bytes:
     """A figure as SVG, with places to a hundredth of a point, finer than any page: half the size."""
 
     def in_hundredths(path: re.Match[str]) -> str:
-        return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
+        return _LONG_NUMBER.sub(
+            lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0]
+        )
 
     buffer = io.BytesIO()
     with paper_style():
@@ -240,12 +289,20 @@ def _for_both_schemes(svg: bytes) -> bytes:
         if f"{kind}: {colour}" in text
     ]
     style = f"<style>@media (prefers-color-scheme: dark){{svg{{fill:{on_dark(REFERENCE_COLOUR)}}}{''.join(rules)}}}</style>"
-    return re.sub(r"(<svg\b[^>]*>)", lambda opening: opening[0] + style, text, count=1).encode("utf-8")
+    return re.sub(r"(<svg\b[^>]*>)", lambda opening: opening[0] + style, text, count=1).encode(
+        "utf-8"
+    )
 
 
 def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     (folder / "tables").mkdir(exist_ok=True)
-    frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8", errors="backslashreplace")
+    frame.to_csv(
+        folder / "tables" / f"{name}.csv",
+        index=False,
+        lineterminator="\n",
+        encoding="utf-8",
+        errors="backslashreplace",
+    )
 
 
 def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
@@ -254,19 +311,29 @@ def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
         if isinstance(block, str):
             parts.append(_harmless(block.strip()))
         elif isinstance(block, Table):
-            parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([CSV](tables/{block.name}.csv))")
+            parts.append(
+                f"**{numbers[position]}.** {_harmless(block.caption)} ([CSV](tables/{block.name}.csv))"
+            )
             headers, rows, numeric = formatted(block)
             lines = [headers, ["--:" if is_number else ":--" for is_number in numeric], *rows]
-            parts.append("\n".join("| " + " | ".join(_in_pipes(cell) for cell in line) + " |" for line in lines))
+            parts.append(
+                "\n".join(
+                    "| " + " | ".join(_in_pipes(cell) for cell in line) + " |" for line in lines
+                )
+            )
         else:
             parts.append(f"![{_spoken(block.caption)}](figures/{block.name}.png)")
-            parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([SVG](figures/{block.name}.svg))")
+            parts.append(
+                f"**{numbers[position]}.** {_harmless(block.caption)} ([SVG](figures/{block.name}.svg))"
+            )
     return "\n\n".join(parts) + "\n"
 
 
 def _in_pipes(cell: str) -> str:
     line = printable(" ".join(cell.split()))
-    return line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
+    return (
+        line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
+    )
 
 
 def _harmless(text: str) -> str:
@@ -277,7 +344,10 @@ def _harmless(text: str) -> str:
     parser = MarkdownIt("commonmark", {"html": True})
     parser.validateLink = lambda url: True  # type: ignore[method-assign]
     tokens = [token for outer in parser.parse(text) for token in (outer, *(outer.children or []))]
-    if not any(token.type in _UNWANTED or _SCRIPTED.match(str(token.attrGet("href") or "")) for token in tokens):
+    if not any(
+        token.type in _UNWANTED or _SCRIPTED.match(str(token.attrGet("href") or ""))
+        for token in tokens
+    ):
         return text
     return text.replace("\\[", "[").replace("<", "&lt;").replace("[", "&#91;")
 
@@ -298,13 +368,27 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
-            blocks.append({"kind": "text", "html": Markup(_LINK_TO_PAGE.sub(r'href="\1.html"', markdown.render(_harmless(block))))})
+            blocks.append(
+                {
+                    "kind": "text",
+                    "html": Markup(
+                        _LINK_TO_PAGE.sub(r'href="\1.html"', markdown.render(_harmless(block)))
+                    ),
+                }
+            )
             continue
-        shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(_harmless(block.caption)))}
+        shared = {
+            "name": block.name,
+            "number": numbers[position],
+            "caption": Markup(markdown.renderInline(_harmless(block.caption))),
+        }
         if isinstance(block, Table):
             blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
-            alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
+            alternative = {
+                "image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"),
+                "alt": _spoken(block.caption),
+            }
             interactive = Markup(block.interactive) if block.interactive else None
             blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
     explored = any(block.get("json") for block in blocks)
@@ -335,20 +419,41 @@ def _no_formula(cell: Any) -> Any:
 
 def _page_table(table: Table) -> dict[str, Any]:
     headers, rows, numeric = formatted(table)
-    csv = table.frame.map(_no_formula).to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
+    csv = (
+        table.frame.map(_no_formula)
+        .to_csv(index=False, lineterminator="\n")
+        .encode("utf-8", "backslashreplace")
+    )
     barred = {i: column.bar for i, column in enumerate(table.columns.values()) if column.bar}
-    bars = {i: bars_of(*(table.frame[name].tolist() for name in names)) for i, names in barred.items()}
-    cells = [[{"text": text, "bar": bars[i][k] if i in bars else None} for i, text in enumerate(row)] for k, row in enumerate(rows)]
-    return {"headers": headers, "rows": cells, "numeric": numeric, "links": list(table.links), "csv": _data_uri(csv, "text/csv")}
+    bars = {
+        i: bars_of(*(table.frame[name].tolist() for name in names)) for i, names in barred.items()
+    }
+    cells = [
+        [{"text": text, "bar": bars[i][k] if i in bars else None} for i, text in enumerate(row)]
+        for k, row in enumerate(rows)
+    ]
+    return {
+        "headers": headers,
+        "rows": cells,
+        "numeric": numeric,
+        "links": list(table.links),
+        "csv": _data_uri(csv, "text/csv"),
+    }
 
 
-def bars_of(values: Sequence[float], lows: Sequence[float], highs: Sequence[float]) -> list[dict[str, Any] | None]:
+def bars_of(
+    values: Sequence[float], lows: Sequence[float], highs: Sequence[float]
+) -> list[dict[str, Any] | None]:
     """Where values and the ends of their intervals lie on one axis from zero, in per cent of its length; none where a value is missing.
 
     The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far beyond; what is longer is ``cut``.
     """
     known = [value for value in values if math.isfinite(value)]
-    ends = [high if math.isfinite(high) else value for value, high in zip(values, highs, strict=True) if math.isfinite(value)]
+    ends = [
+        high if math.isfinite(high) else value
+        for value, high in zip(values, highs, strict=True)
+        if math.isfinite(value)
+    ]
     if not known or max(ends) <= 0:
         return [None] * len(values)
     axis = min(max(ends), LONGEST_AXIS * sorted(known)[len(known) // 2] or max(ends))

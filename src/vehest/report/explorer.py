@@ -28,7 +28,9 @@ def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray |
     Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; of each candidate ``vy0`` [m/s], half widths of its
     90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg], ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
     """
-    described, data = packed({name: values for name, values in columns.items() if values is not None})
+    described, data = packed(
+        {name: values for name, values in columns.items() if values is not None}
+    )
     whole = {**content, "columns": described, "data": data}
     return json.dumps(whole, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
 
@@ -43,17 +45,23 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
     described, parts = {}, []
     for name, values in columns.items():
         known = np.isfinite(values)
-        low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+        low, high = (
+            (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+        )
         scale = (high - low) / LEVELS or 1.0
         codes = np.full(len(values), GAP, np.uint16)
         codes[known] = np.round((values[known] - low) / scale).astype(np.uint16)
         differences = np.diff(codes, prepend=np.uint16(0))  # modulo 2¹⁶
         parts += [(differences & 0xFF).astype(np.uint8), (differences >> 8).astype(np.uint8)]
         described[name] = [low, scale]
-    return described, base64.b64encode(zlib.compress(b"".join(part.tobytes() for part in parts), 9)).decode()
+    return described, base64.b64encode(
+        zlib.compress(b"".join(part.tobytes() for part in parts), 9)
+    ).decode()
 
 
-def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+def reckoned_course(
+    vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray]:
     """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading along x; after NaN it starts anew.
 
     ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two samples.

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, SINGLE_COLUMN, Line, MatplotlibFigure, new_figure, significant
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    REFERENCE,
+    SINGLE_COLUMN,
+    Line,
+    MatplotlibFigure,
+    new_figure,
+    significant,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,7 +29,9 @@ LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other
 LOSSES = ("epoch", "train_loss", "validation_loss")  # columns of a training history
 
-Errors = tuple[str, Line, FloatArray]  # name of an estimator, its line, and its sideslip errors, estimate minus reference [deg], (K,)
+Errors = tuple[
+    str, Line, FloatArray
+]  # name of an estimator, its line, and its sideslip errors, estimate minus reference [deg], (K,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +44,42 @@ class Traces:
     sideslip: FloatArray  # [deg], shape (K,)
 
 
-def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
+def traces_figure(
+    time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str
+) -> MatplotlibFigure:
     """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator: lateral velocity left, sideslip right."""
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
-            for axes, measured, estimated in ((left, reference.vy, estimate.vy), (right, reference.sideslip, estimate.sideslip)):
-                axes.plot(*decimated(time, estimated, STATIC_POINTS), color=estimate.line.colour, linewidth=1.2)
-                axes.plot(*decimated(time, measured, STATIC_POINTS), color=reference.line.colour, linewidth=0.6)
+            for axes, measured, estimated in (
+                (left, reference.vy, estimate.vy),
+                (right, reference.sideslip, estimate.sideslip),
+            ):
+                axes.plot(
+                    *decimated(time, estimated, STATIC_POINTS),
+                    color=estimate.line.colour,
+                    linewidth=1.2,
+                )
+                axes.plot(
+                    *decimated(time, measured, STATIC_POINTS),
+                    color=reference.line.colour,
+                    linewidth=0.6,
+                )
                 axes.margins(x=0.005)
-            left.set_title(estimate.label, loc="left", color=estimate.line.colour, pad=2.0, fontsize=7.5, fontweight="bold")
-            right.set_title(f"RMSE(β) {significant(_rms(estimate.sideslip - reference.sideslip))}°", loc="right", pad=2.0, fontsize=7.0)
+            left.set_title(
+                estimate.label,
+                loc="left",
+                color=estimate.line.colour,
+                pad=2.0,
+                fontsize=7.5,
+                fontweight="bold",
+            )
+            right.set_title(
+                f"RMSE(β) {significant(_rms(estimate.sideslip - reference.sideslip))}°",
+                loc="right",
+                pad=2.0,
+                fontsize=7.0,
+            )
         for column, label in enumerate(("lateral velocity [m/s]", "sideslip angle [deg]")):
             grid[-1][column].set_xlabel(time_label)
             grid[(len(estimates) - 1) // 2][column].set_ylabel(label)
@@ -52,7 +87,11 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
 
 def zoom_figure(
-    time: FloatArray, ay: FloatArray | None, reference: Traces, estimates: Sequence[Traces], time_label: str
+    time: FloatArray,
+    ay: FloatArray | None,
+    reference: Traces,
+    estimates: Sequence[Traces],
+    time_label: str,
 ) -> MatplotlibFigure:
     """Reference and all estimates over a short time, (K,) [s]: lateral velocity, sideslip, its error and, if given, ``ay`` (K,) [m/s²]."""
     from matplotlib.ticker import MaxNLocator
@@ -62,7 +101,11 @@ def zoom_figure(
         all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
         (top, middle, below), bottom = all_axes[:3], all_axes[-1]
         for source in (*reversed(estimates), reference):
-            looks = {"color": source.line.colour, "linestyle": source.line.dash, "linewidth": 1.4 if source is reference else 1.0}
+            looks = {
+                "color": source.line.colour,
+                "linestyle": source.line.dash,
+                "linewidth": 1.4 if source is reference else 1.0,
+            }
             top.plot(time, source.vy, label=source.label, **looks)
             middle.plot(time, source.sideslip, **looks)
             if source is not reference:
@@ -71,7 +114,12 @@ def zoom_figure(
         below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
         if ay is not None:
             bottom.plot(time, ay, color="#444444", linewidth=0.8)
-        labels = ("lateral velocity [m/s]", "sideslip [deg]", "sideslip error [deg]", "$a_y$ [m/s²]")
+        labels = (
+            "lateral velocity [m/s]",
+            "sideslip [deg]",
+            "sideslip error [deg]",
+            "$a_y$ [m/s²]",
+        )
         for axes, label in zip(all_axes, labels, strict=False):
             axes.set_ylabel(label)
             axes.margins(x=0.0)
@@ -93,17 +141,23 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
             counts, _ = np.histogram(np.clip(error, -limit, limit), edges)
             density = counts / len(error) / np.diff(edges)
             label = f"{name}: {significant(_rms(error))}°"
-            axes.stairs(density, edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=label)
+            axes.stairs(
+                density, edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=label
+            )
         axes.axvline(0.0, color=REFERENCE.colour, linewidth=0.7)
         axes.set_xlabel("sideslip error, estimate - reference [deg]".replace("-", "\N{MINUS SIGN}"))
         axes.set_ylabel("density [1/deg]")
         axes.set_xlim(-limit, limit)
         axes.set_ylim(bottom=0.0)
         samples = len(estimates[0][2]) * (edges[1] - edges[0])
-        counts_axis = axes.secondary_yaxis("right", functions=(lambda density: density * samples, lambda count: count / samples))
+        counts_axis = axes.secondary_yaxis(
+            "right", functions=(lambda density: density * samples, lambda count: count / samples)
+        )
         counts_axis.set_ylabel("samples a bin")
         handles, labels = axes.get_legend_handles_labels()
-        axes.legend(handles[::-1], labels[::-1], loc="upper right", title="RMSE(β)", alignment="left")
+        axes.legend(
+            handles[::-1], labels[::-1], loc="upper right", title="RMSE(β)", alignment="left"
+        )
     return figure
 
 
@@ -118,8 +172,19 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
         for name, line, error in reversed(estimates):
             squares = np.bincount(index, weights=np.square(error), minlength=n_bins)
-            rmse = np.sqrt(np.divide(squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES))
-            axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=name)
+            rmse = np.sqrt(
+                np.divide(
+                    squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES
+                )
+            )
+            axes.plot(
+                centres,
+                rmse,
+                color=line.colour,
+                linestyle=line.dash,
+                marker=line.marker,
+                label=name,
+            )
         below.bar(centres, counts, width=0.9, color="#b5b9be")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.set_ylim(bottom=0.0)
@@ -142,7 +207,14 @@ def learning_curves(runs: Sequence[tuple[str, Line, pd.DataFrame]]) -> Matplotli
             left.plot(epoch, train, label=name, **looks)
             right.plot(epoch, validation, **looks)
             for axes, losses in ((left, train), (right, validation)):
-                axes.plot(epoch[best], losses[best], color=line.colour, marker=line.marker, markeredgecolor="black", markersize=4.5)
+                axes.plot(
+                    epoch[best],
+                    losses[best],
+                    color=line.colour,
+                    marker=line.marker,
+                    markeredgecolor="black",
+                    markersize=4.5,
+                )
         for axes, title in ((left, "training"), (right, "validation")):
             axes.set_title(title, loc="left")
             axes.set_yscale("log")
@@ -173,16 +245,29 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         for position, row in enumerate(rows):
             at = nominal + aside[position]
             axes.vlines(at, row.low, row.high, color=row.line.colour, linewidth=0.8, alpha=0.6)
-            axes.plot(at, row.coverage, color=row.line.colour, linestyle=row.line.dash, marker=row.line.marker)
-        lowest = float(np.nanmin([[row.coverage.min(), np.nanmin(row.low, initial=1.0)] for row in rows]))
+            axes.plot(
+                at,
+                row.coverage,
+                color=row.line.colour,
+                linestyle=row.line.dash,
+                marker=row.line.marker,
+            )
+        lowest = float(
+            np.nanmin([[row.coverage.min(), np.nanmin(row.low, initial=1.0)] for row in rows])
+        )
         bottom = max(min(lowest, float(nominal[0])) - 0.05, 0.0)
         axes.set_xlim(nominal[0] - 0.05, 1.0)
         axes.set_ylim(bottom, 1.01)
         axes.set_xticks(nominal, [f"{100 * level:.0f}" for level in levels])
-        axes.set_yticks(ticks := np.arange(np.ceil(10 * bottom) / 10, 1.01, 0.1), [f"{100 * tick:.0f}" for tick in ticks])
+        axes.set_yticks(
+            ticks := np.arange(np.ceil(10 * bottom) / 10, 1.01, 0.1),
+            [f"{100 * tick:.0f}" for tick in ticks],
+        )
         axes.set_xlabel("nominal level [%]")
         axes.set_ylabel("errors of β inside [%]")
-        heights = _apart([float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0)
+        heights = _apart(
+            [float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0
+        )
         for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
             axes.annotate(
                 row.label,
@@ -192,7 +277,14 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
                 fontsize=6.5,
                 va="center",
                 annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "color": row.line.colour, "linewidth": 0.4, "shrinkA": 1, "shrinkB": 2, "relpos": (0, 0.5)},
+                arrowprops={
+                    "arrowstyle": "-",
+                    "color": row.line.colour,
+                    "linewidth": 0.4,
+                    "shrinkA": 1,
+                    "shrinkB": 2,
+                    "relpos": (0, 0.5),
+                },
             )
     return figure
 
@@ -225,14 +317,26 @@ def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[Floa
 def _legend_above(figure: Any, axes: Any) -> None:
     """A legend over the whole width, in the reverse of the order in which lines were drawn."""
     handles, labels = (entries[::-1] for entries in axes.get_legend_handles_labels())
-    fitting = [n for n in range(1, len(labels) + 1) if _legend_width(labels, n) <= figure.get_figwidth()]
+    fitting = [
+        n for n in range(1, len(labels) + 1) if _legend_width(labels, n) <= figure.get_figwidth()
+    ]
     columns = max(fitting, default=1)
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.2, handlelength=2.8)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=columns,
+        columnspacing=1.2,
+        handlelength=2.8,
+    )
 
 
 def _legend_width(labels: Sequence[str], columns: int) -> float:
     """About how wide a legend of 7 pt gets [in]; its entries fill one column after another."""
-    widths = [max(len(label) for label in column) for column in np.array_split(np.array(labels, dtype=object), columns)]
+    widths = [
+        max(len(label) for label in column)
+        for column in np.array_split(np.array(labels, dtype=object), columns)
+    ]
     return sum(0.54 + 0.052 * width for width in widths)
 
 

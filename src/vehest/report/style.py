@@ -80,10 +80,16 @@ REFERENCE = Line(REFERENCE_COLOUR)
 
 def line_of(estimator: str, variant: str = "") -> Line:
     """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour that depends on the name only."""
-    drawn = estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
+    drawn = (
+        estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
+    )
     if drawn is not None:
         return Line(*drawn)
-    return Line(OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)], "solid", "P")
+    return Line(
+        OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)],
+        "solid",
+        "P",
+    )
 
 
 def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
@@ -135,7 +141,11 @@ def significant(value: float, digits: int = 3) -> str:
     """A number to some significant digits, never in exponents between 1e-4 and 1e6; `MISSING` if it is not finite."""
     if not math.isfinite(value):
         return MISSING
-    return _grouped(value, decimals_for([value], digits)) if value == 0 or 1e-4 <= abs(value) < 1e6 else f"{value:.{digits - 1}e}"
+    return (
+        _grouped(value, decimals_for([value], digits))
+        if value == 0 or 1e-4 <= abs(value) < 1e6
+        else f"{value:.{digits - 1}e}"
+    )
 
 
 def decimals_for(values: Sequence[float], digits: int = 3) -> int:

@@ -24,11 +24,15 @@ from vehest.sources.base import open_source, read_single
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml")
 
 
-def align_recording(source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings) -> Alignment:
+def align_recording(
+    source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings
+) -> Alignment:
     """Estimate quantities from one recording; raises `VehestError` where it is not there, cannot be read or does not determine them."""
     with reading(source, overrides) as config:
         recording = _one_recording(source, config, recording_id)
-        refuse_errors(recording, config["dataset"].get("accept") or (), f"recording '{recording.id}'")
+        refuse_errors(
+            recording, config["dataset"].get("accept") or (), f"recording '{recording.id}'"
+        )
         return align(recording, settings)
 
 
@@ -38,11 +42,24 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
     first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; nothing is applied"
     lines: Lines = [first, _parameters(alignment)]
     rows = [
-        [own.channel, *(f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values()), own.unit] for own in alignment.residuals
+        [
+            own.channel,
+            *(f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values()),
+            own.unit,
+        ]
+        for own in alignment.residuals
     ]
     if rows:
-        lines += ["", TerminalTable("", ("residual rms", "before", "after", "and without tilt", "unit"), rows)]
-    lines += [*(f"note: {note}" for note in alignment.notes), f"to correct it: '{override_of(alignment)}'"]
+        lines += [
+            "",
+            TerminalTable(
+                "", ("residual rms", "before", "after", "and without tilt", "unit"), rows
+            ),
+        ]
+    lines += [
+        *(f"note: {note}" for note in alignment.notes),
+        f"to correct it: '{override_of(alignment)}'",
+    ]
     return lines if out is None else [*lines, f"written: {out}"]
 
 
@@ -65,10 +82,16 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
             {"channel": one.channel, "unit": one.unit}
-            | {"rms_before": one.rms["before"], "rms_after": one.rms["after"], "rms_without_tilt": one.rms["rest"]}
+            | {
+                "rms_before": one.rms["before"],
+                "rms_after": one.rms["after"],
+                "rms_without_tilt": one.rms["rest"],
+            }
             for one in alignment.residuals
         ],
-        "correlation": None if correlation is None else {"of": correlation.signal, "peak": correlation.peak, "value": correlation.highest},
+        "correlation": None
+        if correlation is None
+        else {"of": correlation.signal, "peak": correlation.peak, "value": correlation.highest},
         "transforms": alignment.transforms,
         "override": override_of(alignment),
         "notes": alignment.notes,
@@ -81,12 +104,24 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigurationError(f"'{folder}' is not a folder; name a new one")
-    others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.is_dir() else []
+    others = (
+        sorted(path.name for path in folder.iterdir() if path.name not in FILES)
+        if folder.is_dir()
+        else []
+    )
     if others:
-        raise ConfigurationError(f"folder '{folder}' holds other files ('{others[0]}'); name a new one")
+        raise ConfigurationError(
+            f"folder '{folder}' holds other files ('{others[0]}'); name a new one"
+        )
     recording = {"recording": alignment.recording.id, "kind": alignment.recording.kind}
-    table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
-    texts = (_report(alignment), table.to_csv(index=False, lineterminator="\n"), _transforms(alignment))
+    table = pd.DataFrame(
+        [recording | _plain_parameter(parameter) for parameter in alignment.parameters]
+    )
+    texts = (
+        _report(alignment),
+        table.to_csv(index=False, lineterminator="\n"),
+        _transforms(alignment),
+    )
     with written_aside(folder, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in zip(FILES, texts, strict=True):
@@ -98,11 +133,15 @@ def _one_recording(source: str, config: Config, recording_id: str | None) -> Rec
         origin = open_source(config["dataset"])
         known = origin.ids()
         if recording_id is None and len(known) != 1:
-            raise ConfigurationError(f"recordings of data set '{source}': {counted(known)}; choose one by --recording ID")
+            raise ConfigurationError(
+                f"recordings of data set '{source}': {counted(known)}; choose one by --recording ID"
+            )
         return origin.read(known[0] if recording_id is None else recording_id)
     recording = read_single(config["dataset"], Path(source))
     if recording_id not in (None, recording.id):
-        raise ConfigurationError(f"'{source}' holds the recording '{recording.id}', not '{recording_id}'")
+        raise ConfigurationError(
+            f"'{source}' holds the recording '{recording.id}', not '{recording_id}'"
+        )
     return recording
 
 
@@ -111,11 +150,17 @@ def _parameters(alignment: Alignment) -> TerminalTable:
     rows = []
     for parameter in alignment.parameters:
         factor, unit = READ_AS.get(parameter.unit, (1.0, parameter.unit))
-        decimals = min(max(1 - math.floor(math.log10(factor * parameter.uncertainty)), 0), 9) if parameter.uncertainty > 0 else 6
+        decimals = (
+            min(max(1 - math.floor(math.log10(factor * parameter.uncertainty)), 0), 9)
+            if parameter.uncertainty > 0
+            else 6
+        )
         numbers = (parameter.value, parameter.uncertainty, parameter.low, parameter.high)
         value, sigma, low, high = (f"{factor * number:.{decimals}f}" for number in numbers)
         rows.append([parameter.name, value, sigma, f"{low} … {high}", unit])
-    return TerminalTable("", ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows)
+    return TerminalTable(
+        "", ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows
+    )
 
 
 def _report(alignment: Alignment) -> str:
@@ -140,9 +185,16 @@ def _markdown(table: TerminalTable) -> str:
 
 def _transforms(alignment: Alignment) -> str:
     """The transforms as they belong under ``downsample`` in a configuration."""
-    return yaml.safe_dump({"transforms": [dict(transform) for transform in alignment.transforms]}, sort_keys=False, allow_unicode=True)
+    return yaml.safe_dump(
+        {"transforms": [dict(transform) for transform in alignment.transforms]},
+        sort_keys=False,
+        allow_unicode=True,
+    )
 
 
 def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
-    plain = {key: getattr(parameter, key) for key in ("name", "value", "uncertainty", "low", "high", "unit")}
+    plain = {
+        key: getattr(parameter, key)
+        for key in ("name", "value", "uncertainty", "low", "high", "unit")
+    }
     return plain | {"from_scatter": parameter.scatter, "from_tilt": parameter.tilt}

@@ -45,7 +45,9 @@ class StagePlan:
 
     stage: str
     label: str  # start of the folder's name
-    config: Mapping[str, Any]  # the part of the configuration that determines the content, plain values
+    config: Mapping[
+        str, Any
+    ]  # the part of the configuration that determines the content, plain values
     inputs: Mapping[str, str]  # name -> digest
     code: str  # version of the stage's code
     output: Path  # the output root
@@ -53,12 +55,19 @@ class StagePlan:
     @property
     def content(self) -> dict[str, Any]:
         """Everything that determines the content."""
-        return {"stage": self.stage, "config": self.config, "inputs": dict(self.inputs), "code": self.code}
+        return {
+            "stage": self.stage,
+            "config": self.config,
+            "inputs": dict(self.inputs),
+            "code": self.code,
+        }
 
     @property
     def key(self) -> str:
         """Hash of everything that determines the content."""
-        return hashlib.sha256(json.dumps(self.content, sort_keys=True, default=str).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps(self.content, sort_keys=True, default=str).encode()
+        ).hexdigest()
 
     @property
     def folder(self) -> Path:
@@ -144,15 +153,21 @@ def read_artefact(folder: Path) -> Artefact:
     try:
         content = read_json(path)
     except MissingError:
-        raise MissingError(f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it") from None
+        raise MissingError(
+            f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it"
+        ) from None
     if not isinstance(content, dict):
-        raise DataError(f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again")
+        raise DataError(
+            f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again"
+        )
     check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
     manifest = validated(Manifest, content, f"'{path}'")
     files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
     for name, output in manifest.outputs.items():
         if files.get(name) != output.bytes:
-            raise DataError(f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again")
+            raise DataError(
+                f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again"
+            )
     outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
     return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
 
@@ -180,7 +195,13 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
             "key": plan.key,
             "status": status,
             **plan.content,
-            "outputs": {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files},
+            "outputs": {
+                file.relative_to(aside).as_posix(): {
+                    "sha256": sha256_of(file),
+                    "bytes": file.stat().st_size,
+                }
+                for file in files
+            },
             "provenance": provenance() | {"seconds": round(time.monotonic() - started, 3)},
         }
         (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
@@ -219,7 +240,17 @@ def provenance() -> dict[str, Any]:
 @cache
 def library_versions() -> dict[str, str]:
     """Versions of the libraries that numbers depend on."""
-    names = ("torch", "numpy", "scipy", "numba", "pandas", "pyarrow", "hydra-core", "mlflow", "commonroad-vehicle-models")
+    names = (
+        "torch",
+        "numpy",
+        "scipy",
+        "numba",
+        "pandas",
+        "pyarrow",
+        "hydra-core",
+        "mlflow",
+        "commonroad-vehicle-models",
+    )
     versions = {}
     for name in names:
         with suppress(metadata.PackageNotFoundError):
@@ -234,7 +265,9 @@ def commit() -> str:
         return ""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        result = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=10, check=True)
+        result = subprocess.run(
+            command, cwd=CHECKOUT, capture_output=True, text=True, timeout=10, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return ""
     return result.stdout.strip()

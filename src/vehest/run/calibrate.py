@@ -42,7 +42,11 @@ def plan_calibrate(
         return None
     spans = {"train": split.train, "validation": split.validation}
     inputs = {"model": model.digest}
-    inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for own in spans.values() for span in own}
+    inputs |= {
+        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
+        for own in spans.values()
+        for span in own
+    }
     config = {role: [str(span) for span in own] for role, own in spans.items()}
     code = code_of(STAGE, read_description(model.folder).estimator)
     plan = StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output)
@@ -53,11 +57,22 @@ def _write(model_folder: Path, split: Split, data: Mapping[str, Artefact], folde
     """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
 
     def stretch(span: Span) -> Stretch:
-        recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
-        return Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe())
+        recording = read_recording(recording_file(data[span.dataset], span)).cut(
+            span.start - WARM_UP_SECONDS, span.stop
+        )
+        return Stretch(
+            recording, max(span.start, recording.start_time), span.dataset, span.describe()
+        )
 
-    train, validation = ([stretch(span) for span in spans] for spans in (split.train, split.validation))
-    write_trust(learn_trust(load_model(model_folder), train, validation, read_description(model_folder).variant), folder)
+    train, validation = (
+        [stretch(span) for span in spans] for spans in (split.train, split.validation)
+    )
+    write_trust(
+        learn_trust(
+            load_model(model_folder), train, validation, read_description(model_folder).variant
+        ),
+        folder,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +90,9 @@ class Stretch:
         return self.recording.cut(self.start, self.recording.end_time)
 
 
-def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = "") -> Trust:
+def learn_trust(
+    estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = ""
+) -> Trust:
     """Bands, limits of samples and health of a fitted estimator.
 
     Training ranges give scales, limits and relations between channels; validation ranges give factors of bands and, together with the
@@ -88,7 +105,9 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
             _pieces(estimator, validation),
             tuple(estimator.channels),
             vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
-            datasets=tuple(dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)),
+            datasets=tuple(
+                dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)
+            ),
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
             horizon_steps=estimator.horizon_steps,
@@ -98,8 +117,12 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
     try:
         if not train:
             raise DataError("there is no training range to learn limits and health from")
-        guard = learn_limits([stretch.range for stretch in train], estimator.channels, estimator.settings.rate_hz)
-        learnt, stopped = ([stretch.range.without_references() for stretch in part] for part in (train, validation))
+        guard = learn_limits(
+            [stretch.range for stretch in train], estimator.channels, estimator.settings.rate_hz
+        )
+        learnt, stopped = (
+            [stretch.range.without_references() for stretch in part] for part in (train, validation)
+        )
         health = learn_health(learnt, stopped, estimator.channels, estimator.settings.rate_hz)
     except DataError as error:
         notes.append(str(error))
@@ -109,15 +132,30 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
 def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
     """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
     found: list[Piece] = []
-    estimates = estimator.estimate([stretch.recording.without_references() for stretch in stretches])
+    estimates = estimator.estimate(
+        [stretch.recording.without_references() for stretch in stretches]
+    )
     for stretch, estimate in zip(stretches, estimates, strict=True):
         recording = stretch.recording
-        rows, vy, variance = band_inputs(estimate, recording, tuple(estimator.channels), estimator.horizon_steps)
+        rows, vy, variance = band_inputs(
+            estimate, recording, tuple(estimator.channels), estimator.horizon_steps
+        )
         scored = slice(*recording.index_range(stretch.start + SKIP_SECONDS, recording.end_time))
         turned = estimate["sideslip"] - np.arctan2(recording["vy_ref"], recording["vx"])
-        errors = np.stack([vy - recording["vy_ref"], np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi], axis=1)
+        errors = np.stack(
+            [vy - recording["vy_ref"], np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi], axis=1
+        )
         yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
-        found.append(Piece(rows[scored], vy[scored], variance[scored], errors[scored], yaw_rate, recording.rate_hz))
+        found.append(
+            Piece(
+                rows[scored],
+                vy[scored],
+                variance[scored],
+                errors[scored],
+                yaw_rate,
+                recording.rate_hz,
+            )
+        )
     return found
 
 
@@ -152,4 +190,6 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
                 artefact = read_artefact(folder)
                 if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
                     found.append(artefact)
-    return max(found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None)
+    return max(
+        found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None
+    )

@@ -19,7 +19,12 @@ from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
 FORMAT = 1
 WIDENING = 1.5
 """By which the deviations of a record are multiplied before an estimate starts from them."""
-LIMITS = {"leakage": (-0.3, 0.3), "rear_axle": (0.0, 20.0), "compliance": (2e-4, 0.1), "grip": (1.0, 60.0)}
+LIMITS = {
+    "leakage": (-0.3, 0.3),
+    "rear_axle": (0.0, 20.0),
+    "compliance": (2e-4, 0.1),
+    "grip": (1.0, 60.0),
+}
 """Beyond which a number is not one of a car."""
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -43,14 +48,20 @@ class CarRecord:
     rear_axle: Number  # its distance from the inertial unit [m]
     compliance: Number  # C: slip angle of the rear axle over its lateral acceleration, both small [rad s²/m]
     grip: Number  # lateral acceleration at the rear axle's limit [m/s²]
-    offsets: Mapping[str, Mapping[str, Number]]  # drive -> channel -> mean offset [m/s²]; no estimate starts from it
+    offsets: Mapping[
+        str, Mapping[str, Number]
+    ]  # drive -> channel -> mean offset [m/s²]; no estimate starts from it
 
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():
             if not low < getattr(self, name).value < high:
-                raise DataError(f"{name} must lie between {low:g} and {high:g}, not at {getattr(self, name).value:.4g}")
+                raise DataError(
+                    f"{name} must lie between {low:g} and {high:g}, not at {getattr(self, name).value:.4g}"
+                )
         if self.cg_to_rear_axle is not None and self.cg_to_rear_axle >= self.wheelbase:
-            raise DataError(f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {self.cg_to_rear_axle:g}")
+            raise DataError(
+                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {self.cg_to_rear_axle:g}"
+            )
 
 
 def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
@@ -58,7 +69,11 @@ def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     if not isinstance(model, SelfCalibrating):
         what = "a car's record and estimator.KEY=VALUE are for the self-calibrating filter"
         raise ConfigurationError(f"{what}, not for '{model.name}'; leave the model out")
-    new = SelfCalibrating(settings_from_config(SelfCalibrating.settings_type, asdict(model.settings) | changed, "estimator"))
+    new = SelfCalibrating(
+        settings_from_config(
+            SelfCalibrating.settings_type, asdict(model.settings) | changed, "estimator"
+        )
+    )
     new.load_weights(model.weights())
     new.preparation = model.preparation
     return new
@@ -69,14 +84,29 @@ def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) 
 
     Compliance and grip are found anew: tyres and road change them, and estimates that started from them were worse.
     """
-    changed: dict[str, Any] = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
-    base, leakage, rear, point = with_settings(model, changed), record.leakage, record.rear_axle, record.cg_to_rear_axle
+    changed: dict[str, Any] = {
+        "wheelbase": record.wheelbase,
+        "cg_to_rear_axle": record.cg_to_rear_axle,
+    }
+    base, leakage, rear, point = (
+        with_settings(model, changed),
+        record.leakage,
+        record.rear_axle,
+        record.cg_to_rear_axle,
+    )
     if leakage.identified_on:
-        changed |= {"leakage": leakage.value, "leakage_deviation": min(widening * leakage.deviation, base.leakage_deviation)}
+        changed |= {
+            "leakage": leakage.value,
+            "leakage_deviation": min(widening * leakage.deviation, base.leakage_deviation),
+        }
     if rear.identified_on:
         if point is None:  # where the filter's estimates hold without it
             point = rear.value + base.rear_share * (TYPICAL_REAR * record.wheelbase - rear.value)
-        changed |= {"cg_to_rear_axle": point, "imu_deviation": math.hypot(widening * rear.deviation, rear.value - point) / record.wheelbase}
+        changed |= {
+            "cg_to_rear_axle": point,
+            "imu_deviation": math.hypot(widening * rear.deviation, rear.value - point)
+            / record.wheelbase,
+        }
     return with_settings(model, changed)
 
 

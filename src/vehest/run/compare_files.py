@@ -39,7 +39,16 @@ from vehest.studies.kit.standing import standing_columns, verdict_sentences
 SPELLINGS = {
     "time": {"time", "t", "timestamp", "zeit"},
     "vy_ref": {"vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"},
-    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "betaest", "betahat"},
+    "sideslip_ref": {
+        "sideslip",
+        "beta",
+        "β",
+        "slip",
+        "slipangle",
+        "sideslipangle",
+        "betaest",
+        "betahat",
+    },
 }
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
@@ -48,7 +57,9 @@ LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
-def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> tuple[dict[str, Any], list[str | TerminalTable]]:
+def compare_files(
+    recording: Path, words: Sequence[str], models: Sequence[str]
+) -> tuple[dict[str, Any], list[str | TerminalTable]]:
     """Score estimates of other tools, and models, on one recording: for JSON and for a terminal.
 
     Raises `VehestError` where a file or model cannot be used.
@@ -60,17 +71,29 @@ def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) 
         drive = read_table(recording, overrides, references=True)
         estimates = {file.stem: read_estimate_table(file, drive) for file in files}
         if len(estimates) < len(files):
-            raise ConfigurationError("two estimates have the same file name; rename one, since it names the row")
+            raise ConfigurationError(
+                "two estimates have the same file name; rename one, since it names the row"
+            )
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
             about = read_description(folder).about
-            if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
+            if any(
+                span.startswith((f"{drive.id} [", f"{drive.id} ("))
+                for span in (*about.trained_on, *about.validated_on)
+            ):
                 complain(f"warning: '{name}' learnt on this recording: its row is no test")
             estimates[name] = estimate_recording(model, drive.without_references(), trust)
         found = compare_estimates(drive, estimates)
-    cells = [(row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}") for row in found["rows"]]
+    cells = [
+        (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
+        for row in found["rows"]
+    ]
     scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
-    return found, [TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells), scored, found["verdict"]]
+    return found, [
+        TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
+        scored,
+        found["verdict"],
+    ]
 
 
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:
@@ -88,13 +111,21 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
         for name in names:
             if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
                 written = re.search(r"[\[(](.*?)[\])]", name)
-                unit = written and (written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1]))
+                unit = written and (
+                    written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
+                )
                 found.setdefault(quantity, {"column": name, "unit": unit or USUAL_UNITS[quantity]})
     time, channel = found.pop("time", None), next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
         raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
-    options = {"name": file.stem, "source": "tabular", "vehicle": "unknown", "clock": "interpolate", "gappy": [channel]}
+    options = {
+        "name": file.stem,
+        "source": "tabular",
+        "vehicle": "unknown",
+        "clock": "interpolate",
+        "gappy": [channel],
+    }
     table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
     for finding in checks_of_recording(table):
         if finding.check == "impossible":
@@ -102,7 +133,13 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
-    return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
+    return Estimate(
+        vx.id,
+        file.stem,
+        table.rate_hz,
+        table.start_time,
+        {"vy": values, "sideslip": np.zeros_like(values)},
+    )
 
 
 def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
@@ -116,39 +153,77 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> di
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
     if taken := {"zero", "static_map"} & set(estimates):
-        raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
+        raise ConfigurationError(
+            f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file"
+        )
     further = [name for name in ("ay", "yaw_rate") if name in drive]
-    reference = resampled(drive.select(["vx", "vy_ref", *further]), min(RATE_HZ, drive.rate_hz), {"method": "polyphase", "transforms": []})
+    reference = resampled(
+        drive.select(["vx", "vy_ref", *further]),
+        min(RATE_HZ, drive.rate_hz),
+        {"method": "polyphase", "transforms": []},
+    )
     start, stop = _in_common(reference, estimates)
-    span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
+    span, protocol = (
+        Span("", drive.id, start, stop),
+        Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0),
+    )
     candidates = {**estimates, **_baselines(reference, start, stop)}
-    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in candidates.items()}
-    ranking = rank({name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()}, reference.rate_hz)
-    titles = {name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0]) for name in ranking.order}
+    scored = {
+        (name, ""): score(estimate, reference, span, protocol)
+        for name, estimate in candidates.items()
+    }
+    ranking = rank(
+        {name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()},
+        reference.rate_hz,
+    )
+    titles = {
+        name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0])
+        for name in ranking.order
+    }
     verdict = verdict_sentences(ranking, titles, "this recording")
     for words in ("**", " over its seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
     rows = []
     for ranked in ranking.order:
         errors = accuracy([scored[ranked]])
-        figures = {key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}
+        figures = {
+            key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
+        }
         rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
-    return {"rows": rows, "verdict": verdict, "start": start, "stop": stop, "rate_hz": reference.rate_hz}
+    return {
+        "rows": rows,
+        "verdict": verdict,
+        "start": start,
+        "stop": stop,
+        "rate_hz": reference.rate_hz,
+    }
 
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
     """Start and end [s] of the part in which every estimate and the reference have values."""
     known = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
     times = {"the reference": reference.time[known]}
-    times |= {f"'{name}'": estimate.time[np.isfinite(estimate["vy"])] for name, estimate in estimates.items()}
+    times |= {
+        f"'{name}'": estimate.time[np.isfinite(estimate["vy"])]
+        for name, estimate in estimates.items()
+    }
     if empty := [name for name, own in times.items() if not len(own)]:
         raise DataError(f"{empty[0]} has no value at all")
-    start, stop = max(float(own[0]) for own in times.values()), min(float(own[-1]) for own in times.values())
+    start, stop = (
+        max(float(own[0]) for own in times.values()),
+        min(float(own[-1]) for own in times.values()),
+    )
     if stop - start < LEAST_SECONDS:
-        ranges = ", ".join(f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items())
-        raise DataError(f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?")
+        ranges = ", ".join(
+            f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items()
+        )
+        raise DataError(
+            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?"
+        )
     if reference.rate_hz < LOWEST_RATE:
-        raise DataError(f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need {LOWEST_RATE:g} Hz or more")
+        raise DataError(
+            f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need {LOWEST_RATE:g} Hz or more"
+        )
     return start, stop
 
 
@@ -159,17 +234,25 @@ def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Est
         with suppress(DataError):
             found["static_map"] = _held_out_map(reference, start, stop)
     clock = (reference.rate_hz, reference.start_time)
-    return {name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)}) for name, vy in found.items()}
+    return {
+        name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)})
+        for name, vy in found.items()
+    }
 
 
 def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
     """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
     middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
-    for fitted, held_out in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
+    for fitted, held_out in (
+        ((start, middle), reference.time >= middle),
+        ((middle, stop), reference.time < middle),
+    ):
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
         kept = {name: values[clean] for name, values in part.channels.items()}
         model = StaticMap(StaticMap.settings_type(reference.rate_hz))
-        model.values = model.closed_form([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
+        model.values = model.closed_form(
+            [Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)]
+        )
         vy[held_out] = model.run(reference.stack(model.channels)[held_out], None)[0]["vy"]
     return vy

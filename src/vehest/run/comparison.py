@@ -29,7 +29,9 @@ from vehest.run.usable import lack
 NO_TIME = "not done yet: no time was left, the same command goes on"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
-Note = tuple[str, str]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
+Note = tuple[
+    str, str
+]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
 
 
 @dataclass
@@ -42,10 +44,14 @@ class Comparison:
 
     jobs: Sequence[Job]
     groups: Sequence[Group] = ()  # trainings that fit one batch
-    facts: Sequence[str] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
+    facts: Sequence[
+        str
+    ] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
-    found: Mapping[str, Member] = field(default_factory=dict)  # key of a training -> its trained and evaluated member
+    found: Mapping[str, Member] = field(
+        default_factory=dict
+    )  # key of a training -> its trained and evaluated member
 
     @property
     def usable(self) -> list[Job]:
@@ -67,7 +73,9 @@ class Comparison:
     @property
     def failed(self) -> dict[str, str]:
         """Name of what is left out -> why."""
-        return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
+        return {
+            name: failure.message for name, failure in named_failures(self.jobs)
+        } | dict.fromkeys(self.unfinished, NO_TIME)
 
     def plan(self, runner: Runner) -> Sequence[Group]:
         """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.
@@ -79,13 +87,17 @@ class Comparison:
         evaluated = "evaluation" in usable[0].config
         try:
             split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
-            notes = dict.fromkeys(note for job in usable for note in _fit_to_recordings(job, split, contents))
+            notes = dict.fromkeys(
+                note for job in usable for note in _fit_to_recordings(job, split, contents)
+            )
             print_notes(notes, runner)
             self._print_failures(usable, runner)
             checked = self.usable
             for job in checked:
                 try:
-                    data = runner.data_for(split, new_estimator(job.config["estimator"]).settings.rate_hz, job.config)
+                    data = runner.data_for(
+                        split, new_estimator(job.config["estimator"]).settings.rate_hz, job.config
+                    )
                     training = plan_training(job.config, split, data)
                     check_channels(faults_of(job.config), split, data)
                     _check_name(job, training, names)
@@ -101,7 +113,9 @@ class Comparison:
                 runner.messages.line("plan", "train", name)
             raise
         if not self.usable:
-            reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))
+            reasons = "; ".join(
+                dict.fromkeys(job.failure.message for job in usable if job.failure is not None)
+            )
             known = ", ".join(f"'vehest data usable {name}'" for name in split.datasets)
             raise DataError(
                 f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
@@ -111,9 +125,18 @@ class Comparison:
         self.groups = self._groups(split, runner.force, evaluated=evaluated)
         if evaluated:
             configs = [job.config for job in checked]
-            self.facts = [*training_facts(configs), resampling_fact(configs), *(f"{what} {text}" for what, text in notes)]
-            datasets = {name: runner.dataset_config(name, usable[0].config)["dataset"] for name in split.datasets}
-            self.data_titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
+            self.facts = [
+                *training_facts(configs),
+                resampling_fact(configs),
+                *(f"{what} {text}" for what, text in notes),
+            ]
+            datasets = {
+                name: runner.dataset_config(name, usable[0].config)["dataset"]
+                for name in split.datasets
+            }
+            self.data_titles = {
+                name: str(dataset.get("title", name)) for name, dataset in datasets.items()
+            }
         return self.groups
 
     def _groups(self, split: Split, force: frozenset[str], *, evaluated: bool) -> list[Group]:
@@ -124,16 +147,26 @@ class Comparison:
                 of_training.setdefault(job.training.plan.key, (job.training, []))[1].append(job)
         groups: dict[Any, list[TrainJob]] = {}
         for training, jobs in of_training.values():
-            faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
+            faults = all_of(
+                faults_of(job.config) for job in (jobs if jobs[0].label else self.usable)
+            )
             groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
         return [
-            Group(own, split, replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None, force, label)
+            Group(
+                own,
+                split,
+                replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None,
+                force,
+                label,
+            )
             for (_, faults, label), own in groups.items()
         ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
         """Take what became of the trainings: key of each -> its member, or why it failed."""
-        self.found = {key: member for key, member in members.items() if member.evaluation is not None}
+        self.found = {
+            key: member for key, member in members.items() if member.evaluation is not None
+        }
         for job in self.usable:
             if job.training is not None:
                 job.failure = failed.get(job.training.plan.key)
@@ -143,7 +176,9 @@ class Comparison:
             runner.messages.line("fail", "train", name, failure.message)
 
 
-def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> list[Note]:
+def _fit_to_recordings(
+    job: Job, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]
+) -> list[Note]:
     """Lower the rates of a job to those of recordings; it fails where these lack something."""
     job.config, notes = lower_rate(job.config, "evaluation", slowest(contents))
     try:
@@ -159,7 +194,10 @@ def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[R
 
 def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSummary:
     """The recording with the lowest rate of all data sets."""
-    return min((recording for recordings in contents.values() for recording in recordings), key=lambda recording: recording.rate_hz)
+    return min(
+        (recording for recordings in contents.values() for recording in recordings),
+        key=lambda recording: recording.rate_hz,
+    )
 
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
@@ -169,24 +207,39 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):
-        raise DataError(f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out for that")
+        raise DataError(
+            f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out for that"
+        )
     lowered = {**config, group: {**config[group], "rate_hz": lowest}}
     if group == "evaluation":
-        return lowered, [(group, f"reads estimates at {lowest:g} Hz instead of {rate:g} Hz, since {sampled}")]
+        return lowered, [
+            (group, f"reads estimates at {lowest:g} Hz instead of {rate:g} Hz, since {sampled}")
+        ]
     name = new_estimator(config["estimator"]).name
     try:
         settings = new_estimator(lowered["estimator"]).settings
     except ConfigurationError as error:
-        raise DataError(f"estimator '{name}' cannot run at {lowest:g} Hz, and {sampled}: {error}") from None
+        raise DataError(
+            f"estimator '{name}' cannot run at {lowest:g} Hz, and {sampled}: {error}"
+        ) from None
     samples = {"estimator.window": getattr(settings, "window", None)}  # a float counts seconds
-    samples |= {f"training.{key}": value for key, value in config["training"].items() if key == "steps" or key.endswith("_steps")}
+    samples |= {
+        f"training.{key}": value
+        for key, value in config["training"].items()
+        if key == "steps" or key.endswith("_steps")
+    }
     lengths = [
         f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} s "
         f"({key}={max(1, round(number * lowest / rate))} keeps that)"
         for key, number in samples.items()
         if isinstance(number, int) and number > 0
     ]
-    return lowered, [(name, f"runs at {lowest:g} Hz instead of its {rate:g} Hz, since {sampled}{''.join(lengths)}")]
+    return lowered, [
+        (
+            name,
+            f"runs at {lowest:g} Hz instead of its {rate:g} Hz, since {sampled}{''.join(lengths)}",
+        )
+    ]
 
 
 def print_notes(notes: Iterable[Note], runner: Runner) -> None:
@@ -198,7 +251,9 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
             runner.messages.line(*line)
 
 
-def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
+def plan_training(
+    config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]
+) -> TrainJob:
     """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
 
     Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
@@ -208,7 +263,9 @@ def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Ar
     if start is None:
         return job
     folder = find_model(str(start), job.plan.output, lambda _: None)
-    plan = replace(job.plan, inputs={**job.plan.inputs, f"start from {start}": model_artefact(folder).digest})
+    plan = replace(
+        job.plan, inputs={**job.plan.inputs, f"start from {start}": model_artefact(folder).digest}
+    )
     return replace(job, plan=plan, training={**job.training, "start_from": str(folder.resolve())})
 
 
@@ -244,18 +301,25 @@ def _names(jobs: Iterable[Job]) -> list[str]:
             estimator = new_estimator(job.config["estimator"])
             stem = f"{estimator.name}-{estimator.variant}"
         seeds.setdefault(stem, []).append(str(job.config["seed"]))
-    return [f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()]
+    return [
+        f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()
+    ]
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:
     """How recordings came to the rates that estimators work at."""
-    rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(configs[0]["evaluation"]["rate_hz"])})
+    rates = sorted(
+        {float(config["estimator"]["rate_hz"]) for config in configs}
+        | {float(configs[0]["evaluation"]["rate_hz"])}
+    )
     options = configs[0]["downsample"]
     how = {
         "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
         "decimate": "by plain decimation",
     }[options["method"]]
-    first = f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
+    first = (
+        f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
+    )
     return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
 
 
@@ -263,10 +327,19 @@ def training_facts(configs: Sequence[Config]) -> list[str]:
     """The budget of each training scheme, a line each."""
     schemes: dict[str, set[str]] = {}
     for config in configs:
-        schemes.setdefault(json.dumps(config["training"], default=str), set()).add(config["estimator"]["name"])
+        schemes.setdefault(json.dumps(config["training"], default=str), set()).add(
+            config["estimator"]["name"]
+        )
     facts = []
     for text, names in schemes.items():
         training = json.loads(text)
-        options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
-        facts.append(f"{', '.join(sorted(names))}: " + (f"{training['name']} ({options})" if options else "nothing is trained"))
+        options = ", ".join(
+            f"{key} {value}"
+            for key, value in training.items()
+            if key not in {"name", "checkpoint_seconds", "compiled"}
+        )
+        facts.append(
+            f"{', '.join(sorted(names))}: "
+            + (f"{training['name']} ({options})" if options else "nothing is trained")
+        )
     return list(dict.fromkeys(facts))

@@ -87,7 +87,9 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         *local, _, papers = conf_folders()
         for folder in local:
-            search_path.prepend("local", f"file://{folder.resolve()}")  # Hydra takes it literally, spaces too
+            search_path.prepend(
+                "local", f"file://{folder.resolve()}"
+            )  # Hydra takes it literally, spaces too
         search_path.append("papers", f"file://{papers}")
 
 
@@ -106,7 +108,9 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         Plugins.instance().register(_LocalFirst)
     try:
         with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
-            composed = compose(command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in read)])
+            composed = compose(
+                command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in read)]
+            )
         resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration
         if isinstance(error, FileNotFoundError) and error.filename is None:
@@ -114,22 +118,36 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         raise ConfigurationError(_one_line(error, command)) from None
     validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]
-    return {str(key): value for key, value in resolved.items()} | ({GIVEN: chosen} if chosen else {})
+    return {str(key): value for key, value in resolved.items()} | (
+        {GIVEN: chosen} if chosen else {}
+    )
 
 
 def _check(override: Override) -> None:
     """Refuse what Hydra would take, or answer with less help."""
     group, text = override.key_or_group, _shortened(override.input_line)
     if override.is_sweep_override():
-        raise ConfigurationError(f"'{text}' names several values; one is wanted here (pipelines and sweeps take several)")
+        raise ConfigurationError(
+            f"'{text}' names several values; one is wanted here (pipelines and sweeps take several)"
+        )
     if override.is_delete() and "." not in group:
-        raise ConfigurationError(f"'{text}': only keys inside a group can be removed, for example ~dataset.channels.steer")
+        raise ConfigurationError(
+            f"'{text}': only keys inside a group can be removed, for example ~dataset.channels.steer"
+        )
     if re.match(r"hydra\b", group):
-        raise ConfigurationError(f"'{text}' is an option of Hydra itself, which vehest does not take")
-    if group in GROUPS and not override.is_delete() and str(override.value()) not in (known := choices(group)):
+        raise ConfigurationError(
+            f"'{text}' is an option of Hydra itself, which vehest does not take"
+        )
+    if (
+        group in GROUPS
+        and not override.is_delete()
+        and str(override.value()) not in (known := choices(group))
+    ):
         close = difflib.get_close_matches(str(override.value()), known, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
-        raise ConfigurationError(f"{group}={override.value()} is not there; {hint}choices: {', '.join(known)}")
+        raise ConfigurationError(
+            f"{group}={override.value()} is not there; {hint}choices: {', '.join(known)}"
+        )
 
 
 def _one_line(error: Exception, command: str) -> str:
@@ -138,12 +156,19 @@ def _one_line(error: Exception, command: str) -> str:
         return f"the configuration of '{command}' cannot be read ({first_line(error)})"
     text = str(error).strip()
     if unknown := re.search(r"Could not override '([^']+)'", text):
-        hint = option_hint(unknown[1]) or f"; 'vehest config {command}' prints the options there are; +{unknown[1]}=… adds one"
+        hint = (
+            option_hint(unknown[1])
+            or f"; 'vehest config {command}' prints the options there are; +{unknown[1]}=… adds one"
+        )
         return f"unknown option '{unknown[1]}'{hint}"
     if missing := re.search(r"You must specify '([^']+)'", text):
         return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
     key = getattr(error, "full_key", None)
-    return f"{key}: {text.splitlines()[0]}" if key else " ".join(line.strip() for line in text.splitlines()[:2])
+    return (
+        f"{key}: {text.splitlines()[0]}"
+        if key
+        else " ".join(line.strip() for line in text.splitlines()[:2])
+    )
 
 
 @lru_cache(maxsize=4096)
@@ -151,13 +176,21 @@ def parsed(text: str) -> Override:
     """An override, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
     try:
         override = OverridesParser.create().parse_override(text)
-        if override.key_or_group in GROUPS and isinstance(override.value(), float):  # a choice called nan or inf
-            return OverridesParser.create().parse_override(f"{override.get_key_element()}='{override.value()}'")
+        if override.key_or_group in GROUPS and isinstance(
+            override.value(), float
+        ):  # a choice called nan or inf
+            return OverridesParser.create().parse_override(
+                f"{override.get_key_element()}='{override.value()}'"
+            )
         return override
     except (HydraException, ValueError, ArithmeticError, TypeError, RecursionError) as error:
         if isinstance(error, HydraException) and "=" not in text:
-            raise ConfigurationError(f"'{text}' is not an override; write key=value, for example estimator=ksnn") from None
-        raise ConfigurationError(f"override '{_shortened(text)}' cannot be read ({first_line(error)}); quote special characters") from None
+            raise ConfigurationError(
+                f"'{text}' is not an override; write key=value, for example estimator=ksnn"
+            ) from None
+        raise ConfigurationError(
+            f"override '{_shortened(text)}' cannot be read ({first_line(error)}); quote special characters"
+        ) from None
 
 
 def count(overrides: Sequence[str]) -> int:
@@ -177,10 +210,16 @@ def _values(override: Override) -> list[str]:
         return [str(override.input_line)]
     text, value = _shortened(override.input_line), override.value()
     try:
-        found = value.filter(choices(override.key_or_group)) if isinstance(value, Glob) else override.sweep_string_iterator()
+        found = (
+            value.filter(choices(override.key_or_group))
+            if isinstance(value, Glob)
+            else override.sweep_string_iterator()
+        )
         values = list(islice(found, current_limits().jobs + 1))
     except (HydraException, ValueError, ArithmeticError, TypeError) as error:
-        raise ConfigurationError(f"override '{text}' cannot be read ({first_line(error)})") from None
+        raise ConfigurationError(
+            f"override '{text}' cannot be read ({first_line(error)})"
+        ) from None
     if not values:
         raise ConfigurationError(f"'{text}' stands for no value")
     return [f"{override.get_key_element()}={value}" for value in values]
@@ -216,26 +255,38 @@ def option_hint(key: str) -> str:
 def has_key(config: Config, key: str) -> bool:
     """Whether a dotted key is in a configuration."""
     first, _, rest = key.partition(".")
-    return isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
+    return (
+        isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
+    )
 
 
 def as_yaml(config: Config) -> str:
     """A configuration as YAML, control characters as escapes."""
     text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, width=120)
-    return text if printable(text, keep="\n") == text else yaml.safe_dump(config, sort_keys=False, allow_unicode=False, width=120)
+    return (
+        text
+        if printable(text, keep="\n") == text
+        else yaml.safe_dump(config, sort_keys=False, allow_unicode=False, width=120)
+    )
 
 
 def positive_rate(value: Any, name: str) -> float:
     """A rate [Hz] of a configuration; raises `ConfigurationError` unless it is a positive number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
-        raise ConfigurationError(f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20")
+        raise ConfigurationError(
+            f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20"
+        )
     return float(value)
 
 
 def missing_keys(config: Any, prefix: str = "") -> list[str]:
     """Dotted keys that still hold ``???``."""
     if isinstance(config, dict):
-        return [found for key, value in config.items() for found in missing_keys(value, f"{prefix}{key}.")]
+        return [
+            found
+            for key, value in config.items()
+            for found in missing_keys(value, f"{prefix}{key}.")
+        ]
     return [prefix.rstrip(".")] if config == "???" else []
 
 

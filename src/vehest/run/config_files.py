@@ -23,7 +23,9 @@ def conf_folders() -> list[Path]:
 
 def choices(group: str) -> list[str]:
     """Names that a group offers, from all folders together."""
-    return sorted({file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")})
+    return sorted(
+        {file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")}
+    )
 
 
 def is_file_name(word: str) -> bool:
@@ -35,9 +37,22 @@ def find_pipeline(name: str) -> Path | None:
     """A pipeline by path or by name: as given, then ./pipelines, then the packaged ones."""
     given = Path(name)
     file = f"{given.name.removesuffix('.yaml')}.yaml"
-    return next((path for path in (given, Path("pipelines") / file, packaged("pipelines") / file) if path.is_file()), None)
+    return next(
+        (
+            path
+            for path in (given, Path("pipelines") / file, packaged("pipelines") / file)
+            if path.is_file()
+        ),
+        None,
+    )
 
 
 def pipeline_names() -> list[str]:
     """Names of the pipelines in ./pipelines and in the package."""
-    return sorted({file.stem for folder in (Path("pipelines"), packaged("pipelines")) for file in folder.glob("*.yaml")})
+    return sorted(
+        {
+            file.stem
+            for folder in (Path("pipelines"), packaged("pipelines"))
+            for file in folder.glob("*.yaml")
+        }
+    )

@@ -44,14 +44,30 @@ def examine() -> Iterator[Item]:
 
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
-    yield Item("ok", "configuration", f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}")
+    yield Item(
+        "ok",
+        "configuration",
+        f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}",
+    )
     yield _kernels()
-    absent = [f"{use} need 'vehest[{extra}]'" for extra, (package, use) in EXTRAS.items() if importlib.util.find_spec(package) is None]
-    extras = f"{'; '.join(absent)}: pip install it where you need it" if absent else f"{', '.join(EXTRAS)} are there"
+    absent = [
+        f"{use} need 'vehest[{extra}]'"
+        for extra, (package, use) in EXTRAS.items()
+        if importlib.util.find_spec(package) is None
+    ]
+    extras = (
+        f"{'; '.join(absent)}: pip install it where you need it"
+        if absent
+        else f"{', '.join(EXTRAS)} are there"
+    )
     yield Item("warning" if absent else "ok", "extras", extras)
     root = os.environ.get("VEHEST_DATA")
     if not root:
-        yield Item("warning", "recordings", "VEHEST_DATA is not set; only simulated data sets work without root=FOLDER")
+        yield Item(
+            "warning",
+            "recordings",
+            "VEHEST_DATA is not set; only simulated data sets work without root=FOLDER",
+        )
     elif not Path(root).is_dir():
         yield Item("error", "recordings", f"VEHEST_DATA is '{root}', which is no folder")
     else:
@@ -64,7 +80,11 @@ def examine() -> Iterator[Item]:
     free = shutil.disk_usage(".").free / 1e9
     yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
     yield Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")
-    yield Item("ok", "GPU", f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run on the processor")
+    yield Item(
+        "ok",
+        "GPU",
+        f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run on the processor",
+    )
 
 
 def _kernels() -> Item:
@@ -75,5 +95,9 @@ def _kernels() -> Item:
 
         observe(np.array([[0.5, 20.0, 9.0, 0.0]]), 5.0, 0.1, 0.01)
     except Exception as error:
-        return Item("warning", "compiled recursions", f"numba does not work; use training.compiled=false ({first_line(error)})")
+        return Item(
+            "warning",
+            "compiled recursions",
+            f"numba does not work; use training.compiled=false ({first_line(error)})",
+        )
     return Item("ok", "compiled recursions", "numba compiles and runs")

@@ -17,29 +17,49 @@ from vehest.run.versions import code_of
 STAGE = "downsample"
 
 
-def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
+def plan_downsample(
+    ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path
+) -> StagePlan:
     """The artefact of a downsampling; raises `ConfigurationError` for a rate, method or transform that makes no sense."""
-    config = {"rate_hz": float(rate_hz), "method": options["method"], "transforms": list(options.get("transforms") or [])}
+    config = {
+        "rate_hz": float(rate_hz),
+        "method": options["method"],
+        "transforms": list(options.get("transforms") or []),
+    }
     transforms_of(config)
-    return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of(STAGE), output)
+    return StagePlan(
+        STAGE,
+        f"{ingested.label}-{rate_hz:g}hz",
+        config,
+        dict(ingested.outputs),
+        code_of(STAGE),
+        output,
+    )
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:
     """Transform and resample every recording into ``folder``."""
     for name in ingested.outputs:
-        write_recording(resampled(read_recording(ingested.folder / name), config["rate_hz"], config), folder / name)
+        write_recording(
+            resampled(read_recording(ingested.folder / name), config["rate_hz"], config),
+            folder / name,
+        )
 
 
 def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, Any]) -> Recording:
     """A recording, after the transforms of a preparation and by its method, at a rate that is no higher; else raises `DataError`."""
     if recording.rate_hz < rate_hz * (1 - 1e-9):
-        raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed")
+        raise DataError(
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed"
+        )
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)
     return recording
 
 
-def resampled_parts(parts: Iterable[Recording], rate_hz: float, preparation: Mapping[str, Any]) -> Iterator[Recording]:
+def resampled_parts(
+    parts: Iterable[Recording], rate_hz: float, preparation: Mapping[str, Any]
+) -> Iterator[Recording]:
     """`resampled` for a recording that comes in parts, to the same bits; a preparation with other transforms needs it whole."""
     if preparation["transforms"]:
         parts = [joined(list(parts))]
@@ -62,4 +82,7 @@ def resampled_parts(parts: Iterable[Recording], rate_hz: float, preparation: Map
 
 def transforms_of(config: Mapping[str, Any]) -> list[Transform]:
     """The transforms of a downsampling, in order."""
-    return [*map(transform_from_config, config["transforms"]), Resample(float(config["rate_hz"]), config["method"])]
+    return [
+        *map(transform_from_config, config["transforms"]),
+        Resample(float(config["rate_hz"]), config["method"]),
+    ]

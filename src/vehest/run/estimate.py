@@ -49,7 +49,9 @@ from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, rea
 from vehest.trust.record import Trust, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
-SHARPEST_TURN = 0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
+SHARPEST_TURN = (
+    0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
+)
 LARGEST_FROUDE = 400.0  # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 PRETRAINED, SELF_CALIBRATING = "pretrained", "self_calibrating"
@@ -74,18 +76,26 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     found = [folder for folder in models if folder.match(f"{given.name}*")]
     if name in WITH_VEHEST:
         if found:
-            say(f"'{name}' is the model that comes with vehest; yours are {counted([folder.name for folder in found])}")
+            say(
+                f"'{name}' is the model that comes with vehest; yours are {counted([folder.name for folder in found])}"
+            )
         return pretrained_folder(name)
     if not found:
         known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
-        raise MissingError(f"there is no model '{name}', neither a folder nor in {known}; train one first")
+        raise MissingError(
+            f"there is no model '{name}', neither a folder nor in {known}; train one first"
+        )
     newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
     if len(found) > 1:
-        say(f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}")
+        say(
+            f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}"
+        )
     return newest
 
 
-def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Path, Estimator, Trust | None]:
+def open_model(
+    name: str, output: Path, say: Callable[[str], None]
+) -> tuple[Path, Estimator, Trust | None]:
     """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration."""
     folder = find_model(name, output, say)
     model = load_model(folder)
@@ -93,7 +103,9 @@ def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Pat
     return folder, model, trust_of(folder, output)
 
 
-def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None) -> dict[str, Any]:
+def estimate_file(
+    words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None
+) -> dict[str, Any]:
     """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
 
     Args:
@@ -107,9 +119,15 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         VehestError: model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
-    name, file, overrides = (words[0] if n_names == 2 else SELF_CALIBRATING), Path(words[n_names - 1]), words[n_names:]
+    name, file, overrides = (
+        (words[0] if n_names == 2 else SELF_CALIBRATING),
+        Path(words[n_names - 1]),
+        words[n_names:],
+    )
     if n_names == 1 and file.is_dir():
-        raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
+        raise ConfigurationError(
+            f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv"
+        )
     if out.suffix.lower() in LOGS:
         check_log_name(file, out)
     else:
@@ -124,7 +142,9 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     with use_limits(limits_from_config(config["limits"])):
         dataset = _without_references(config["dataset"])
         accepted, source = dataset.get("accept") or (), source_of_file(dataset, file)
-        parts = ((part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file))
+        parts = (
+            (part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file)
+        )
         first, known = next(parts)
         remarks: list[str] = []
         if name == SELF_CALIBRATING:
@@ -137,7 +157,11 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
                 remarks.append("there is no channel ax: estimator.measured_ax=false")
         if settings:
             model = with_settings(model, settings)
-            if trust is not None and trust.health is not None and trust.health.channels != model.channels:
+            if (
+                trust is not None
+                and trust.health is not None
+                and trust.health.channels != model.channels
+            ):
                 trust = replace(trust, health=None)  # of a channel that is not measured
         if car is not None:
             model = calibrated(model, read_car(car))
@@ -145,13 +169,20 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
-        run, log = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first)), out.suffix.lower() in LOGS
+        run, log = (
+            GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first)),
+            out.suffix.lower() in LOGS,
+        )
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
             first = joined(list(drive))
             drive = iter([first])
-        needed = resampled_parts((part.select(model.channels) for part in drive), model.settings.rate_hz, model.preparation)
+        needed = resampled_parts(
+            (part.select(model.channels) for part in drive),
+            model.settings.rate_hz,
+            model.preparation,
+        )
         estimates = report.counted(_estimates(run, needed))
         if log:
             (estimate,) = estimates
@@ -171,7 +202,11 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         **report.summary(),
         "verdict": report.verdict(),
         "findings": findings,
-        **({"note": " ".join(read_description(folder).about.note.split())} if name in WITH_VEHEST else {}),
+        **(
+            {"note": " ".join(read_description(folder).about.note.split())}
+            if name in WITH_VEHEST
+            else {}
+        ),
     }
 
 
@@ -189,7 +224,9 @@ def _estimates(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """Settings of an estimator among overrides, ``estimator.KEY=VALUE``, and the others; raises `ConfigurationError` on bad syntax."""
     own = [override for override in overrides if key_of(override).startswith("estimator.")]
-    return {key_of(one).partition(".")[2]: value_of(one) for one in own}, [one for one in overrides if one not in own]
+    return {key_of(one).partition(".")[2]: value_of(one) for one in own}, [
+        one for one in overrides if one not in own
+    ]
 
 
 def model_artefact(folder: Path) -> Artefact:
@@ -197,13 +234,17 @@ def model_artefact(folder: Path) -> Artefact:
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != TRAIN:
-            raise ConfigurationError(f"'{folder}' holds no model but an artefact of the stage '{artefact.stage}'")
+            raise ConfigurationError(
+                f"'{folder}' holds no model but an artefact of the stage '{artefact.stage}'"
+            )
         return artefact
     about = read_description(folder)
     outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
     key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
     config = {"estimator": dict(about.settings), "train": [], "validation": []}
-    return Artefact(folder, TRAIN, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True)
+    return Artefact(
+        folder, TRAIN, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True
+    )
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
@@ -228,11 +269,26 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     """Options of a data set without its reference channels; not validated yet."""
     channels, transforms = dataset.get("channels"), dataset.get("transforms")
     if isinstance(channels, dict):
-        channels = {name: entry for name, entry in channels.items() if not str(name).endswith(REFERENCE_SUFFIX)}
+        channels = {
+            name: entry
+            for name, entry in channels.items()
+            if not str(name).endswith(REFERENCE_SUFFIX)
+        }
     if isinstance(transforms, list | tuple):
-        transforms = [entry for entry in transforms if not (isinstance(entry, dict) and str(entry.get("name")) in OF_REFERENCES)]
-    changed = {"channels": channels or None, "transforms": transforms or None, "reference_point": None, "pose": None}
-    return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
+        transforms = [
+            entry
+            for entry in transforms
+            if not (isinstance(entry, dict) and str(entry.get("name")) in OF_REFERENCES)
+        ]
+    changed = {
+        "channels": channels or None,
+        "transforms": transforms or None,
+        "reference_point": None,
+        "pose": None,
+    }
+    return {key: value for key, value in dataset.items() if key not in changed} | {
+        key: new for key, new in changed.items() if new
+    }
 
 
 def finding_in_words(finding: Finding) -> str:
@@ -240,10 +296,17 @@ def finding_in_words(finding: Finding) -> str:
     return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
-def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None = None) -> list[Finding]:
+def findings_of(
+    recording: Recording,
+    model: Estimator,
+    accepted: Sequence[str],
+    known: Sequence[Finding] | None = None,
+) -> list[Finding]:
     """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
     read = [name for name in model.channels if name in recording]
-    if known is not None and (set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)):
+    if known is not None and (
+        set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)
+    ):
         findings = list(known)
     else:
         findings = checks_of_recording(recording.select(read)) if read else []
@@ -251,7 +314,9 @@ def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str],
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
-            raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
+            raise DataError(
+                f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])"
+            )
     return findings + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
@@ -264,24 +329,45 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what, remedy = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size", "give estimator.wheelbase"
+    what, remedy = (
+        f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size",
+        "give estimator.wheelbase",
+    )
     if wheelbase * turn > SHARPEST_TURN:
-        return [Finding("warning", "wheelbase", "", f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}")]
+        return [
+            Finding(
+                "warning",
+                "wheelbase",
+                "",
+                f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}",
+            )
+        ]
     fast = float(np.quantile(speed, 0.99))
     if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
-        return [Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")]
+        return [
+            Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")
+        ]
     return []
 
 
-def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
+def estimate_recording(
+    model: Estimator, recording: Recording, trust: Trust | None = None
+) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
-    needed, run = prepared_recording(model, recording), GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
+    needed, run = (
+        prepared_recording(model, recording),
+        GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording)),
+    )
     return require_estimate(model, recording, run(needed.channels, needed))
 
 
-def prepared_recording(model: Estimator, recording: Recording, rate_hz: float | None = None) -> Recording:
+def prepared_recording(
+    model: Estimator, recording: Recording, rate_hz: float | None = None
+) -> Recording:
     """The channels that a model reads, at its rate or another one [Hz]; raises as `estimate_recording` does."""
-    return resampled(recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation)
+    return resampled(
+        recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation
+    )
 
 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
@@ -292,7 +378,9 @@ def require_estimate(model: Estimator, recording: Recording, estimate: Estimate)
 
 
 def _too_short(model: Estimator, recording_id: str, seconds: float) -> DataError:
-    return DataError(f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to estimate anything")
+    return DataError(
+        f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to estimate anything"
+    )
 
 
 def write_estimate_table(parts: Iterable[Estimate], path: Path) -> None:
@@ -314,7 +402,10 @@ def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
     """Cells of a table of text, with the reasons of health in words."""
     cells: dict[str, list[Any]] = {"time": columns["time"].tolist()}
     own = {name: values for name, values in columns.items() if name in QUANTITIES}
-    cells |= {name: ["" if np.isnan(value) else value for value in values.tolist()] for name, values in own.items()}
+    cells |= {
+        name: ["" if np.isnan(value) else value for value in values.tolist()]
+        for name, values in own.items()
+    }
     if "health" in columns:
         cells["health"] = columns["health"].astype(int).tolist()
         cells["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
@@ -323,7 +414,9 @@ def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
 
 def _check_table_name(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"'{path}' must end in {', '.join(SUFFIXES)} or, as a log with further channels, {' or '.join(LOGS)}")
+        raise ConfigurationError(
+            f"'{path}' must end in {', '.join(SUFFIXES)} or, as a log with further channels, {' or '.join(LOGS)}"
+        )
 
 
 class _Report:
@@ -335,7 +428,9 @@ class _Report:
         strict: name of the file if findings are an error.
     """
 
-    def __init__(self, model: Estimator, trust: Trust | None, accepted: Sequence[str], strict: str | None) -> None:
+    def __init__(
+        self, model: Estimator, trust: Trust | None, accepted: Sequence[str], strict: str | None
+    ) -> None:
         self.model, self.accepted, self.strict = model, accepted, strict
         self.health = trust.health if trust is not None else None
         self.findings: list[list[Finding]] = []
@@ -355,7 +450,9 @@ class _Report:
             self.findings.append(found)
             self.seconds += part.duration
             if self.health is not None:
-                self.outside = self.outside + outside_domain(self.health, {name: part[name] for name in self.health.channels})
+                self.outside = self.outside + outside_domain(
+                    self.health, {name: part[name] for name in self.health.channels}
+                )
             yield part
 
     def counted(self, parts: Iterable[Estimate]) -> Iterator[Estimate]:
@@ -364,9 +461,16 @@ class _Report:
             self.last, known = part, ~np.isnan(part["vy"])
             degrees = np.degrees(part["sideslip"])
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
-            self.samples, self.estimated = self.samples + len(part), self.estimated + int(known.sum())
+            self.samples, self.estimated = (
+                self.samples + len(part),
+                self.estimated + int(known.sum()),
+            )
             if "band_sideslip" in part.channels:
-                self.half.frombytes(part["band_sideslip"][~np.isnan(part["band_sideslip"])].astype(np.float32).tobytes())
+                self.half.frombytes(
+                    part["band_sideslip"][~np.isnan(part["band_sideslip"])]
+                    .astype(np.float32)
+                    .tobytes()
+                )
             status, reasons = part["health"][known], part["health_reason"][known]
             self.invalid += int((status > 0).sum())
             found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
@@ -385,13 +489,20 @@ class _Report:
             "samples": self.samples,
             "estimated": self.estimated,
             "quantities": {name: QUANTITIES[name] for name in last.channels},
-            "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
+            "sideslip_deg": {
+                end: round(float(take.reduce(self.extremes)), 3)
+                for end, take in (("min", np.fmin), ("max", np.fmax))
+            },
         }
         if "band_sideslip" in last.channels:
             half = np.frombuffer(self.half, np.float32)
             np.degrees(half, out=half)
             middle = float(np.median(half, overwrite_input=True)) if len(half) else 0.0
-            band = {"median": round(middle, 3), "largest": round(float(half.max()), 3)} if len(half) else {}
+            band = (
+                {"median": round(middle, 3), "largest": round(float(half.max()), 3)}
+                if len(half)
+                else {}
+            )
             figures["band_sideslip_deg"] = band
         return figures
 
@@ -400,8 +511,13 @@ class _Report:
         if self.health is None:
             bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
-        worst = [reason_in_words(code) for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]]
+        worst = [
+            reason_in_words(code)
+            for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]
+        ]
         share = 100.0 * (1.0 - self.invalid / self.estimated)
-        valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
+        valid = f"valid in {share:.3g} % of the drive" + (
+            f"; else: {', '.join(worst)}" if worst else ""
+        )
         outside = domain_verdict(self.health, self.outside)
         return f"{outside}; {valid}" if outside else valid

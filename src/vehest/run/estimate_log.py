@@ -23,7 +23,9 @@ HEALTH = ("valid", "degraded", "invalid")
 def check_log_name(log: Path, out: Path) -> None:
     """Raises `ConfigurationError` where a log cannot be written in the format that a name asks for."""
     if out.suffix.lower() == ".mf4" != log.suffix.lower():
-        raise ConfigurationError(f"'{out}' would be '{log}' with further channels, which is no .mf4; name a .mat, .csv or .parquet file")
+        raise ConfigurationError(
+            f"'{out}' would be '{log}' with further channels, which is no .mf4; name a .mat, .csv or .parquet file"
+        )
 
 
 def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) -> None:
@@ -45,19 +47,35 @@ def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) ->
     if out.suffix.lower() == ".mat":
         from scipy.io import savemat
 
-        own = {f"{PREFIX}{name}": estimate.held_at(recording.time, name) for name in estimate.channels}
+        own = {
+            f"{PREFIX}{name}": estimate.held_at(recording.time, name) for name in estimate.channels
+        }
         with written_aside(out) as aside, open(aside, "wb") as stream:
-            savemat(stream, {"time": recording.time, **recording.channels, **own}, oned_as="column", do_compression=True)
+            savemat(
+                stream,
+                {"time": recording.time, **recording.channels, **own},
+                oned_as="column",
+                do_compression=True,
+            )
         return
     signals = []
     for name, values in estimate.channels.items():
         about = CHANNELS[name].meaning if name in CHANNELS else name.replace("_", " ")
         signals.append(
-            (f"{PREFIX}{name}", values.tolist(), QUANTITIES[name], f"estimated by {estimate.estimator}: {about}", _texts(name, values))
+            (
+                f"{PREFIX}{name}",
+                values.tolist(),
+                QUANTITIES[name],
+                f"estimated by {estimate.estimator}: {about}",
+                _texts(name, values),
+            )
         )
-    content = read_limited("vehest.sources.readers.mdf:with_signals", log, seconds=estimate.time.tolist(), signals=signals).arrays[
-        "content"
-    ]
+    content = read_limited(
+        "vehest.sources.readers.mdf:with_signals",
+        log,
+        seconds=estimate.time.tolist(),
+        signals=signals,
+    ).arrays["content"]
     with written_aside(out) as aside:
         aside.write_bytes(content.tobytes())
 
@@ -66,4 +84,8 @@ def _texts(name: str, values: FloatArray) -> dict[int, str]:
     """Texts of the codes of health and its reason."""
     if name == "health":
         return dict(enumerate(HEALTH))
-    return {int(code): reason_in_words(code) or "-" for code in np.unique(values)} if name == "health_reason" else {}
+    return (
+        {int(code): reason_in_words(code) or "-" for code in np.unique(values)}
+        if name == "health_reason"
+        else {}
+    )

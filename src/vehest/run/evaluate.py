@@ -30,12 +30,28 @@ from vehest.evaluation.bands import band_figures, banded, coverage_intervals, fi
 from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, scored_range, sequences
+from vehest.evaluation.metrics import (
+    UNITS,
+    Protocol,
+    Scored,
+    accuracy,
+    pieces_of,
+    reference_state,
+    score_all,
+    scored_range,
+    sequences,
+)
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.run.evaluate_faults import FaultSettings, errors_under
-from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
+from vehest.run.train import (
+    FIT_METRICS,
+    file_digest,
+    learnt_spans,
+    read_fit_metrics,
+    recording_file,
+)
 from vehest.run.versions import code_of
 from vehest.studies.artefacts import HEAD, METRIC_COLUMNS, read_frame
 from vehest.trust.bands import Bands, with_bands
@@ -57,11 +73,19 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
     protocol = settings_from_config(Protocol, config, "evaluation")
-    if protocol.rate_hz <= 0 or min(protocol.warm_up_seconds, protocol.skip_seconds, protocol.least_speed) < 0:
-        raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and least_speed must not be negative")
+    if (
+        protocol.rate_hz <= 0
+        or min(protocol.warm_up_seconds, protocol.skip_seconds, protocol.least_speed) < 0
+    ):
+        raise ConfigurationError(
+            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and least_speed must not be negative"
+        )
     if protocol.sequence_seconds is not None:
         samples = protocol.sequence_seconds * protocol.rate_hz
-        if not protocol.sequence_seconds > protocol.skip_seconds or abs(samples - round(samples)) > 1e-6:
+        if (
+            not protocol.sequence_seconds > protocol.skip_seconds
+            or abs(samples - round(samples)) > 1e-6
+        ):
             raise ConfigurationError(
                 f"evaluation.sequence_seconds must be longer than skip_seconds ({protocol.skip_seconds:g} s) and a whole number of "
                 f"samples at {protocol.rate_hz:g} Hz, not {protocol.sequence_seconds:g} s"
@@ -86,7 +110,9 @@ class Evaluation:
     output: Path
     faults: tuple[FaultSettings, ...] = ()
 
-    def of(self, model: Artefact, calibration: Artefact | None) -> tuple[StagePlan, Callable[[Path], None]]:
+    def of(
+        self, model: Artefact, calibration: Artefact | None
+    ) -> tuple[StagePlan, Callable[[Path], None]]:
         """The evaluation of a model, as `artefacts.make` takes it; raises `ConfigurationError` where it was trained on a test range."""
         for name, spans in self.split.tests.items():
             for learnt in learnt_spans(model):
@@ -95,13 +121,28 @@ class Evaluation:
                         f"test set '{name}' shares samples with the ranges that {model.label} was trained or chosen on "
                         f"({learnt.describe()}); test it on something else"
                     )
-        inputs = {"model": model.digest} | ({} if calibration is None else {"calibration": calibration.digest})
+        inputs = {"model": model.digest} | (
+            {} if calibration is None else {"calibration": calibration.digest}
+        )
         scored = scored_spans(self.split)
-        inputs |= {f"{span.dataset}/{span.recording}": file_digest(self.data[span.dataset], span) for span in scored}
-        compared = [*scored, *(span for span in learnt_spans(model, "train") if span.dataset in self.references)]
-        inputs |= {f"reference of {span.dataset}/{span.recording}": file_digest(self.references[span.dataset], span) for span in compared}
+        inputs |= {
+            f"{span.dataset}/{span.recording}": file_digest(self.data[span.dataset], span)
+            for span in scored
+        }
+        compared = [
+            *scored,
+            *(span for span in learnt_spans(model, "train") if span.dataset in self.references),
+        ]
+        inputs |= {
+            f"reference of {span.dataset}/{span.recording}": file_digest(
+                self.references[span.dataset], span
+            )
+            for span in compared
+        }
         config: dict[str, Any] = {
-            "sets": {name: [str(span) for span in spans] for name, spans in test_sets(self.split).items()},
+            "sets": {
+                name: [str(span) for span in spans] for name, spans in test_sets(self.split).items()
+            },
             "protocol": self.protocol.plain,
             "kinds": dict(self.kinds),
             "split": self.split.name,
@@ -109,7 +150,9 @@ class Evaluation:
         if self.faults:
             config["faults"] = [asdict(fault) for fault in self.faults]
         code = code_of(STAGE, read_description(model.folder).estimator, faults=bool(self.faults))
-        plan = StagePlan(STAGE, f"{model.label}-on-{self.split.name}", config, inputs, code, self.output)
+        plan = StagePlan(
+            STAGE, f"{model.label}-on-{self.split.name}", config, inputs, code, self.output
+        )
         return plan, partial(_write, self, model, calibration)
 
     def reference(self, span: Span) -> Recording:
@@ -119,11 +162,15 @@ class Evaluation:
     def measured(self, span: Span) -> Recording:
         """A range as the estimator sees it: no references, and a warm-up before it."""
         recording = read_recording(recording_file(self.data[span.dataset], span))
-        return recording.cut(span.start - self.protocol.warm_up_seconds, span.stop).without_references()
+        return recording.cut(
+            span.start - self.protocol.warm_up_seconds, span.stop
+        ).without_references()
 
     def state(self, piece: Span) -> dict[str, float] | None:
         """The state that the protocol passes to an estimator at the start of a piece, if any."""
-        return reference_state(self.reference(piece), piece) if self.protocol.initial_state else None
+        return (
+            reference_state(self.reference(piece), piece) if self.protocol.initial_state else None
+        )
 
     def score(self, spans: Sequence[Span], estimates: Sequence[Estimate]) -> list[Scored]:
         """Estimates of a test set beside the reference."""
@@ -143,7 +190,9 @@ def scored_spans(split: Split) -> list[Span]:
 def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path) -> None:
     """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
     estimator, protocol = load_model(model.folder), how.protocol
-    without_fit = model.outputs and FIT_METRICS not in model.outputs  # such as a model that was saved from Python
+    without_fit = (
+        model.outputs and FIT_METRICS not in model.outputs
+    )  # such as a model that was saved from Python
     fit = {"n_parameters": float(estimator.n_parameters), "epochs": 0.0, "train_seconds": 0.0}
     fit |= {} if without_fit else read_fit_metrics(model.folder)
     trust = None if calibration is None else read_trust(calibration.folder)
@@ -156,10 +205,16 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
         pieces = sequences(spans, how.reference, protocol)
         estimates = _estimates(estimator, how, pieces)
         for position, piece in enumerate(pieces):
-            if bands is not None:  # wider on vehicles without calibration and on test sets that the protocol names
+            if (
+                bands is not None
+            ):  # wider on vehicles without calibration and on test sets that the protocol names
                 measured = how.measured(piece)
-                other_vehicle = not bands.are_of(measured.vehicle) or name in protocol.sets_elsewhere
-                estimates[position] = with_bands(estimates[position], measured, bands, elsewhere=other_vehicle)
+                other_vehicle = (
+                    not bands.are_of(measured.vehicle) or name in protocol.sets_elsewhere
+                )
+                estimates[position] = with_bands(
+                    estimates[position], measured, bands, elsewhere=other_vehicle
+                )
             write_estimate(estimates[position], folder / name / f"{position}.parquet")
         scored = how.score(spans, estimates)
         blocks[name] = segments_of(scored, protocol.rate_hz)
@@ -179,18 +234,32 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
         with open(folder / file, "w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
             writer.writeheader()
-            writer.writerows(row for row in rows + under_faults if (row["metric"] in TIMES) is timed)
+            writer.writerows(
+                row for row in rows + under_faults if (row["metric"] in TIMES) is timed
+            )
 
 
 def _rows_of_parts(
-    how: Evaluation, head: Mapping[str, Any], spans: Sequence[Span], scored: Sequence[Scored], bands: Bands | None
+    how: Evaluation,
+    head: Mapping[str, Any],
+    spans: Sequence[Span],
+    scored: Sequence[Scored],
+    bands: Bands | None,
 ) -> list[dict[str, Any]]:
     """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
     protocol, masks, turns = how.protocol, [], []
     for reference, piece in pieces_of(spans, how.reference, protocol):
         masks.append(regimes_of(reference, piece, protocol))
-        turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None)
-    rows = _rows(head, lever_arm_figures(scored, pieces_of(spans, how.reference, protocol), protocol), condition=CONDITION)
+        turns.append(
+            reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))]
+            if "yaw_rate" in reference
+            else None
+        )
+    rows = _rows(
+        head,
+        lever_arm_figures(scored, pieces_of(spans, how.reference, protocol), protocol),
+        condition=CONDITION,
+    )
     if head["test_set"] != VALIDATION:
         for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
             rows += _rows(head, own, subset=regime)
@@ -204,45 +273,81 @@ def _rows_of_parts(
 
 
 def _rows_under_faults(
-    estimator: Estimator, how: Evaluation, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
+    estimator: Estimator,
+    how: Evaluation,
+    head: Mapping[str, Any],
+    spans: Sequence[Span],
+    nominal: Sequence[Scored],
+    trust: Trust | None,
 ) -> list[dict[str, Any]]:
     if not how.faults:
         return []
     rows: list[dict[str, Any]] = []
-    pieces = [(piece, how.measured(piece), how.state(piece)) for piece in sequences(spans, how.reference, how.protocol)]
+    pieces = [
+        (piece, how.measured(piece), how.state(piece))
+        for piece in sequences(spans, how.reference, how.protocol)
+    ]
     other_vehicle = head["test_set"] in how.protocol.sets_elsewhere
     score, rate_hz = partial(how.score, spans), how.protocol.rate_hz
     for fault in how.faults:
-        for subset, own in errors_under(fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle).items():
+        for subset, own in errors_under(
+            fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle
+        ).items():
             rows += _rows(head, own, subset=subset, condition=fault.condition)
     return rows
 
 
-def _head(how: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
+def _head(
+    how: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]
+) -> dict[str, Any]:
     about = read_description(model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
     kinds = dict.fromkeys(how.kinds[name] for name in datasets)
     mode = "causal" if estimator.causal else "offline"
     learnt = (estimator.name, estimator.variant, "+".join(about.datasets))
-    test = ("+".join(datasets), "+".join(kinds), name, "all", "nominal", how.protocol.rate_hz, mode, about.seed)
+    test = (
+        "+".join(datasets),
+        "+".join(kinds),
+        name,
+        "all",
+        "nominal",
+        how.protocol.rate_hz,
+        mode,
+        about.seed,
+    )
     return dict(zip(HEAD, (*learnt, *test), strict=True))
 
 
 def _rows(
-    head: Mapping[str, Any], figures: Mapping[str, float], intervals: Mapping[str, tuple[float, float]] | None = None, **columns: str
+    head: Mapping[str, Any],
+    figures: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+    **columns: str,
 ) -> list[dict[str, Any]]:
     """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
     rows = []
     for metric, value in figures.items():
-        low, high = (repr(float(end)) for end in intervals[metric]) if intervals and metric in intervals else ("", "")
-        row = {"metric": metric, "value": repr(float(value)), "unit": ALL_UNITS[metric], "low": low, "high": high}
+        low, high = (
+            (repr(float(end)) for end in intervals[metric])
+            if intervals and metric in intervals
+            else ("", "")
+        )
+        row = {
+            "metric": metric,
+            "value": repr(float(value)),
+            "unit": ALL_UNITS[metric],
+            "low": low,
+            "high": high,
+        }
         rows.append({**head, **columns, **row})
     return rows
 
 
 def _estimates(estimator: Estimator, how: Evaluation, pieces: Sequence[Span]) -> list[Estimate]:
     """An estimate each; sequences in one go, since a method may then take them all at once."""
-    batches = [pieces] if how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
+    batches = (
+        [pieces] if how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
+    )
     estimates: list[Estimate] = []
     for batch in batches:
         states = [state for piece in batch if (state := how.state(piece)) is not None]
@@ -254,9 +359,15 @@ def _floors(estimator: Estimator, how: Evaluation, spans: Sequence[Span]) -> dic
     """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
     drives = drives_of(spans, how.reference, how.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
-    floors = {"floor_reference": reference_floor(drives)} | ({"floor_cramer_rao": cramer_rao_floor(drives, inputs)} if inputs else {})
+    floors = {"floor_reference": reference_floor(drives)} | (
+        {"floor_cramer_rao": cramer_rao_floor(drives, inputs)} if inputs else {}
+    )
     known = {name: floor for name, floor in floors.items() if floor is not None}
-    return {name + suffix: value for name, own in known.items() for suffix, value in (("", own.sideslip), ("_vy", own.vy))}
+    return {
+        name + suffix: value
+        for name, own in known.items()
+        for suffix, value in (("", own.sideslip), ("_vy", own.vy))
+    }
 
 
 def _step_seconds(estimator: Estimator, recording: Recording) -> float:
@@ -282,19 +393,33 @@ def _training_rows(how: Evaluation, model: Artefact, estimator: Estimator) -> li
         figures = accuracy(how.score(spans, estimates))
     except DataError:
         return []
-    return _rows(_head(how, model, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
+    return _rows(
+        _head(how, model, estimator, TRAINING, spans),
+        {name: figures[name] for name in TRAINING_METRICS},
+    )
 
 
 def test_figures(folder: Path) -> dict[str, float]:
     """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
     tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
     table = pd.concat([own for own in tables if len(own)], ignore_index=True)
-    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all") & (table["condition"] == "nominal")]
-    return dict(zip(tested["metric"] + "." + tested["test_set"], map(float, tested["value"]), strict=True))
+    tested = table[
+        ~table["test_set"].isin((VALIDATION, TRAINING))
+        & (table["subset"] == "all")
+        & (table["condition"] == "nominal")
+    ]
+    return dict(
+        zip(tested["metric"] + "." + tested["test_set"], map(float, tested["value"]), strict=True)
+    )
 
 
 def fault_figures(folder: Path) -> dict[str, float]:
     """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` -> value."""
     rows = read_frame(folder / METRICS, COLUMNS, numbers=("value",)).to_dict("records")
     shown = [row for row in rows if is_fault(row["condition"]) and row["test_set"] != VALIDATION]
-    return {".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): float(row["value"]) for row in shown}
+    return {
+        ".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): float(
+            row["value"]
+        )
+        for row in shown
+    }

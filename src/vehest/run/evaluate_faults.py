@@ -42,7 +42,9 @@ class FaultSettings:
     channel: str
     severity: Annotated[Severity, "mild, medium or severe"]
     size: float | None = None  # instead of the severity's
-    start: float | None = None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    start: float | None = (
+        None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    )
     duration: float | None = None  # [s]; None: to the end of the range
     seed: int = 0
 
@@ -63,20 +65,26 @@ class FaultSettings:
         drawn = np.random.default_rng([self.seed, position])
         own_start = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
         duration = math.inf if self.duration is None else self.duration
-        return replace(self._fault, onset=start + own_start, duration=duration, seed=int(drawn.integers(2**32)))
+        return replace(
+            self._fault, onset=start + own_start, duration=duration, seed=int(drawn.integers(2**32))
+        )
 
 
 def faults_of(config: Config) -> tuple[FaultSettings, ...]:
     """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
-    if not isinstance(listed, list) or not all(isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed):
+    if not isinstance(listed, list) or not all(
+        isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed
+    ):
         raise ConfigurationError(
             "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]; "
             f"kinds: {', '.join(kinds)}"
         )
     named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
-    bases = {kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(named)}
+    bases = {
+        kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(named)
+    }
     own = [{key: value for key, value in entry.items() if key != "kind"} for entry in listed]
     found = [_settings(bases[kind] | changes) for kind, changes in zip(named, own, strict=True)]
     chosen = chosen_fault(config)
@@ -105,9 +113,15 @@ def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ..
     return tuple(found.values())
 
 
-def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]) -> None:
+def check_channels(
+    faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]
+) -> None:
     """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
-    spans = [span for spans in (split.validation, *split.tests.values()) for span in spans] if faults else []
+    spans = (
+        [span for spans in (split.validation, *split.tests.values()) for span in spans]
+        if faults
+        else []
+    )
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
         held = stored_summary(recording_file(data[dataset], Span(dataset, recording))).channels
         for fault in faults:
@@ -157,7 +171,11 @@ def errors_under(
     if trust is not None and FAULTED in found:
         flags = []
         for estimate, part in zip(guarded, scored, strict=True):
-            band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
+            band = (
+                estimate.held_at(part.time, "band_sideslip")
+                if "band_sideslip" in estimate.channels
+                else np.full(len(part.time), np.nan)
+            )
             flags.append((band, estimate.held_at(part.time, "health")))
         found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
     return found

@@ -24,8 +24,14 @@ def failure_of(error: Exception) -> Failure:
     known = error if isinstance(error, VehestError) else _of_machine(error)
     if known is not None:
         return Failure(str(known), exit_code=known.exit_code)
-    deep = "; something that was read nests too deeply: make it flatter" if isinstance(error, RecursionError) else ""
-    return Failure(f"{type(error).__name__}: {error}{deep}", "".join(traceback.format_exception(error)))
+    deep = (
+        "; something that was read nests too deeply: make it flatter"
+        if isinstance(error, RecursionError)
+        else ""
+    )
+    return Failure(
+        f"{type(error).__name__}: {error}{deep}", "".join(traceback.format_exception(error))
+    )
 
 
 def _of_machine(error: Exception) -> MissingError | None:
@@ -33,14 +39,18 @@ def _of_machine(error: Exception) -> MissingError | None:
     full = no_room(error)
     if full is not None:
         where = f"'{full.filename}'" if full.filename else "where results and temporary files go"
-        return MissingError(f"no room left to write {where} ({full.strerror}); free some space and run again")
+        return MissingError(
+            f"no room left to write {where} ({full.strerror}); free some space and run again"
+        )
     if isinstance(error, FileNotFoundError):
         try:
             os.getcwd()
         except OSError:
             return MissingError("the working folder has been removed; change to another")
     if isinstance(error, OSError) and error.filename is not None:
-        return MissingError(f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions")
+        return MissingError(
+            f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions"
+        )
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return MissingError(
             "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter recordings, smaller networks"

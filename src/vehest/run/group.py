@@ -72,7 +72,9 @@ class Group:
         def made(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
             if should_stop():
                 return None
-            return self.existing(plan) or ensured(plan, write, plan.stage in self.force, should_stop, on_progress)
+            return self.existing(plan) or ensured(
+                plan, write, plan.stage in self.force, should_stop, on_progress
+            )
 
         torch.set_num_threads(1)
         with one_blas_thread():
@@ -84,11 +86,18 @@ class Group:
                         if STAGE in self.force:
                             drop_checkpoint(job.plan.checkpoint_folder)
                         else:
-                            models[job.plan.key] = find(job.plan)  # another process may have made it meanwhile
-                    for together in _together([job for job in jobs if models[job.plan.key] is None]):
+                            models[job.plan.key] = find(
+                                job.plan
+                            )  # another process may have made it meanwhile
+                    for together in _together(
+                        [job for job in jobs if models[job.plan.key] is None]
+                    ):
                         if should_stop():
                             break
-                        models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
+                        models |= {
+                            artefact.key: artefact
+                            for artefact in _train(together, should_stop, on_progress)
+                        }
                 waiting = [job for job in waiting if job not in jobs]
             members = []
             for job in self.jobs:
@@ -103,11 +112,17 @@ class Group:
 
 def existing(group: Group) -> list[Member]:
     """The members of a group with the artefacts that are there already."""
-    return [_member(group, job, group.existing(job.plan), lambda plan, _: group.existing(plan)) for job in group.jobs]
+    return [
+        _member(group, job, group.existing(job.plan), lambda plan, _: group.existing(plan))
+        for job in group.jobs
+    ]
 
 
 def _member(
-    group: Group, job: TrainJob, model: Artefact | None, made: Callable[[StagePlan, Callable[[Path], None]], Artefact | None]
+    group: Group,
+    job: TrainJob,
+    model: Artefact | None,
+    made: Callable[[StagePlan, Callable[[Path], None]], Artefact | None],
 ) -> Member:
     """A member whose model is calibrated, then evaluated, as far as ``made`` gives artefacts."""
     if model is None or model.status != "complete":
@@ -120,17 +135,27 @@ def _member(
             return Member(job, model)
     if group.evaluation is not None:
         evaluation = made(*group.evaluation.of(model, calibration))
-    return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
+    return Member(
+        job,
+        model,
+        evaluation,
+        calibration,
+        finished=group.evaluation is None or evaluation is not None,
+    )
 
 
-def _compiled_by_one(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
+def _compiled_by_one(
+    output: Path, should_stop: Callable[[], bool]
+) -> AbstractContextManager[object]:
     """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
     missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
     return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
 
 
 @contextmanager
-def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_waiting: Callable[[Waiting], None]) -> Iterator[list[TrainJob]]:
+def _held(
+    jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_waiting: Callable[[Waiting], None]
+) -> Iterator[list[TrainJob]]:
     """Hold the locks of those trainings that are free; where none is, wait for the first.
 
     A process that waits holds no other training, so that two never wait for each other.
@@ -150,9 +175,13 @@ def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
     return list(batches.values())
 
 
-def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Report) -> list[Artefact]:
+def _train(
+    jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Report
+) -> list[Artefact]:
     folders = [job.plan.checkpoint_folder for job in jobs]
-    context = FitContext(checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress)
+    context = FitContext(
+        checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress
+    )
     artefacts = []
     for job, (estimator, record) in zip(jobs, fit_jobs(jobs, context), strict=True):
         if record.interrupted and not record.metrics.get("best_epoch", 1):

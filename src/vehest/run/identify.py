@@ -23,10 +23,20 @@ from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, read_car, with_settings
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
-from vehest.run.estimate import SELF_CALIBRATING, finding_in_words, findings_of, open_model, prepared_recording, read_table, split_settings
+from vehest.run.estimate import (
+    SELF_CALIBRATING,
+    finding_in_words,
+    findings_of,
+    open_model,
+    prepared_recording,
+    read_table,
+    split_settings,
+)
 from vehest.run.printing import TerminalTable, complain
 
-IDENTIFIED_SHARE = 0.5  # of the prior's variance: a number is identified on a drive that leaves less
+IDENTIFIED_SHARE = (
+    0.5  # of the prior's variance: a number is identified on a drive that leaves less
+)
 ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
 UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
@@ -46,9 +56,16 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
 
     ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter, ``estimator.KEY=VALUE``.
     """
-    files, overrides = [Path(word) for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)]
+    files, overrides = (
+        [Path(word) for word in words if is_file_name(word)],
+        [word for word in words if not is_file_name(word)],
+    )
     if not files or out.suffix.lower() not in (".yaml", ".yml"):
-        raise ConfigurationError(f"'{out}' must end in .yaml" if files else "no recording is named: vehest identify lap*.csv -o car.yaml")
+        raise ConfigurationError(
+            f"'{out}' must end in .yaml"
+            if files
+            else "no recording is named: vehest identify lap*.csv -o car.yaml"
+        )
     if out.exists():
         read_car(out)  # refuses to write over anything else
     settings, overrides = split_settings(overrides)
@@ -67,16 +84,31 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)
     with written_aside(out) as aside:
-        aside.write_text(yaml.safe_dump({"format": FORMAT, **asdict(record)}, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        aside.write_text(
+            yaml.safe_dump(
+                {"format": FORMAT, **asdict(record)}, sort_keys=False, allow_unicode=True
+            ),
+            encoding="utf-8",
+        )
     return record
 
 
 def in_words(record: CarRecord) -> TerminalTable:
     """A record for a terminal."""
     numbers = {name: getattr(record, name) for name in LIMITS}
-    numbers |= {f"offset of {channel}, {drive}": one for drive, own in record.offsets.items() for channel, one in own.items()}
+    numbers |= {
+        f"offset of {channel}, {drive}": one
+        for drive, own in record.offsets.items()
+        for channel, one in own.items()
+    }
     rows = [
-        (name, f"{one.value:.4g}", f"{one.deviation:.2g}", UNITS.get(name, "m/s²"), ", ".join(one.identified_on) or "not identified")
+        (
+            name,
+            f"{one.value:.4g}",
+            f"{one.deviation:.2g}",
+            UNITS.get(name, "m/s²"),
+            ", ".join(one.identified_on) or "not identified",
+        )
         for name, one in numbers.items()
     ]
     return TerminalTable("", ("quantity", "value", "deviation", "unit", "identified on"), rows)
@@ -89,20 +121,34 @@ def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Norm
     if len(samples) < 2:
         raise DataError(f"recording '{recording.id}' is too short to identify anything")
     if not np.isfinite(samples).all():
-        raise DataError(f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them")
+        raise DataError(
+            f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them"
+        )
     turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
-    on_time, early, late = (_found(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]])) for shift in (0.0, turning, -turning))
-    return {name: Normal(*own, (late[name][0] - early[name][0]) / 2.0) for name, own in on_time.items()}
+    on_time, early, late = (
+        _found(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
+        for shift in (0.0, turning, -turning)
+    )
+    return {
+        name: Normal(*own, (late[name][0] - early[name][0]) / 2.0) for name, own in on_time.items()
+    }
 
 
 def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
     """Means and deviations after samples of the model's channels, (T, C)."""
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
-    numbers = {name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in ROWS.items()}
-    numbers |= {name: (float(mean[:, at].mean()), math.sqrt(variance[:, at].mean())) for name, at in OFFSETS.items()}
+    numbers = {
+        name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in ROWS.items()
+    }
+    numbers |= {
+        name: (float(mean[:, at].mean()), math.sqrt(variance[:, at].mean()))
+        for name, at in OFFSETS.items()
+    }
     numbers["grip"] = _grip(model, last.log_weights)
-    if last.weights[kernel.BANK] < last.weights[kernel.STEADY]:  # the filter fell back on the priors: its bank tells nothing
+    if (
+        last.weights[kernel.BANK] < last.weights[kernel.STEADY]
+    ):  # the filter fell back on the priors: its bank tells nothing
         numbers |= {name: (numbers[name][0], math.inf) for name in LIMITS}
     return numbers
 
@@ -111,7 +157,9 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
     """The same before any drive."""
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights
-    numbers = {name: Normal(float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()}
+    numbers = {
+        name: Normal(float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()
+    }
     return numbers | {"grip": Normal(*_grip(model, start))}
 
 
@@ -119,16 +167,24 @@ def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float
     """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
     logs, weights = np.log(model.grips), np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
-    return mean, math.sqrt(weights @ (np.square(logs - mean) + np.square(np.gradient(logs) / 2.0)) / weights.sum())
+    return mean, math.sqrt(
+        weights @ (np.square(logs - mean) + np.square(np.gradient(logs) / 2.0)) / weights.sum()
+    )
 
 
 def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
     """The record of a car from `posterior_of` its drives; raises `DataError` where a number is not of a car."""
     prior = prior_of(model)
-    found = {name: together(prior[name], {drive: own[name] for drive, own in drives.items()}) for name in LIMITS}
+    found = {
+        name: together(prior[name], {drive: own[name] for drive, own in drives.items()})
+        for name in LIMITS
+    }
     grip = math.exp(found["grip"].value)
     found["grip"] = Number(grip, grip * found["grip"].deviation, found["grip"].identified_on)
-    offsets = {drive: {name: together(prior[name], {drive: own[name]}) for name in OFFSETS} for drive, own in drives.items()}
+    offsets = {
+        drive: {name: together(prior[name], {drive: own[name]}) for name in OFFSETS}
+        for drive, own in drives.items()
+    }
     return CarRecord(model.wheelbase, model.cg_to_rear_axle, **found, offsets=offsets)
 
 
@@ -137,18 +193,34 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
 
     The deviation grows where drives contradict each other.
     """
-    mean, deviation, of_lateness = np.array([own for own in drives.values() if own.deviation < prior.deviation]).reshape(-1, 3).T
+    mean, deviation, of_lateness = (
+        np.array([own for own in drives.values() if own.deviation < prior.deviation])
+        .reshape(-1, 3)
+        .T
+    )
     alone, of_alone = without_prior(prior, Normal(mean, deviation))
     total = prior.deviation**-2.0 + float(np.sum(of_alone**-2.0))
     shares = deviation**-2.0 / total
     value = prior.mean + float(shares @ (mean - prior.mean))
-    scatter = float(np.sum(np.square((alone - value) / of_alone))) / (len(alone) - 1) if len(alone) > 1 else 1.0
+    scatter = (
+        float(np.sum(np.square((alone - value) / of_alone))) / (len(alone) - 1)
+        if len(alone) > 1
+        else 1.0
+    )
     least = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
-    identified = tuple(drive for drive, own in drives.items() if math.hypot(own.deviation, own.of_lateness) < least)
-    return Number(value, math.hypot(math.sqrt(max(scatter, 1.0) / total), float(shares @ of_lateness)), identified)
+    identified = tuple(
+        drive for drive, own in drives.items() if math.hypot(own.deviation, own.of_lateness) < least
+    )
+    return Number(
+        value,
+        math.hypot(math.sqrt(max(scatter, 1.0) / total), float(shares @ of_lateness)),
+        identified,
+    )
 
 
 def without_prior(prior: Normal, posterior: Normal) -> tuple[Any, Any]:
     """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation is below the prior's."""
     information = 1.0 / posterior.deviation**2 - 1.0 / prior.deviation**2
-    return prior.mean + (posterior.mean - prior.mean) / posterior.deviation**2 / information, information**-0.5
+    return prior.mean + (
+        posterior.mean - prior.mean
+    ) / posterior.deviation**2 / information, information**-0.5

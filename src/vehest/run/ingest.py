@@ -33,26 +33,44 @@ from vehest.trust.health import SLOW_KERNEL, compile_health
 STAGE = "ingest"
 PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
-Report = Callable[[int, int, str], None]  # recordings done, recordings in all, name of one that was begun
-PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; samples do not depend on it
+Report = Callable[
+    [int, int, str], None
+]  # recordings done, recordings in all, name of one that was begun
+PROSE = frozenset(
+    {"path", "title", "licence", "citation", "download"}
+)  # of a data set's configuration; samples do not depend on it
 
 
 def plan_ingest(config: Config) -> StagePlan:
     """The artefact of an ingest; raises `VehestError` where raw files are missing or the data set's configuration makes no sense."""
     dataset: Mapping[str, Any] = config["dataset"]
     if missing := missing_keys(dict(dataset)):
-        raise ConfigurationError(f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set")
+        raise ConfigurationError(
+            f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set"
+        )
     source = open_source(dataset)
     if not source.ids():
         raise ConfigurationError(f"data set '{source.name}' names no recordings")
     for recording_id in source.ids():
         recording_file(recording_id)
     content = {key: value for key, value in dataset.items() if key not in PROSE}
-    inputs = {name: sha256_of(origin) if isinstance(origin, Path) else str(origin) for name, origin in source.inputs().items()}
-    return StagePlan(STAGE, source.name, content, inputs, code_of(STAGE, str(dataset["source"])), Path(config["output"]))
+    inputs = {
+        name: sha256_of(origin) if isinstance(origin, Path) else str(origin)
+        for name, origin in source.inputs().items()
+    }
+    return StagePlan(
+        STAGE,
+        source.name,
+        content,
+        inputs,
+        code_of(STAGE, str(dataset["source"])),
+        Path(config["output"]),
+    )
 
 
-def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
+def write_ingest(
+    config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report
+) -> None:
     """Read every recording, check it, and write it into ``folder``.
 
     Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
@@ -67,9 +85,16 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     parts = parts_of(plan)
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
-    missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
-    tasks: list[Callable[..., None]] = [partial(_make_part, dict(config["dataset"]), recording_id, parts) for recording_id in missing]
-    if min(jobs, len(tasks)) > 1 and has_to_compile(SLOW_KERNEL):  # while the first process compiles the plant, for which others wait
+    missing = [
+        recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()
+    ]
+    tasks: list[Callable[..., None]] = [
+        partial(_make_part, dict(config["dataset"]), recording_id, parts)
+        for recording_id in missing
+    ]
+    if min(jobs, len(tasks)) > 1 and has_to_compile(
+        SLOW_KERNEL
+    ):  # while the first process compiles the plant, for which others wait
         tasks.insert(1, compile_health)
         missing.insert(1, "")
     done, failures = len(ids) - len(missing) + missing.count(""), []
@@ -87,7 +112,9 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         parts.rmdir()  # unless something was made
     stop.raise_if_requested()
     if failures:
-        error = DataError(failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""))
+        error = DataError(
+            failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else "")
+        )
         error.exit_code = failures[0].exit_code
         raise error
     for recording_id in ids:
@@ -105,7 +132,11 @@ def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: o
 def _make(source: Source, recording_id: str, folder: Path) -> None:
     """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
     recording = source.read(recording_id)
-    refuse_errors(recording, source.dataset.get("accept") or (), f"data set '{source.name}', recording '{recording.id}'")
+    refuse_errors(
+        recording,
+        source.dataset.get("accept") or (),
+        f"data set '{source.name}', recording '{recording.id}'",
+    )
     write_recording(recording, folder / recording_file(recording_id))
 
 
@@ -116,7 +147,10 @@ def parts_of(plan: StagePlan) -> Path:
 
 def recording_file(recording_id: str) -> str:
     """The file of a recording in the store, by its id; raises `DataError` where that cannot be a file's name or would lead elsewhere."""
-    if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id) or len(os.fsencode(recording_id)) > LONGEST_ID:
+    if (
+        not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id)
+        or len(os.fsencode(recording_id)) > LONGEST_ID
+    ):
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
             f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
@@ -126,10 +160,15 @@ def recording_file(recording_id: str) -> str:
 
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     """Configuration of a simulated data set's ingest; override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`."""
-    spelt_out = [f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override for override in overrides]
+    spelt_out = [
+        f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override
+        for override in overrides
+    ]
     config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
     if config["dataset"].get("source") != SIMULATED:
-        raise ConfigurationError(f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'")
+        raise ConfigurationError(
+            f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'"
+        )
     return config
 
 
@@ -152,7 +191,11 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
-        known = [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]
+        known = [
+            name
+            for name in choices("dataset")
+            if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")
+        ]
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from (download); "
             f"data sets that do: {', '.join(known) or 'none'}"
@@ -160,7 +203,9 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
     download = download_of(source)
     if dry_run:
         for name in download.missing():
-            messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
+            messages.line(
+                "plan", "download", name, f"from {download.address(name)} into {download.folder}"
+            )
         if download.missing():
             messages.line("plan", "ingest", source.name, "then")
             raise DryRunStop
@@ -178,4 +223,9 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
                 "fetched": f"{file.size / 1e6:.1f} MB{went_on}, sha256 {file.sha256}",
             }
             bars.close(f"download {file.name}")
-            messages.line("skip" if file.what == "matched" else "done", "download", file.name, words[file.what])
+            messages.line(
+                "skip" if file.what == "matched" else "done",
+                "download",
+                file.name,
+                words[file.what],
+            )

@@ -32,7 +32,10 @@ from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_i
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.tabular import unused_columns
 
-EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
+EARLIEST_UNIX, LATEST_UNIX = (
+    6e8,
+    4e9,
+)  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 MOST_COLUMNS = 40  # of a table that are listed
 SPREAD = ("min", "mean", "max", "std")
 
@@ -44,11 +47,28 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines]:
     rows = []
     for name in choices("dataset"):
         dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
-        row = {"dataset": name, "kind": kind_of(dataset), "source": str(dataset.get("source", "")), "here": _is_here(dataset)}
-        rows.append(row | {key: " ".join(str(dataset.get(key, "")).split()) for key in ("title", "licence", "citation")})
+        row = {
+            "dataset": name,
+            "kind": kind_of(dataset),
+            "source": str(dataset.get("source", "")),
+            "here": _is_here(dataset),
+        }
+        rows.append(
+            row
+            | {
+                key: " ".join(str(dataset.get(key, "")).split())
+                for key in ("title", "licence", "citation")
+            }
+        )
     shown = ("dataset", "kind", "source", "here", "title")
-    table = TerminalTable("", ("data set", *shown[1:]), [[row[key] for key in shown] for row in rows])
-    cited = [line for row in rows for line in (f"{row['dataset']}: {row['licence']}", f"  cite: {row['citation']}")]
+    table = TerminalTable(
+        "", ("data set", *shown[1:]), [[row[key] for key in shown] for row in rows]
+    )
+    cited = [
+        line
+        for row in rows
+        for line in (f"{row['dataset']}: {row['licence']}", f"  cite: {row['citation']}")
+    ]
     return rows, [table, "", "licences and citations", *cited]
 
 
@@ -59,7 +79,10 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
     lines: Lines = []
     for own in recordings:
         about = f"{own['id']}: {own['kind']}, {own['vehicle']}, {own['rate_hz']:g} Hz, {_stretch(own['start'], own['end'])}"
-        rows = [[channel["name"], channel["unit"], *(f"{channel[key]:.4g}" for key in SPREAD)] for channel in own["channels"]]
+        rows = [
+            [channel["name"], channel["unit"], *(f"{channel[key]:.4g}" for key in SPREAD)]
+            for channel in own["channels"]
+        ]
         lines += [f"{about}, {own['samples']} samples", *(f"  {line}" for line in own["origin"])]
         lines.append(TerminalTable("", ("channel", "unit", *SPREAD), rows))
     return {"source": source, "recordings": recordings}, lines
@@ -73,9 +96,20 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
             try:
                 recording = read()
             except DataError as error:
-                rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
+                rows.append(
+                    {
+                        "level": "error",
+                        "recording": name,
+                        "check": "read",
+                        "channel": "",
+                        "message": str(error),
+                    }
+                )
             else:
-                rows += [{"recording": recording.id, **asdict(finding)} for finding in checks_of_recording(recording)]
+                rows += [
+                    {"recording": recording.id, **asdict(finding)}
+                    for finding in checks_of_recording(recording)
+                ]
     lines: Lines = []
     for row in rows:
         channel = f" {row['channel']}:" if row["channel"] else ""
@@ -87,7 +121,9 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
     """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal; raises `VehestError`."""
     with reading(source, overrides) as config:
         recordings = _contents(source, config)
-        columns = unused_columns(config["dataset"], None if source in choices("dataset") else Path(source))
+        columns = unused_columns(
+            config["dataset"], None if source in choices("dataset") else Path(source)
+        )
     if not recordings:
         raise DataError(f"'{source}' holds no recordings")
     rows, missing = all_usabilities(recordings), absent_channels(SCORED, recordings).to_estimate
@@ -96,7 +132,9 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
         lines.append(f"every estimate is scored by {' and '.join(missing)}")
     if columns:
         names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
-        lines.append(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
+        lines.append(
+            f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset"
+        )
     plain = {
         "source": source,
         "recordings": [recording.id for recording in recordings],
@@ -116,7 +154,9 @@ def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
     elif os.path.lexists(source):  # also of a name that is too long or holds a null character
         config = compose_config("estimate", overrides)
     else:
-        raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
+        raise ConfigurationError(
+            f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file"
+        )
     with use_limits(limits_from_config(config["limits"])):
         yield config
 
@@ -138,7 +178,12 @@ def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Re
     origin = open_source(config["dataset"])
     ingested = find(plan_ingest(config)) if origin.slow else None
     for name in origin.ids():
-        yield name, partial(origin.read, name) if ingested is None else partial(read_recording, ingested.folder / recording_file(name))
+        yield (
+            name,
+            partial(origin.read, name)
+            if ingested is None
+            else partial(read_recording, ingested.folder / recording_file(name)),
+        )
 
 
 def _described(recording: Recording) -> dict[str, Any]:
@@ -150,7 +195,10 @@ def _described(recording: Recording) -> dict[str, Any]:
         "start": recording.start_time,
         "end": recording.end_time,
         "samples": len(recording),
-        "channels": [{"name": name, "unit": CHANNELS[name].unit, **_spread(samples)} for name, samples in recording.channels.items()],
+        "channels": [
+            {"name": name, "unit": CHANNELS[name].unit, **_spread(samples)}
+            for name, samples in recording.channels.items()
+        ],
         "provenance": dict(recording.provenance),
         "origin": origin_in_words(recording),
     }
@@ -160,7 +208,9 @@ def _spread(samples: FloatArray) -> dict[str, float]:
     """Range, mean and standard deviation of the measured samples; NaN where there are none."""
     measured = samples[~np.isnan(samples)]
     with np.errstate(over="ignore", invalid="ignore"):
-        return {name: float(getattr(measured, name)()) if len(measured) else math.nan for name in SPREAD}
+        return {
+            name: float(getattr(measured, name)()) if len(measured) else math.nan for name in SPREAD
+        }
 
 
 def _stretch(start: float, end: float) -> str:

@@ -37,7 +37,9 @@ class Lock:
     def __init__(self, output: Path, stage: str, name: str) -> None:
         self.stage, self.name = stage, name
         self._path = output / LOCKS / file_name(f"{stage}-{name}", ".lock")
-        self._lock = FileLock(self._path, fallback_to_soft=False)  # a file that only stands for a lock would outlive its process
+        self._lock = FileLock(
+            self._path, fallback_to_soft=False
+        )  # a file that only stands for a lock would outlive its process
 
     def take(self) -> bool:
         """Take the lock if it is free; raises MissingError where the output root cannot be written to."""
@@ -49,7 +51,9 @@ class Lock:
         except OSError as error:
             raise writing_error(self._path, error) from error
         with suppress(OSError):  # for people only
-            self._path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
+            self._path.write_text(
+                f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8"
+            )
         return True
 
     @property
@@ -65,7 +69,11 @@ class Lock:
 
 
 @contextmanager
-def held(lock: Lock, should_stop: Callable[[], bool] = lambda: True, on_wait: Callable[[Waiting], None] | None = None) -> Iterator[bool]:
+def held(
+    lock: Lock,
+    should_stop: Callable[[], bool] = lambda: True,
+    on_wait: Callable[[Waiting], None] | None = None,
+) -> Iterator[bool]:
     """Hold a lock, and wait for it until ``should_stop``, by default not at all; yields whether it is held; raises `MissingError`."""
     try:
         mine = lock.take()

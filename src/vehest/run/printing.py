@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
     from vehest.studies.sweep import SweepArtefacts
 
-SCORE_HEADER = ("RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0, static map")
+SCORE_HEADER = (
+    "RMSE(β) [deg]",
+    "95 % interval [deg]",
+    "to the lowest [deg]",
+    "beats v = 0, static map",
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,10 @@ def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | Non
         echo(as_json_text(outcome), keep="\n")
         return
     if shown is None:
-        shown = (f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}" for key, value in outcome.items())
+        shown = (
+            f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}"
+            for key, value in outcome.items()
+        )
     for one in shown:
         if isinstance(one, str):
             echo(one)
@@ -84,12 +92,19 @@ def _print_table(shown: TerminalTable) -> None:
         echo("")
         echo(shown.title)
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(*(Column(Text(printable(name))) for name in shown.header), box=None, header_style="bold", pad_edge=False)
+    table = Table(
+        *(Column(Text(printable(name))) for name in shown.header),
+        box=None,
+        header_style="bold",
+        pad_edge=False,
+    )
     for row in shown.rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     with console.capture() as captured:
         console.print(table)
-    echo(captured.get().removesuffix("\n"), keep="\n\x1b")  # cells hold no escapes any more, styles do
+    echo(
+        captured.get().removesuffix("\n"), keep="\n\x1b"
+    )  # cells hold no escapes any more, styles do
 
 
 def echo(text: str, keep: str = "") -> None:
@@ -124,7 +139,11 @@ def silence(stream: Any) -> None:
 
 def counted(names: Sequence[str]) -> str:
     """Their number, and the first of them."""
-    return f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})" if names else "0"
+    return (
+        f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
+        if names
+        else "0"
+    )
 
 
 def as_json_text(outcome: Any) -> str:
@@ -139,7 +158,10 @@ def as_json_text(outcome: Any) -> str:
 
     encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
     text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
-    return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)
+    return "".join(
+        c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f"
+        for c in text
+    )
 
 
 def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
@@ -149,50 +171,88 @@ def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> 
     return _summary([table], [], {"overview": _records(overview)}, left_out)
 
 
-def summary_of_leaderboard(title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]) -> TerminalSummary:
+def summary_of_leaderboard(
+    title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]
+) -> TerminalSummary:
     """The leaderboard of a study, a table a test set, with the study's verdict."""
     header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
     tables, notes = [], []
     for test_set, rows in board.groupby("test_set", sort=False):
-        given = " (estimates start at the reference state)" if (rows["start"] == "reference").any() else ""
+        given = (
+            " (estimates start at the reference state)"
+            if (rows["start"] == "reference").any()
+            else ""
+        )
         cells = [
-            (row["title"], f"{row['n_parameters']:.0f}", str(row["n_seeds"]), *score_cells(row), f"{row['fvu']:.3f}")
+            (
+                row["title"],
+                f"{row['n_parameters']:.0f}",
+                str(row["n_seeds"]),
+                *score_cells(row),
+                f"{row['fvu']:.3f}",
+            )
             for row in rows.to_dict("records")
         ]
         tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
         if rows["rmse_sideslip_low"].isna().all():
-            notes.append(f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner")
+            notes.append(
+                f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner"
+            )
     figures = {"leaderboard": _records(board)} | ({"verdict": list(verdict)} if verdict else {})
     return _summary(tables, notes, figures, left_out)
 
 
-def _summary(tables: list[TerminalTable], notes: list[str], figures: dict[str, Any], left_out: Mapping[str, str]) -> TerminalSummary:
+def _summary(
+    tables: list[TerminalTable],
+    notes: list[str],
+    figures: dict[str, Any],
+    left_out: Mapping[str, str],
+) -> TerminalSummary:
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
     shown = "\n".join([*notes, *missing, *figures.get("verdict", [])])
-    return TerminalSummary(tuple(tables), shown, "report.html", json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})))
+    return TerminalSummary(
+        tuple(tables),
+        shown,
+        "report.html",
+        json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})),
+    )
 
 
 def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
     """A row a combination with settings, seeds, mean and half interval on validation and tests."""
     from vehest.studies.sweep import table_of
 
-    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(artefacts.part.kinds.values()))
+    kinds = " and ".join(
+        kind.upper() if kind == "simulated" else kind
+        for kind in dict.fromkeys(artefacts.part.kinds.values())
+    )
     title = f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
     records = _records(artefacts.table)
     figures = {
         "chosen": next((row for row in records if row["chosen"]), None),
         "summary": records,
-        "failed": [{"jobs": name, "message": reason} for name, reason in artefacts.part.failed.items()],
+        "failed": [
+            {"jobs": name, "message": reason} for name, reason in artefacts.part.failed.items()
+        ],
     }
-    note = "* lowest mean on the validation range; tests choose nothing" if figures["chosen"] else ""
-    return TerminalSummary((TerminalTable(title, *table_of(artefacts)),), note, "report.md", json.dumps(figures))
+    note = (
+        "* lowest mean on the validation range; tests choose nothing" if figures["chosen"] else ""
+    )
+    return TerminalSummary(
+        (TerminalTable(title, *table_of(artefacts)),), note, "report.md", json.dumps(figures)
+    )
 
 
 def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
     """Cells of a ranked estimate under `SCORE_HEADER`."""
     low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
     interval = f"{low:.3f} … {high:.3f}" if low > 0 else "–"
-    return (f"{row['rmse_sideslip']:.3f}", interval, str(row["against_best"]), f"{row['beats_zero']}, {row['beats_static_map']}")
+    return (
+        f"{row['rmse_sideslip']:.3f}",
+        interval,
+        str(row["against_best"]),
+        f"{row['beats_zero']}, {row['beats_static_map']}",
+    )
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:

@@ -40,17 +40,30 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     """
     artefacts = _artefacts(output)
     whole = [artefact for artefact in artefacts.values() if artefact is not None]
-    present = {digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())}
-    reasons = {folder: reason for folder, artefact in artefacts.items() if (reason := _reason(artefact, present))}
+    present = {
+        digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())
+    }
+    reasons = {
+        folder: reason
+        for folder, artefact in artefacts.items()
+        if (reason := _reason(artefact, present))
+    }
     for folder in _entries(output / CHECKPOINTS):  # without a model its training may go on
         model = output / TRAIN / folder.name
-        if model in reasons or any(own.folder == model and own.status == "complete" for own in whole):
+        if model in reasons or any(
+            own.folder == model and own.status == "complete" for own in whole
+        ):
             reasons[folder] = SUPERFLUOUS
-    for path in (path for place in (*VERSIONS, CHECKPOINTS, FINISHED) for path in _entries(output / place)):
+    for path in (
+        path for place in (*VERSIONS, CHECKPOINTS, FINISHED) for path in _entries(output / place)
+    ):
         parts_of = path.with_name(path.name.removeprefix(PARTS_PREFIX))
         if is_left_over(path) or (parts_of != path and parts_of in artefacts):
             reasons[path] = LEFT_OVER
-    return [{"path": str(path), "reason": reason} | _size_and_age(path) for path, reason in reasons.items()]
+    return [
+        {"path": str(path), "reason": reason} | _size_and_age(path)
+        for path, reason in reasons.items()
+    ]
 
 
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
@@ -88,18 +101,30 @@ def _reason(artefact: Artefact | None, present: set[str]) -> str:
         return OUTDATED
     name = artefact.code.partition(" ")[2].partition("=")[0]  # train=1 NAME=1 training=1
     with suppress(VehestError):
-        if artefact.code not in (code_of(artefact.stage, name), code_of(artefact.stage, name, faults=True)):
+        if artefact.code not in (
+            code_of(artefact.stage, name),
+            code_of(artefact.stage, name, faults=True),
+        ):
             return OUTDATED
-    orphaned = artefact.stage not in (INGEST, TRAIN) and not present.issuperset(artefact.inputs.values())
+    orphaned = artefact.stage not in (INGEST, TRAIN) and not present.issuperset(
+        artefact.inputs.values()
+    )
     return ORPHANED if orphaned else ""
 
 
 def _entries(place: Path) -> list[Path]:
     """Files and folders in a folder, by name; no links."""
-    return [path for path in sorted(place.iterdir()) if not path.is_symlink()] if place.is_dir() and not place.is_symlink() else []
+    return (
+        [path for path in sorted(place.iterdir()) if not path.is_symlink()]
+        if place.is_dir() and not place.is_symlink()
+        else []
+    )
 
 
 def _size_and_age(path: Path) -> dict[str, int]:
     about = [one.lstat() for one in (path, *path.rglob("*"))]
     size = sum(one.st_size for one in about if not stat.S_ISDIR(one.st_mode))
-    return {"bytes": size, "seconds": round(max(0.0, time.time() - max(one.st_mtime for one in about)))}
+    return {
+        "bytes": size,
+        "seconds": round(max(0.0, time.time() - max(one.st_mtime for one in about))),
+    }

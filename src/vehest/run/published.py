@@ -39,55 +39,101 @@ CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
 
 
-def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
+def keys_of_study(
+    study: Study,
+    jobs: Jobs,
+    absent: Collection[str],
+    runner: Runner,
+    inputs: Mapping[str, Mapping[str, str]],
+) -> Keys:
     """Keys of everything that determines the results of a study."""
     ingests = _ingests(study, jobs, absent, runner)
     keys: Keys = {}
     for name, config in ingests.items():
         content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
-        keys[f"ingest {name}"] = {CODE: code_of("ingest", config["dataset"]["source"]), CONFIGURATION: _hash(content)}
+        keys[f"ingest {name}"] = {
+            CODE: code_of("ingest", config["dataset"]["source"]),
+            CONFIGURATION: _hash(content),
+        }
         if name in inputs:
             keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
-    about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
+    about: dict[str, Any] = {
+        name: getattr(study, name) for name in ("study", "title", "about", "report")
+    } | {"file": study.file.name}
     if study.datasets:
         about["datasets"] = [_titled(job.config) for job in jobs[""]]
     for part in (name for name in study.parts if name not in absent):
         configs = [job.config for job in jobs[part]]
         keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
         titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
-        about[f"part {part}"] = [study.parts[part].title, *training_facts(configs), resampling_fact(configs), *titles]
+        about[f"part {part}"] = [
+            study.parts[part].title,
+            *training_facts(configs),
+            resampling_fact(configs),
+            *titles,
+        ]
     return keys | {"report": {CODE: code_of("report", study.report), CONFIGURATION: _hash(about)}}
 
 
-def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
+def _ingests(
+    study: Study, jobs: Jobs, absent: Collection[str], runner: Runner
+) -> dict[str, Config]:
     there = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
         return there
-    return {name: runner.dataset_config(name, config) for config in there.values() for name in dataset_names(config["split"])}
+    return {
+        name: runner.dataset_config(name, config)
+        for config in there.values()
+        for name in dataset_names(config["split"])
+    }
 
 
 def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
     """Part, or data set, -> configuration of its first job."""
-    return {name: jobs[name][0].config for name in study.parts} or {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
+    return {name: jobs[name][0].config for name in study.parts} or {
+        str(job.config["dataset"]["name"]): job.config for job in jobs[""]
+    }
 
 
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
     faults = all_of(map(faults_of, configs))
-    rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(first["evaluation"]["rate_hz"])})
+    rates = sorted(
+        {float(config["estimator"]["rate_hz"]) for config in configs}
+        | {float(first["evaluation"]["rate_hz"])}
+    )
     yield "split", {CONFIGURATION: _hash(first["split"])}
-    yield "downsample", {CODE: code_of("downsample"), CONFIGURATION: _hash([first["downsample"], rates])}
+    yield (
+        "downsample",
+        {CODE: code_of("downsample"), CONFIGURATION: _hash([first["downsample"], rates])},
+    )
     for name in dict.fromkeys(str(config["estimator"]["name"]) for config in configs):
         jobs = [config for config in configs if config["estimator"]["name"] == name]
-        trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
+        trained = [
+            [job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]]
+            for job in jobs
+        ]
         yield f"train {name}", {CODE: code_of("train", name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
-            yield f"calibrate {name}", {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)}
-        conditions: Any = {key: value for key, value in first["evaluation"].items() if key != "least_speed" or value}  # as `Protocol.plain`
+            yield (
+                f"calibrate {name}",
+                {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)},
+            )
+        conditions: Any = {
+            key: value
+            for key, value in first["evaluation"].items()
+            if key != "least_speed" or value
+        }  # as `Protocol.plain`
         if faults:
             conditions = [conditions, *map(asdict, faults)]
-        yield f"evaluate {name}", {CODE: code_of("evaluate", name, faults=bool(faults)), CONFIGURATION: _hash(conditions)}
+        yield (
+            f"evaluate {name}",
+            {
+                CODE: code_of("evaluate", name, faults=bool(faults)),
+                CONFIGURATION: _hash(conditions),
+            },
+        )
 
 
 def _titled(config: Config) -> list[str]:
@@ -96,7 +142,9 @@ def _titled(config: Config) -> list[str]:
 
 
 def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[
+        :16
+    ]
 
 
 def in_words(verdict: Mapping[str, Any]) -> str:
@@ -119,10 +167,14 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
     Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
     """
     if content_overrides(overrides):
-        raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
+        raise ConfigurationError(
+            f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides"
+        )
     published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
     if not (names or published):
-        raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
+        raise MissingError(
+            f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true"
+        )
     pipelines: dict[str, Study | None] = {}
     for name in names or published:
         if not names or (find_pipeline(name) is None and name in published):
@@ -144,7 +196,12 @@ def _pipeline_of(study: str) -> Study | None:
 
 
 def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
-    published, state, changes, note = published_in(RESULTS / study), "not known", [("pipeline", CONFIGURATION)], ""
+    published, state, changes, note = (
+        published_in(RESULTS / study),
+        "not known",
+        [("pipeline", CONFIGURATION)],
+        "",
+    )
     if published is None:
         changes, note = [], f"there is nothing in '{RESULTS / study}' that vehest published"
     elif not published.keys:
@@ -157,19 +214,33 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
         except ConfigurationError as error:
             note = f"today it cannot be run ({error})"
         state = "stale" if changes else "up to date"
-    return {"study": study, "state": state, "changes": [{"what": what, "cause": cause} for what, cause in changes], "note": note}
+    return {
+        "study": study,
+        "state": state,
+        "changes": [{"what": what, "cause": cause} for what, cause in changes],
+        "note": note,
+    }
 
 
 def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
     """Pairs of what differs from when results were published and its cause; a note on what was not compared."""
-    runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(quiet=True), StopSignals())
+    runner = Runner(
+        Path(str(next(iter(jobs.values()))[0].config["output"])),
+        Messages(quiet=True),
+        StopSignals(),
+    )
     ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
     for name, config in ingests.items():
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
     then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
-    changes = [(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
+    changes = [
+        (what, cause)
+        for what in then
+        for cause, own in today.get(what, {}).items()
+        if then[what].get(cause) != own
+    ]
     changes += [(f"{what} added", CONFIGURATION) for what in today if what not in then]
     changes += [(f"{what} removed", CONFIGURATION) for what in then if what not in today]
     parts = _firsts(study, jobs)

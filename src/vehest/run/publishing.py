@@ -33,7 +33,9 @@ class Publication:
     """A study whose report goes to results/<study>."""
 
     study: str
-    absent: Mapping[str, str]  # name of a part or data set that the study went on without -> the same for people
+    absent: Mapping[
+        str, str
+    ]  # name of a part or data set that the study went on without -> the same for people
     keys: dict[str, dict[str, str]]  # `vehest.run.published.keys_of_study`
 
 
@@ -45,7 +47,9 @@ class Published:
     kinds: dict[str, str] = field(default_factory=dict)  # data set -> ``real`` or ``simulated``
     parts: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
-    keys: dict[str, dict[str, str]] = field(default_factory=dict)  # empty where they were not recorded yet
+    keys: dict[str, dict[str, str]] = field(
+        default_factory=dict
+    )  # empty where they were not recorded yet
 
 
 def published_in(folder: Path) -> Published | None:
@@ -56,7 +60,9 @@ def published_in(folder: Path) -> Published | None:
         return None
 
 
-def publish_study(publication: Publication | None, report: Artefact, messages: Messages) -> Path | None:
+def publish_study(
+    publication: Publication | None, report: Artefact, messages: Messages
+) -> Path | None:
     """Copy a study's report without pages and times to results/STUDY, with keys in its provenance; returns the folder, if it is published.
 
     CSV files are published with six significant digits (`published_content`).
@@ -69,7 +75,11 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
         return None
     folder = RESULTS / publication.study
     former = published_in(folder) or Published()
-    lost = [words for name, words in publication.absent.items() if name in former.kinds or name in former.parts]
+    lost = [
+        words
+        for name, words in publication.absent.items()
+        if name in former.kinds or name in former.parts
+    ]
     if lost:
         messages.warn(f"not published: '{folder}' shows {lost[0]}, and this run could not read it")
         return None
@@ -81,23 +91,39 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
 
 def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
     if any(part.is_symlink() for part in (folder, folder.parent)):
-        raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
+        raise ConfigurationError(
+            f"'{folder}' leads elsewhere through a link; remove the link or set publish: false"
+        )
     names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]
     contents = {name: published_content(report.folder / name) for name in names}
     if folder.is_dir():
-        present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
+        present = {
+            file.relative_to(folder).as_posix(): sha256_of(file)
+            for file in folder.rglob("*")
+            if file.is_file()
+        }
         former = published_in(folder)
         wanted = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        if former is not None and former.keys == keys and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}:
+        if (
+            former is not None
+            and former.keys == keys
+            and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}
+        ):
             return False
         if present and PROVENANCE not in present:
-            raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
+            raise ConfigurationError(
+                f"'{folder}' holds files that vehest did not publish; move them away or set publish: false"
+            )
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
             (aside / name).write_bytes(content)
         about = {**read_json(report.folder / PROVENANCE), "keys": keys}
-        (aside / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
+        (aside / PROVENANCE).write_text(
+            json.dumps(about, indent=1, ensure_ascii=False) + "\n",
+            encoding="utf-8",
+            errors="backslashreplace",
+        )
     return True
 
 
@@ -107,7 +133,9 @@ def published_content(file: Path) -> bytes:
         return file.read_bytes()
     text = io.StringIO(newline="")
     with file.open(encoding="utf-8", newline="") as lines:
-        csv.writer(text, lineterminator="\n").writerows([_rounded(cell) for cell in row] for row in csv.reader(lines))
+        csv.writer(text, lineterminator="\n").writerows(
+            [_rounded(cell) for cell in row] for row in csv.reader(lines)
+        )
     return text.getvalue().encode("utf-8")
 
 

@@ -49,7 +49,9 @@ def replay_log(
     """Replay a log and let a model estimate; returns its figures. The options are those of ``vehest replay``; raises `VehestError`."""
     bus, estimates = Bus(interface, channel, _speed(speed)), EstimateFrames(_identifier(identifier))
     if bus.speed is None and interface != "virtual":
-        raise ConfigurationError(f"--speed max needs the virtual bus, not '{interface}'; give --speed 1")
+        raise ConfigurationError(
+            f"--speed max needs the virtual bus, not '{interface}'; give --speed 1"
+        )
     written = output_files(out) + ([write_dbc] if write_dbc else [])
     for path in written:
         if any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
@@ -60,11 +62,17 @@ def replay_log(
         wanted = _signals(config if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
         timing = survey(frames, wanted, bus_rate)
-        faster = timing.rate_hz if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE else None
+        faster = (
+            timing.rate_hz
+            if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE
+            else None
+        )
         if write_dbc is not None:
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
-        figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(lambda: GuardedStepper(fitted, trust, faster), out, view)
+        figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
+            lambda: GuardedStepper(fitted, trust, faster), out, view
+        )
     return {
         "log": str(log),
         "model": model if model in WITH_VEHEST else str(folder),
@@ -74,16 +82,24 @@ def replay_log(
         **figures.plain(),
         "stopped": stopped(),
         "written": [str(file) for file in written],
-        **({"note": " ".join(read_description(folder).about.note.split())} if model in WITH_VEHEST else {}),
+        **(
+            {"note": " ".join(read_description(folder).about.note.split())}
+            if model in WITH_VEHEST
+            else {}
+        ),
     }
 
 
-def _signals(described: Config | None, dbc: Path | None, signals: str, model: Estimator) -> BusSignals:
+def _signals(
+    described: Config | None, dbc: Path | None, signals: str, model: Estimator
+) -> BusSignals:
     """The signals of a model's channels: from the configuration of a data set, if any, or by their names in a DBC."""
     named = [word for word in signals.split(",") if word.strip()]
     if described is not None:
         if named:
-            raise ConfigurationError("--dataset and --signals both name the channels; leave one out")
+            raise ConfigurationError(
+                "--dataset and --signals both name the channels; leave one out"
+            )
         return from_dataset(described["dataset"], model.channels, model.skippable, dbc)
     if dbc is None:
         raise ConfigurationError("nothing describes the bus; add --dbc car.dbc, or --dataset NAME")

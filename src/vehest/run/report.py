@@ -25,7 +25,12 @@ from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
-from vehest.run.printing import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
+from vehest.run.printing import (
+    TerminalSummary,
+    summary_of_leaderboard,
+    summary_of_overview,
+    summary_of_sweep,
+)
 from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
@@ -53,7 +58,10 @@ SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
 def draw_report(
-    study: Study, comparisons: Mapping[str, Comparison], datasets: Sequence[StoredDataset | AbsentDataset], runner: Runner
+    study: Study,
+    comparisons: Mapping[str, Comparison],
+    datasets: Sequence[StoredDataset | AbsentDataset],
+    runner: Runner,
 ) -> tuple[Artefact, TerminalSummary]:
     """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent."""
     shown = {name: part for name, part in comparisons.items() if part.members}
@@ -64,44 +72,73 @@ def draw_report(
         about=study.about,
         command=study.command,
         titles={name: part.title for name, part in study.parts.items()},
-        parts={name: _part_artefacts(study, study.parts[name].title, part) for name, part in shown.items()},
+        parts={
+            name: _part_artefacts(study, study.parts[name].title, part)
+            for name, part in shown.items()
+        },
         absent=[name for name in study.parts if name not in comparisons],
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
     )
     config: dict[str, Any] = {
-        **{key: getattr(artefacts, key) for key in ("study", "title", "about", "command", "titles")},
+        **{
+            key: getattr(artefacts, key) for key in ("study", "title", "about", "command", "titles")
+        },
         "module": study.report,
         "absent": [{"name": name, "title": artefacts.titles[name]} for name in artefacts.absent],
         "parts": {
-            name: {"training": list(part.facts), "failed": part.failed, "data_titles": part.data_titles, "protocol": part.protocol.plain}
+            name: {
+                "training": list(part.facts),
+                "failed": part.failed,
+                "data_titles": part.data_titles,
+                "protocol": part.protocol.plain,
+            }
             for name, part in artefacts.parts.items()
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},
         "absent_datasets": [asdict(dataset) for dataset in artefacts.absent_datasets],
         **({"weights": True} if study.publish else {}),
     }
-    ingested = [artefact for artefact in runner.artefacts.values() if study.datasets and artefact.stage == INGEST]
+    ingested = [
+        artefact
+        for artefact in runner.artefacts.values()
+        if study.datasets and artefact.stage == INGEST
+    ]
     inputs = {artefact.label: artefact.digest for artefact in ingested}
     for name, part in shown.items():
         made = [own for member in part.members for own in member.made]
-        inputs |= {f"{name}: {artefact.label}" if name else artefact.label: artefact.digest for artefact in made}
-    models = [member.model for part in shown.values() for member in part.members if member.model is not None]
+        inputs |= {
+            f"{name}: {artefact.label}" if name else artefact.label: artefact.digest
+            for artefact in made
+        }
+    models = [
+        member.model
+        for part in shown.values()
+        for member in part.members
+        if member.model is not None
+    ]
 
     def write(folder: Path) -> None:
         _write(artefacts, study.report, _recordings(shown, ingested), folder)
         if study.publish and models:
             write_weights(models, folder / PUBLISHED_WEIGHTS)
 
-    report = runner.ensure(StagePlan(STAGE, study.study, config, inputs, code_of(STAGE, study.report), runner.output), write)
+    report = runner.ensure(
+        StagePlan(STAGE, study.study, config, inputs, code_of(STAGE, study.report), runner.output),
+        write,
+    )
     module = study_module(study.report)
     if not hasattr(module, "leaderboard"):
         return report, summary_of_overview(read_frame(report.folder / OVERVIEW), left_out)
     verdict: list[str] = module.verdict(artefacts) if hasattr(module, "verdict") else []
-    return report, summary_of_leaderboard(study.title, module.leaderboard(artefacts.first), left_out, verdict)
+    return report, summary_of_leaderboard(
+        study.title, module.leaderboard(artefacts.first), left_out, verdict
+    )
 
 
-def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path) -> None:
+def _write(
+    artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path
+) -> None:
     """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a comparison metrics.csv and timings.csv.
 
     On one thread, as groups are trained, so that it has the same last digits whether trainings came before or not.
@@ -118,13 +155,17 @@ def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], 
     with one_blas_thread():
         write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times))
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
-        raise ConfigurationError(f"the study module '{name}' gives no table 'overview', which the terminal shows")
+        raise ConfigurationError(
+            f"the study module '{name}' gives no table 'overview', which the terminal shows"
+        )
     if artefacts.parts:
         table, kept = artefacts.metrics, getattr(module, "METRICS", None)
         if kept is not None:
             table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
         for file, written in ((METRICS, table), (TIMINGS, of_parts(timings))):
-            written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
+            written.to_csv(
+                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
+            )
     kinds = {name: kind for part in artefacts.parts.values() for name, kind in part.kinds.items()}
     about = provenance()
     about |= {
@@ -135,17 +176,27 @@ def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], 
         "kinds": kinds | {dataset.name: dataset.kind for dataset in artefacts.datasets},
         "recordings": recordings,
     }
-    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
+    (folder / PROVENANCE).write_text(
+        json.dumps(about, indent=1, ensure_ascii=False) + "\n",
+        encoding="utf-8",
+        errors="backslashreplace",
+    )
 
 
-def _recordings(comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]) -> dict[str, str]:
+def _recordings(
+    comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]
+) -> dict[str, str]:
     """Data set and recording -> digest, of every recording that is scored, at the evaluation rate, or shown."""
     found = {}
     for part in comparisons.values():
         for span in scored_spans(part.evaluation.split):
             outputs = part.evaluation.references[span.dataset].outputs
             found[f"{span.dataset}/{span.recording}"] = outputs[f"{span.recording}.parquet"]
-    return found | {f"{own.label}/{Path(name).stem}": digest for own in ingested for name, digest in own.outputs.items()}
+    return found | {
+        f"{own.label}/{Path(name).stem}": digest
+        for own in ingested
+        for name, digest in own.outputs.items()
+    }
 
 
 def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
@@ -164,7 +215,9 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
                 model_folder=member.model.folder,
                 evaluation_folder=member.evaluation.folder,
                 training=dict(member.job.training),
-                calibration_folder=member.calibration.folder if member.calibration is not None else None,
+                calibration_folder=member.calibration.folder
+                if member.calibration is not None
+                else None,
             )
         )
     e = part.evaluation
@@ -179,7 +232,10 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         data_titles=part.data_titles,
         metrics=_together(tables, study.study),
         models=models,
-        references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in (*e.split.train, *scored_spans(e.split))},
+        references={
+            (s.dataset, s.recording): recording_file(e.references[s.dataset], s)
+            for s in (*e.split.train, *scored_spans(e.split))
+        },
         facts=part.facts,
         failed=part.failed,
     )
@@ -190,9 +246,16 @@ def _timings_of(part: PartArtefacts) -> pd.DataFrame:
     tables = []
     for model in part.models:
         own = _table_of(model.evaluation_folder, TIMINGS)
-        fit = {name: value for name, value in read_fit_metrics(model.model_folder).items() if name.endswith("_seconds")}
+        fit = {
+            name: value
+            for name, value in read_fit_metrics(model.model_folder).items()
+            if name.endswith("_seconds")
+        }
         phases = {name: value for name, value in fit.items() if name not in set(own["metric"])}
-        tables += [own, *(own.head(1).assign(metric=name, value=value) for name, value in phases.items())]
+        tables += [
+            own,
+            *(own.head(1).assign(metric=name, value=value) for name, value in phases.items()),
+        ]
     return _together(tables, part.study)
 
 
@@ -204,22 +267,37 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
 
 
-def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Artefact, TerminalSummary]:
+def draw_sweep(
+    study: Study, comparison: Comparison, runner: Runner
+) -> tuple[Artefact, TerminalSummary]:
     """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
     configs = [job.config for job in comparison.jobs if "estimator" in job.config]
-    conditions = dict.fromkeys(fault.condition for config in configs if (fault := chosen_fault(config)) is not None)
-    under = [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"] if conditions else []
+    conditions = dict.fromkeys(
+        fault.condition for config in configs if (fault := chosen_fault(config)) is not None
+    )
+    under = (
+        [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"]
+        if conditions
+        else []
+    )
     part = _part_artefacts(study, "", comparison)
     part = replace(part, facts=[*part.facts, *under])
     artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
-    made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]
+    made = [
+        own
+        for member in comparison.members
+        for own in (member.model, member.evaluation)
+        if own is not None
+    ]
     plan = StagePlan(
         stage=SWEEP,
         label=part.study,
         config={
             "command": part.command,
             "keys": artefacts.keys,
-            "jobs": artefacts.jobs[["combination", "title", *artefacts.keys, "seed", "status"]].astype(object).to_dict("records"),
+            "jobs": artefacts.jobs[["combination", "title", *artefacts.keys, "seed", "status"]]
+            .astype(object)
+            .to_dict("records"),
             "failures": part.failed,
             "protocol": part.protocol.plain,
             "kinds": part.kinds,
@@ -236,7 +314,9 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
 
         write_document(build(artefacts), folder, page=False)
         for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", artefacts.table)):
-            written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
+            written.to_csv(
+                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
+            )
 
     return runner.ensure(plan, write), summary_of_sweep(artefacts)
 
@@ -246,22 +326,51 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []
     for job in comparison.jobs:
-        member = None if job.failure is not None or job.training is None else comparison.found.get(job.training.plan.key)
-        title = new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""  # else refused
-        row: dict[str, Any] = {"combination": job.combination, "title": title, **job.values, "seed": job.config["seed"]}
-        row |= {"status": DONE if member else FAILED, "error": job.failure.message if job.failure is not None else ""}
+        member = (
+            None
+            if job.failure is not None or job.training is None
+            else comparison.found.get(job.training.plan.key)
+        )
+        title = (
+            new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""
+        )  # else refused
+        row: dict[str, Any] = {
+            "combination": job.combination,
+            "title": title,
+            **job.values,
+            "seed": job.config["seed"],
+        }
+        row |= {
+            "status": DONE if member else FAILED,
+            "error": job.failure.message if job.failure is not None else "",
+        }
         rows.append(row | _figures(member, sets, chosen_fault(job.config)))
     return pd.DataFrame(rows)
 
 
-def _figures(member: Member | None, sets: Sequence[str], fault: FaultSettings | None) -> dict[str, Any]:
+def _figures(
+    member: Member | None, sets: Sequence[str], fault: FaultSettings | None
+) -> dict[str, Any]:
     """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one; NaN where it failed."""
     columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(["n_parameters", "epochs", *columns], float("nan"))
     table = _table_of(member.evaluation.folder, METRICS)
     nominal = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
-    own = {metric: float(nominal.loc[nominal["metric"] == metric, "value"].iloc[0]) for metric in ("n_parameters", "epochs")}
-    scored = nominal if fault is None else table[(table["subset"] == FAULTED) & (table["condition"] == fault.condition)]
-    found = dict(zip(scored["metric"] + "." + scored["test_set"], map(float, scored["value"]), strict=True))
-    return {**own, **{column: found.get(column, float("nan")) for column in columns}, "model": member.model.folder.name}
+    own = {
+        metric: float(nominal.loc[nominal["metric"] == metric, "value"].iloc[0])
+        for metric in ("n_parameters", "epochs")
+    }
+    scored = (
+        nominal
+        if fault is None
+        else table[(table["subset"] == FAULTED) & (table["condition"] == fault.condition)]
+    )
+    found = dict(
+        zip(scored["metric"] + "." + scored["test_set"], map(float, scored["value"]), strict=True)
+    )
+    return {
+        **own,
+        **{column: found.get(column, float("nan")) for column in columns},
+        "model": member.model.folder.name,
+    }

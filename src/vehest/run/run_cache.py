@@ -58,7 +58,9 @@ class Record:
     key: str  # of its `RunCache`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
     made: dict[str, str]  # folder of an artefact in the output root -> digest; the report last
-    notes: tuple[tuple[str, str, str, str], ...]  # that the next run in full would print too: status, stage, label, detail
+    notes: tuple[
+        tuple[str, str, str, str], ...
+    ]  # that the next run in full would print too: status, stage, label, detail
     summary: TerminalSummary
     publication: Publication | None
     store: str  # MLflow's local store in the output root; empty where there is none
@@ -76,12 +78,24 @@ class RunCache:
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
-        self._words, self._overrides, self._pipeline = (command, name, *overrides), overrides, name if command == "run" else ""
-        named = [override.removeprefix("output=") for override in overrides if override.lstrip("+~").startswith("output")]
+        self._words, self._overrides, self._pipeline = (
+            (command, name, *overrides),
+            overrides,
+            name if command == "run" else "",
+        )
+        named = [
+            override.removeprefix("output=")
+            for override in overrides
+            if override.lstrip("+~").startswith("output")
+        ]
         root = named[-1] if named else os.environ.get("VEHEST_OUTPUT", "outputs")
         plain = root and not re.search(r"[\\'\"${},=()\[\]]", root)
         own = hashlib.sha256(json.dumps(self._words).encode()).hexdigest()[:12]
-        self.file = Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{own}.json") if plain else None
+        self.file = (
+            Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{own}.json")
+            if plain
+            else None
+        )
         self.key = self._key()
 
     def load(self) -> tuple[Record, list[Artefact]] | None:
@@ -91,12 +105,17 @@ class RunCache:
         output = self.file.parents[1]
         try:
             record = validated(Record, read_json(self.file), f"'{self.file}'")
-            if record.key != self.key or any(stamp_of(path) != stamp for path, stamp in record.raw.items()):
+            if record.key != self.key or any(
+                stamp_of(path) != stamp for path, stamp in record.raw.items()
+            ):
                 return None
             made = [read_artefact(output / folder) for folder in record.made]
         except VehestError:
             return None
-        whole = all(own.status == "complete" and own.digest == digest for own, digest in zip(made, record.made.values(), strict=True))
+        whole = all(
+            own.status == "complete" and own.digest == digest
+            for own, digest in zip(made, record.made.values(), strict=True)
+        )
         return (record, made) if whole and (output / record.store).exists() else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
@@ -105,24 +124,42 @@ class RunCache:
         if found is None:
             return None
         (record, (*made, report)), messages = found, Messages(quiet=options.quiet)
-        for line in (*record.notes, *(("skip", own.stage, own.label, "up to date") for own in (*made, report))):
+        for line in (
+            *record.notes,
+            *(("skip", own.stage, own.label, "up to date") for own in (*made, report)),
+        ):
             messages.line(*line)
         published = None if options.dry_run else publish_study(record.publication, report, messages)
         return Ran(record.summary, report.folder, True, published)
 
     def save(
-        self, runner: Runner, report: Artefact, summary: TerminalSummary, raw: dict[str, str], publication: Publication | None
+        self,
+        runner: Runner,
+        report: Artefact,
+        summary: TerminalSummary,
+        raw: dict[str, str],
+        publication: Publication | None,
     ) -> None:
         """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: stamps from before reading."""
         tracker, output = runner.tracker, runner.output
-        if self.file is None or not self.key or output != self.file.parents[1] or not tracker.complete or self._key() != self.key:
+        if (
+            self.file is None
+            or not self.key
+            or output != self.file.parents[1]
+            or not tracker.complete
+            or self._key() != self.key
+        ):
             return
         made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
         record = Record(
             key=self.key,
             raw=raw,
             made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
-            notes=tuple(line for line in runner.messages.printed if line[0] in ("note", WARNING) and line[1] != "calibrate"),
+            notes=tuple(
+                line
+                for line in runner.messages.printed
+                if line[0] in ("note", WARNING) and line[1] != "calibrate"
+            ),
             summary=summary,
             publication=publication,
             store=tracker.store,
@@ -130,25 +167,39 @@ class RunCache:
         try:
             remove_leftovers(self.file.parent)
             with written_aside(self.file) as aside:
-                aside.write_text(json.dumps(asdict(record), indent=1, ensure_ascii=False), encoding="utf-8")
+                aside.write_text(
+                    json.dumps(asdict(record), indent=1, ensure_ascii=False), encoding="utf-8"
+                )
         except VehestError as error:
             runner.messages.warn(f"{error}; the next run looks at everything again")
 
     def _key(self) -> str:
-        digest = hashlib.sha256(repr((FORMAT, sys.version_info[:2], self._words, os.getcwd(), library_versions())).encode())
+        digest = hashlib.sha256(
+            repr(
+                (FORMAT, sys.version_info[:2], self._words, os.getcwd(), library_versions())
+            ).encode()
+        )
         texts = list(self._overrides)
         try:
             for file in [*_configuration(self._pipeline), *_code()]:
                 content = file.read_bytes()
-                digest.update(repr((str(file), hashlib.sha256(content).hexdigest())).encode("utf-8", "surrogateescape"))
+                digest.update(
+                    repr((str(file), hashlib.sha256(content).hexdigest())).encode(
+                        "utf-8", "surrogateescape"
+                    )
+                )
                 if file.suffix == ".yaml":
                     texts.append(content.decode("utf-8", "replace"))
         except (OSError, VehestError, ImportError, ValueError):
             return ""
-        for resolver, variable in sorted({pair for text in texts for pair in _RESOLVED.findall(text)}):
+        for resolver, variable in sorted(
+            {pair for text in texts for pair in _RESOLVED.findall(text)}
+        ):
             if resolver != "oc.env":
                 return ""  # its value may differ each time
-            digest.update(repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape"))
+            digest.update(
+                repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape")
+            )
         return digest.hexdigest()
 
 
@@ -164,7 +215,9 @@ def stamp_of(path: str) -> str:
         for file in (os.path.join(folder, name) for name in names):
             with suppress(OSError):  # a link to nothing
                 about = os.stat(file)
-                entries.append((file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino))
+                entries.append(
+                    (file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino)
+                )
     return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -182,12 +235,19 @@ def _configuration(pipeline: str) -> Iterator[Path]:
 def _code() -> Iterator[Path]:
     """Files of vehest and of every package that offers it estimators, sources or studies."""
     found = metadata.entry_points()
-    points = [point for group in found.groups if group.startswith("vehest.") for point in found.select(group=group)]
+    points = [
+        point
+        for group in found.groups
+        if group.startswith("vehest.")
+        for point in found.select(group=group)
+    ]
     for package in sorted({"vehest", *(point.module.partition(".")[0] for point in points)}):
         spec = importlib.util.find_spec(package)
         if spec is not None and spec.origin and not spec.submodule_search_locations:
             yield Path(spec.origin)
         for top in (spec and spec.submodule_search_locations) or ():
             for folder, folders, names in os.walk(top):
-                folders[:] = sorted(name for name in folders if name not in ("__pycache__", "pretrained"))
+                folders[:] = sorted(
+                    name for name in folders if name not in ("__pycache__", "pretrained")
+                )
                 yield from (Path(folder, name) for name in sorted(names))

@@ -58,12 +58,18 @@ class Runner:
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     dry_run: bool = False
-    tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # by default it logs nothing
+    tracker: Tracker = field(
+        default_factory=lambda: Tracker({}, Path(), print)
+    )  # by default it logs nothing
     launcher: Launcher = field(default_factory=LocalLauncher)
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
-    weights: PublishedWeights | None = None  # of a published study, which are taken instead of training
+    weights: PublishedWeights | None = (
+        None  # of a published study, which are taken instead of training
+    )
     train_first: str = ""  # command to run first where a training is missing; empty to train here
-    artefacts: dict[Path, Artefact] = field(default_factory=dict)  # those found or made so far, by folder
+    artefacts: dict[Path, Artefact] = field(
+        default_factory=dict
+    )  # those found or made so far, by folder
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)
 
     def _once(self, what: str, of: Any, make: Callable[[], Value]) -> Value:
@@ -79,11 +85,16 @@ class Runner:
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
-            made = self.ensure(plan, lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report))
+            made = self.ensure(
+                plan,
+                lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report),
+            )
         plan.drop(parts_of(plan))
         return made
 
-    def downsample(self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]) -> Artefact:
+    def downsample(
+        self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
+    ) -> Artefact:
         """The recordings of a data set at another rate."""
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
@@ -91,11 +102,20 @@ class Runner:
     def dataset_config(self, name: str, config: Config) -> Config:
         """The configuration of a data set's ingest, with the root and output of another command's."""
         root = [] if config.get("root") is None else [f"root={_quoted(config['root'])}"]
-        return self._once("dataset", name, lambda: {**compose_config("ingest", [f"dataset={name}", *root]), "output": config["output"]})
+        return self._once(
+            "dataset",
+            name,
+            lambda: {
+                **compose_config("ingest", [f"dataset={name}", *root]),
+                "output": config["output"],
+            },
+        )
 
     def datasets_of(self, config: Config) -> list[Config]:
         """The configuration of every data set of a split."""
-        return [self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])]
+        return [
+            self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])
+        ]
 
     def look_for_files(self, config: Config) -> None:
         """Make sure that the raw files of every data set of a split are here; read nothing; raises `MissingError` where some are not."""
@@ -111,9 +131,14 @@ class Runner:
 
         def recordings_of(name: str) -> Mapping[str, Reader]:
             ingested = self._ingested(name, config)
-            return {file.removesuffix(".parquet"): partial(read_recording, ingested.folder / file) for file in ingested.outputs}
+            return {
+                file.removesuffix(".parquet"): partial(read_recording, ingested.folder / file)
+                for file in ingested.outputs
+            }
 
-        return self._once("split", config["split"], partial(split_from_config, config["split"], recordings_of))
+        return self._once(
+            "split", config["split"], partial(split_from_config, config["split"], recordings_of)
+        )
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
         """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
@@ -122,17 +147,31 @@ class Runner:
             ingested = self._ingested(name, config)
             return tuple(stored_summary(ingested.folder / file) for file in ingested.outputs)
 
-        return {name: self._once("contents", name, partial(read, name)) for name in dataset_names(config["split"])}
+        return {
+            name: self._once("contents", name, partial(read, name))
+            for name in dataset_names(config["split"])
+        }
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
         """Every data set of a split at a rate."""
-        return {name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"]) for name in split.datasets}
+        return {
+            name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"])
+            for name in split.datasets
+        }
 
-    def evaluation(self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()) -> Evaluation:
+    def evaluation(
+        self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
+    ) -> Evaluation:
         """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
         split, protocol = self.split(config), protocol_from_config(config["evaluation"])
-        references = self.data_for(split, protocol.rate_hz, {**config, "downsample": {**config["downsample"], "transforms": []}})
-        kinds = {name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets}
+        references = self.data_for(
+            split,
+            protocol.rate_hz,
+            {**config, "downsample": {**config["downsample"], "transforms": []}},
+        )
+        kinds = {
+            name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets
+        }
         return Evaluation(split, data, references, kinds, protocol, self.output, faults)
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
@@ -144,10 +183,16 @@ class Runner:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
         if found is None:
-            found = ensured(plan, write, plan.stage in self.force, self.stop.requested, self._print_waiting)
+            found = ensured(
+                plan, write, plan.stage in self.force, self.stop.requested, self._print_waiting
+            )
             self.stop.raise_if_requested()
             assert found is not None
-        detail = "up to date" if found.skipped else f"{found.provenance['seconds']:.1f} s, {found.folder}"
+        detail = (
+            "up to date"
+            if found.skipped
+            else f"{found.provenance['seconds']:.1f} s, {found.folder}"
+        )
         self.messages.line("skip" if found.skipped else "done", plan.stage, plan.label, detail)
         self.artefacts[plan.folder] = found
         return found
@@ -172,10 +217,15 @@ class Runner:
             waiting += [replace(group, jobs=missing)] if missing else []
         failures: dict[str, Failure] = {}
         if waiting and self.train_first:
-            plans, reason = [job.plan for group in waiting for job in group.jobs], f"run '{self.train_first}' first"
+            plans, reason = (
+                [job.plan for group in waiting for job in group.jobs],
+                f"run '{self.train_first}' first",
+            )
             if not members:
                 raise MissingError(f"{plans[0].label} has not been trained and evaluated; {reason}")
-            failure = Failure(f"has not been trained and evaluated; {reason}", exit_code=MissingError.exit_code)
+            failure = Failure(
+                f"has not been trained and evaluated; {reason}", exit_code=MissingError.exit_code
+            )
             return members, {plan.key: failure for plan in plans}
         if waiting:
             self._announce(waiting, len(members))
@@ -184,7 +234,9 @@ class Runner:
             with self.messages.bars() as bars:
                 bars.step(ALL, 0, len(waiting))
                 report = partial(self._report, waiting, bars)
-                for ended, done in enumerate(self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report), start=1):
+                for ended, done in enumerate(
+                    self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report), start=1
+                ):
                     group, outcome = waiting[done.position], done.outcome
                     bars.close(group.name)
                     bars.step(ALL, ended, len(waiting))
@@ -203,10 +255,21 @@ class Runner:
         """Take models that are published under the key of a training and are not there."""
         wanted = [plan for plan in plans if plan.key in weights and find(plan) is None]
         for plan in wanted if not self.dry_run else ():
-            ensured(plan, partial(weights.write, plan.key), False, self.stop.requested, self._print_waiting)
+            ensured(
+                plan,
+                partial(weights.write, plan.key),
+                False,
+                self.stop.requested,
+                self._print_waiting,
+            )
             self.stop.raise_if_requested()
         if wanted:
-            self.messages.line("note", TRAIN, f"{len(wanted)} of {len(plans)}", f"taken from {weights.path}; --retrain trains them")
+            self.messages.line(
+                "note",
+                TRAIN,
+                f"{len(wanted)} of {len(plans)}",
+                f"taken from {weights.path}; --retrain trains them",
+            )
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
         """Print what groups are going to do; a dry run ends here."""
@@ -214,14 +277,28 @@ class Runner:
             labels = [job.plan.label for group in waiting for job in group.jobs]
             for label in labels:
                 self.messages.line("plan", "train", label)
-            self.messages.line("plan", "train", f"{len(labels)} in all", f"{n_there} more are there")
+            self.messages.line(
+                "plan", "train", f"{len(labels)} in all", f"{n_there} more are there"
+            )
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(estimator_class(name).slow_kernel):
-                self.messages.line("once", "compile", name, "tens of seconds before its first training; later ones load it")
+                self.messages.line(
+                    "once",
+                    "compile",
+                    name,
+                    "tens of seconds before its first training; later ones load it",
+                )
         if any(group.split.validation for group in waiting) and has_to_compile(SLOW_KERNEL):
-            self.messages.line("once", "compile", "health", "about 20 s before the first calibration; later ones load it")
-        for split in dict.fromkeys(group.split.name for group in waiting if not group.split.validation):
+            self.messages.line(
+                "once",
+                "compile",
+                "health",
+                "about 20 s before the first calibration; later ones load it",
+            )
+        for split in dict.fromkeys(
+            group.split.name for group in waiting if not group.split.validation
+        ):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
 
     def _received(self, outcome: Sequence[Member]) -> dict[str, Member]:
@@ -230,7 +307,12 @@ class Runner:
             if member.finished and not self.dry_run:
                 member.job.plan.drop(member.job.plan.checkpoint_folder)
             if member.model is None:
-                self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
+                self.messages.line(
+                    "stop",
+                    "train",
+                    member.job.plan.label,
+                    "before its first epoch was over; the next run goes on",
+                )
             for made in member.made:
                 self.artefacts[made.folder] = made
                 status, detail = _in_words(made)
@@ -238,7 +320,9 @@ class Runner:
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
-    def _report(self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None) -> None:
+    def _report(
+        self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None
+    ) -> None:
         """Draw the progress of a group, or print for whom it waits."""
         name = groups[at].name
         if isinstance(news, Waiting):
@@ -250,7 +334,9 @@ class Runner:
             bars.step(name, news.epoch, news.max_epochs, note)
 
     def _print_waiting(self, waiting: Waiting) -> None:
-        self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
+        self.messages.line(
+            "wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it"
+        )
 
 
 def _in_words(made: Artefact) -> tuple[str, str]:
@@ -263,17 +349,30 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         fit = read_fit_metrics(made.folder)
         loss = fit.get("best_validation_loss")
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
-        return "done", epochs + (f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}")
+        return "done", epochs + (
+            f"{fit['n_parameters']:.0f} parameters"
+            if loss is None
+            else f"validation loss {loss:.4g}"
+        )
     if made.stage == "evaluate":
-        errors = {name: error for name, error in test_figures(made.folder).items() if name.startswith("rmse_sideslip")}
+        errors = {
+            name: error
+            for name, error in test_figures(made.folder).items()
+            if name.startswith("rmse_sideslip")
+        }
         return "done", ", ".join(f"{name} {error:.3f}°" for name, error in errors.items())
     trust = read_trust(made.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"
-    return "done", f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}"
+    return (
+        "done",
+        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}",
+    )
 
 
 def _quoted(text: Any) -> str:
     """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
-    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text))
+    escaped = re.sub(
+        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
+    )
     return f"'{escaped}'"

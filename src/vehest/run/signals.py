@@ -40,7 +40,10 @@ class StopSignals:
     @contextmanager
     def installed(self) -> Iterator[None]:
         """Listen, and restore the former handlers afterwards."""
-        former = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        former = {
+            number: signal.signal(number, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
         try:
             yield
         finally:
@@ -72,4 +75,6 @@ class TimeLimit:
 
     def requested(self) -> bool:
         """Whether a signal came, or the time is up."""
-        return self._stop.requested() or (self._until is not None and time.monotonic() >= self._until)
+        return self._stop.requested() or (
+            self._until is not None and time.monotonic() >= self._until
+        )

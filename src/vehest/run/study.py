@@ -45,7 +45,9 @@ FORMS = "it needs study, report and one of: split and sweeps; parts, each with s
 SAME_IN_A_PART = ("split", "evaluation", "downsample")
 ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
-Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
+Sweeps = Annotated[
+    tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"
+]
 Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
 Names = Annotated[tuple[str, ...], "a list of names"]
 
@@ -73,7 +75,9 @@ class PipelineFile:
     evaluation: dict[str, int | float | bool | str | Faults | None] = field(default_factory=dict)
     split: str = ""
     sweeps: Sweeps = ()
-    parts: Annotated[dict[str, Part], "a mapping from names to what each has"] = field(default_factory=dict)
+    parts: Annotated[dict[str, Part], "a mapping from names to what each has"] = field(
+        default_factory=dict
+    )
     datasets: Names = ()
     optional_datasets: Names = ()
     based_on: str | None = None
@@ -89,22 +93,34 @@ class Study(PipelineFile):
     @property
     def shows_failed(self) -> bool:
         """Whether its report can leave out failed jobs: it is not in parts, or its module says so."""
-        return not self.parts or "" in self.parts or bool(getattr(study_module(self.report), "SHOWS_FAILED", False))
+        return (
+            not self.parts
+            or "" in self.parts
+            or bool(getattr(study_module(self.report), "SHOWS_FAILED", False))
+        )
 
 
 @dataclass(eq=False)
 class Job:
     """One training and its evaluation."""
 
-    config: Config  # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
-    label: str = ""  # its settings as a sweep names them; empty for the estimator's name and variant
-    values: Mapping[str, Value] = field(default_factory=dict)  # keys that a sweep varies -> its own values
+    config: (
+        Config  # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
+    )
+    label: str = (
+        ""  # its settings as a sweep names them; empty for the estimator's name and variant
+    )
+    values: Mapping[str, Value] = field(
+        default_factory=dict
+    )  # keys that a sweep varies -> its own values
     combination: int = 0  # of these values
     failure: Failure | None = None  # why it cannot be done, or failed
     training: TrainJob | None = None  # once it is planned
 
 
-Jobs = Mapping[str, Sequence[Job]]  # part of a study -> its jobs; the one part of a study without parts is called ``""``
+Jobs = Mapping[
+    str, Sequence[Job]
+]  # part of a study -> its jobs; the one part of a study without parts is called ``""``
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
@@ -123,20 +139,36 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
     for key, part in parts.items():
         if not part.split or not part.sweeps or not all(part.sweeps):
             where = f"part '{key}'" if key else "it"
-            raise ConfigurationError(f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides")
+            raise ConfigurationError(
+                f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides"
+            )
     if read.report not in study_names():
-        raise ConfigurationError(f"'{file}': there is no study module '{read.report}'; there are: {', '.join(study_names())}")
+        raise ConfigurationError(
+            f"'{file}': there is no study module '{read.report}'; there are: {', '.join(study_names())}"
+        )
     takes = getattr(study_module(read.report), "TAKES", "")
     if given != ["split" if takes == "folds" else takes]:
-        draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(takes, takes)
-        raise ConfigurationError(f"'{file}': the study module '{read.report}' draws its report from {draws}")
+        draws = {
+            "split": "split and sweeps",
+            "folds": "split and sweeps, where the split has folds",
+        }.get(takes, takes)
+        raise ConfigurationError(
+            f"'{file}': the study module '{read.report}' draws its report from {draws}"
+        )
     parts = _folds_of(parts[""], file) if takes == "folds" else parts
-    evaluation = [f"{'' if key == 'faults' else 'evaluation.'}{key}={_as_override(value)}" for key, value in read.evaluation.items()]
+    evaluation = [
+        f"{'' if key == 'faults' else 'evaluation.'}{key}={_as_override(value)}"
+        for key, value in read.evaluation.items()
+    ]
     changed = {
         "title": " ".join((read.title or read.study).split()),
         "about": " ".join(read.about.split()),
         "parts": {
-            key: replace(part, title=" ".join((part.title or key).split()), overrides=(*part.overrides, *evaluation))
+            key: replace(
+                part,
+                title=" ".join((part.title or key).split()),
+                overrides=(*part.overrides, *evaluation),
+            )
             for key, part in parts.items()
         },
     }
@@ -152,7 +184,9 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
         hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
         if name in choices("dataset"):
             hint = f", only a data set: 'vehest data usable {name}' says what its recordings suffice for"
-        raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
+        raise MissingError(
+            f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})"
+        )
     try:
         content = read_yaml(file)
     except DataError as error:
@@ -163,9 +197,16 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
     if not isinstance(based_on, str):
         return file, content
     if as_base:
-        raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{based_on}'")
+        raise ConfigurationError(
+            f"'{file}' is based on another pipeline itself; base on '{based_on}'"
+        )
     _, base = _content_of(based_on, as_base=True)
-    return file, {**base, **content, "based_on": None, "parts": _merged(base.get("parts"), content.get("parts", {}))}
+    return file, {
+        **base,
+        **content,
+        "based_on": None,
+        "parts": _merged(base.get("parts"), content.get("parts", {})),
+    }
 
 
 def _merged(base: Any, changes: Any) -> Any:
@@ -173,7 +214,11 @@ def _merged(base: Any, changes: Any) -> Any:
     if not isinstance(base, dict) or not isinstance(changes, dict):
         return changes
     changed = {key: _merged(base.get(key), value) for key, value in changes.items()}
-    return {key: value for key, value in {**base, **changed}.items() if key not in changed or value is not None}
+    return {
+        key: value
+        for key, value in {**base, **changed}.items()
+        if key not in changed or value is not None
+    }
 
 
 def _as_override(value: Any) -> str:
@@ -190,10 +235,14 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
     folds = compose_config("train", [f"split={part.split}"])["split"].get("folds")
     number = folds.get("number", FoldsFile.number) if isinstance(folds, dict) else None
     if not isinstance(number, int) or number < 1:
-        raise ConfigurationError(f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, of: laps}}")
+        raise ConfigurationError(
+            f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, of: laps}}"
+        )
     check_jobs(number, f"the folds of '{file.name}' stand")
     return {
-        f"fold_{fold}": replace(part, title=f"fold {fold} of {number}", overrides=(f"++split.fold={fold - 1}",))
+        f"fold_{fold}": replace(
+            part, title=f"fold {fold} of {number}", overrides=(f"++split.fold={fold - 1}",)
+        )
         for fold in range(1, number + 1)
     }
 
@@ -205,7 +254,11 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
         raise ConfigurationError(
             f"'{fixed}' belongs to the study; copy '{study.file.name}' to pipelines/ under another name and change that there"
         )
-    used = {override for override in overrides if study.datasets and key_of(override).split(".")[0] == "tracking"}
+    used = {
+        override
+        for override in overrides
+        if study.datasets and key_of(override).split(".")[0] == "tracking"
+    }
 
     def suiting(config: Config) -> list[str]:
         found = [override for override in overrides if has_key(config, key_of(override))]
@@ -214,13 +267,25 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
 
     if study.datasets:
         own = [[f"dataset={name}"] for name in (*study.datasets, *study.optional_datasets)]
-        jobs: Jobs = {"": [Job(compose_config("ingest", [*one, *suiting(compose_config("ingest", one))])) for one in own]}
+        jobs: Jobs = {
+            "": [
+                Job(compose_config("ingest", [*one, *suiting(compose_config("ingest", one))]))
+                for one in own
+            ]
+        }
     else:
         compose = cache(partial(compose_config, "eval"))
         sweeps = [sweep for part in study.parts.values() for sweep in part.sweeps]
-        with use_limits(limits_of([*(override for sweep in sweeps for override in sweep), *overrides])):
-            check_jobs(sum(count(sweep) for sweep in sweeps), f"the sweeps of '{study.file.name}' stand")
-            jobs = {name: _part_jobs(part, overrides, suiting, compose) for name, part in study.parts.items()}
+        with use_limits(
+            limits_of([*(override for sweep in sweeps for override in sweep), *overrides])
+        ):
+            check_jobs(
+                sum(count(sweep) for sweep in sweeps), f"the sweeps of '{study.file.name}' stand"
+            )
+            jobs = {
+                name: _part_jobs(part, overrides, suiting, compose)
+                for name, part in study.parts.items()
+            }
     for override in overrides:
         if override not in used:
             hint = option_hint(key_of(override)) or f": none has an option '{key_of(override)}'"
@@ -229,15 +294,23 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
 
 
 def _part_jobs(
-    part: Part, overrides: Sequence[str], suiting: Callable[[Config], list[str]], compose: Callable[[tuple[str, ...]], Config]
+    part: Part,
+    overrides: Sequence[str],
+    suiting: Callable[[Config], list[str]],
+    compose: Callable[[tuple[str, ...]], Config],
 ) -> list[Job]:
     def config_of(job: Sequence[str]) -> Config:
         """Composed without its split, which other jobs share, as other parts share the rest."""
         of_split = tuple(override for override in job if key_of(override).split(".")[0] == "split")
-        return {**compose(tuple(override for override in job if override not in of_split)), "split": compose(of_split)["split"]}
+        return {
+            **compose(tuple(override for override in job if override not in of_split)),
+            "split": compose(of_split)["split"],
+        }
 
     configs: dict[str, Config] = {}
-    faults = [override for override in overrides if key_of(override) == "fault"]  # which have further keys
+    faults = [
+        override for override in overrides if key_of(override) == "fault"
+    ]  # which have further keys
     for sweep in part.sweeps:
         for job in expand([f"split={part.split}", *part.overrides, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
@@ -249,13 +322,19 @@ def _part_jobs(
     jobs = [Job(config) for config in configs.values()]
     for key in SAME_IN_A_PART:
         if any(job.config[key] != jobs[0].config[key] for job in jobs):
-            raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
+            raise ConfigurationError(
+                f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own"
+            )
     return jobs
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
     """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
-    return [override for override in overrides if key_of(override).split(".")[0] not in {"root", "output", "tracking"}]
+    return [
+        override
+        for override in overrides
+        if key_of(override).split(".")[0] not in {"root", "output", "tracking"}
+    ]
 
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
@@ -268,7 +347,9 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
         keys = [key_of(override) for override in overrides]
         for key in keys:
             if keys.count(key) > 1:
-                raise ConfigurationError(f"'{key}' is named twice; give all its values at once: {key}=1,2")
+                raise ConfigurationError(
+                    f"'{key}' is named twice; give all its values at once: {key}=1,2"
+                )
         swept = [str(one.key_or_group) for one in map(parsed, overrides) if one.is_sweep_override()]
         for key in swept:
             if key.split(".")[0] in ONE_VALUE:
@@ -277,12 +358,23 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
                 )
         others = [override for override in overrides if key_of(override) != "seed"]
         found = [_combination(own, swept, number) for number, own in enumerate(expand(others))]
-        seeds = [value_of(own[0]) for own in expand([override for override in overrides if override not in others]) if own]
+        seeds = [
+            value_of(own[0])
+            for own in expand([override for override in overrides if override not in others])
+            if own
+        ]
     usable = [job.config for job in found if job.failure is None]
     if not usable:
-        raise ConfigurationError("; ".join(dict.fromkeys(job.failure.message for job in found if job.failure is not None)))
+        raise ConfigurationError(
+            "; ".join(
+                dict.fromkeys(job.failure.message for job in found if job.failure is not None)
+            )
+        )
     split = str(usable[0]["split"]["name"])
-    study = name or f"{'_'.join(dict.fromkeys(str(config['estimator']['name']) for config in usable))}-{split}"
+    study = (
+        name
+        or f"{'_'.join(dict.fromkeys(str(config['estimator']['name']) for config in usable))}-{split}"
+    )
     check_name(study, "--name")
     words = [*map(shlex.quote, content_overrides(overrides)), *(["--name", study] if name else [])]
     of_jobs = {repr(seed): seed for seed in seeds or [usable[0]["seed"]]}.values()
@@ -296,7 +388,9 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
     for override in overrides:
         if key_of(override) in swept:
             value = value_of(override)
-            values[key_of(override)] = value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
+            values[key_of(override)] = (
+                value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
+            )
     names = short_names(list(values))
     label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
     try:

@@ -12,7 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError, VehestError
+from vehest.data.errors import (
+    ConfigurationError,
+    DataError,
+    JobsFailedError,
+    MissingError,
+    VehestError,
+)
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
@@ -43,19 +49,42 @@ from vehest.studies.artefacts import AbsentDataset, StoredDataset
 
 
 @contextmanager
-def open_runner(config: Config, options: RunOptions, stages: Collection[str], study: str = "") -> Iterator[Runner]:
+def open_runner(
+    config: Config, options: RunOptions, stages: Collection[str], study: str = ""
+) -> Iterator[Runner]:
     """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
-    tracker = Tracker(config["tracking"] if options.track or study else {}, output, messages.warn, stop.requested, study)
+    tracker = Tracker(
+        config["tracking"] if options.track or study else {},
+        output,
+        messages.warn,
+        stop.requested,
+        study,
+    )
     forced = frozenset(stages if options.force else ())
     launcher = chosen_launcher(options, output, messages)
-    runner = Runner(output, messages, stop, options.jobs or default_jobs(), forced, options.dry_run, tracker, launcher)
+    runner = Runner(
+        output,
+        messages,
+        stop,
+        options.jobs or default_jobs(),
+        forced,
+        options.dry_run,
+        tracker,
+        launcher,
+    )
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         yield runner
 
 
 def run_study(
-    name: str | None, overrides: Sequence[str], options: RunOptions, cache: RunCache, *, sweep: bool = False, only_report: bool = False
+    name: str | None,
+    overrides: Sequence[str],
+    options: RunOptions,
+    cache: RunCache,
+    *,
+    sweep: bool = False,
+    only_report: bool = False,
 ) -> Ran:
     """Run every stage of a pipeline, or of a sweep; what is there is skipped. A study that overrides changed is not published.
 
@@ -79,8 +108,15 @@ def run_study(
         study = read_study(str(name), overrides)
         jobs = jobs_of(study, overrides)
     first = _first(next(iter(jobs.values())))
-    stages = {"train", "calibrate", "evaluate", *((SWEEP,) if sweep else ("ingest", "downsample", REPORT))}
-    with open_runner(first, options, {REPORT} if only_report else stages, study.study if study.parts else "") as runner:
+    stages = {
+        "train",
+        "calibrate",
+        "evaluate",
+        *((SWEEP,) if sweep else ("ingest", "downsample", REPORT)),
+    }
+    with open_runner(
+        first, options, {REPORT} if only_report else stages, study.study if study.parts else ""
+    ) as runner:
         runner.until = _until(options.minutes, begun)
         if study.publish and not options.retrain:
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
@@ -89,7 +125,10 @@ def run_study(
         used = [config["dataset"] for config in shown]
         for part in study.parts:
             used += runner.datasets_of(_first(jobs[part]))
-        raw = {path: stamp_of(path) for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)}
+        raw = {
+            path: stamp_of(path)
+            for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)
+        }
         datasets: list[StoredDataset | AbsentDataset] = []
         for config in shown:
             with suppress(DryRunStop):
@@ -107,16 +146,36 @@ def run_study(
         else:
             report, summary = draw_report(study, comparisons, datasets, runner)
         published = None
-        if error is None and not runner.dry_run and not any(own.unfinished for own in comparisons.values()):
+        if (
+            error is None
+            and not runner.dry_run
+            and not any(own.unfinished for own in comparisons.values())
+        ):
             publication = None
             if study.publish and not content_overrides(overrides):
                 gone = {name: f"part '{name}'" for name in study.parts if name not in comparisons}
-                gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
-                inputs = {own.label: own.inputs for own in runner.artefacts.values() if own.stage == INGEST}  # raw files as they were
-                publication = Publication(study.study, gone, keys_of_study(study, jobs, gone, runner, inputs))
+                gone |= {
+                    own.name: f"data set '{own.name}'"
+                    for own in datasets
+                    if isinstance(own, AbsentDataset)
+                }
+                inputs = {
+                    own.label: own.inputs
+                    for own in runner.artefacts.values()
+                    if own.stage == INGEST
+                }  # raw files as they were
+                publication = Publication(
+                    study.study, gone, keys_of_study(study, jobs, gone, runner, inputs)
+                )
             cache.save(runner, report, summary, raw, publication)
             published = publish_study(publication, report, runner.messages)
-    return Ran(summary, report.folder, report.skipped, published, None if sweep and runner.dry_run else error)
+    return Ran(
+        summary,
+        report.folder,
+        report.skipped,
+        published,
+        None if sweep and runner.dry_run else error,
+    )
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
@@ -139,19 +198,27 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
     for name, part in study.parts.items():
         try:
             runner.look_for_files(_first(jobs[name]))
-            found[name] = Comparison([replace(job) for job in jobs[name]])  # published keys hold rates before they are lowered
+            found[name] = Comparison(
+                [replace(job) for job in jobs[name]]
+            )  # published keys hold rates before they are lowered
         except MissingError as error:
             if not part.optional:
                 raise
             runner.messages.warn(f"{error}; the study goes on without part '{name}'")
     if study.parts and not found:
-        raise MissingError(f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
+        raise MissingError(
+            f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER"
+        )
     for comparison in found.values():
         with suppress(DryRunStop):
             comparison.plan(runner)
             if not any(comparison.evaluation.split.tests.values()):
-                raise ConfigurationError(f"split '{comparison.evaluation.split.name}' has no test ranges to compare estimators on")
-    lacking = dict.fromkeys(job.failure.message for own in found.values() for job in own.jobs if job.failure is not None)
+                raise ConfigurationError(
+                    f"split '{comparison.evaluation.split.name}' has no test ranges to compare estimators on"
+                )
+    lacking = dict.fromkeys(
+        job.failure.message for own in found.values() for job in own.jobs if job.failure is not None
+    )
     if lacking and not study.shows_failed:
         raise DataError(f"a study in parts needs all of its jobs; {'; '.join(lacking)}")
     return found
@@ -160,7 +227,9 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
     """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
     own = config["dataset"]
-    title, licence, citation = (" ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation"))
+    title, licence, citation = (
+        " ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation")
+    )
     try:
         planned = plan_ingest(config)
     except MissingError as error:
@@ -169,13 +238,17 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
         runner.messages.warn(f"{error}; the study goes on without it")
         return AbsentDataset(own["name"], title, licence, citation)
     if runner.train_first and find(planned) is None:
-        raise MissingError(f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first")
+        raise MissingError(
+            f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
+        )
     made = runner.ingest(config)
     files = {Path(name).stem: made.folder / name for name in made.outputs}
     return StoredDataset(own["name"], title, kind_of(own), made.config, files, licence, citation)
 
 
-def _error_of(study: Study, comparisons: Sequence[Comparison], runner: Runner) -> JobsFailedError | None:
+def _error_of(
+    study: Study, comparisons: Sequence[Comparison], runner: Runner
+) -> JobsFailedError | None:
     """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
     reasons: dict[str, list[str]] = {}
     for name, failure in (pair for own in comparisons for pair in named_failures(own.jobs)):
@@ -186,13 +259,17 @@ def _error_of(study: Study, comparisons: Sequence[Comparison], runner: Runner) -
     if reasons:
         listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
         n_failed = sum(job.failure is not None for job in jobs)
-        error = JobsFailedError(f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}")
+        error = JobsFailedError(
+            f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}"
+        )
     nothing = bool(study.parts) and not any(own.members for own in comparisons)
     if error is not None and (nothing or not study.shows_failed):
         raise error
     if nothing:
         left = [name for own in comparisons for name in own.unfinished]
-        raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(left)}")
+        raise DataError(
+            f"no estimator was done in this time; the same command goes on with: {', '.join(left)}"
+        )
     return error
 
 
@@ -210,10 +287,17 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     model = next((member.model for member in members.values()), None)
     if model is None:
         return {}
-    return {"model": str(model.folder), "status": model.status, "skipped": model.skipped, **read_fit_metrics(model.folder)}
+    return {
+        "model": str(model.folder),
+        "status": model.status,
+        "skipped": model.skipped,
+        **read_fit_metrics(model.folder),
+    }
 
 
-def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]) -> dict[str, Any]:
+def evaluate_one(
+    overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]
+) -> dict[str, Any]:
     """Evaluate a model by folder or start of its name, or the one that overrides train, on the tests of a split; raises `MissingError`."""
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
@@ -224,30 +308,45 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
             trained = model_artefact(find_model(model, runner.output, note))
             if not any(key_of(override).split(".")[0] == "downsample" for override in overrides):
                 config["downsample"] = preparation_of(trained.folder)
-            how = runner.evaluation(config, runner.data_for(split, trained_rate(trained), config), faults_of(config))
+            how = runner.evaluation(
+                config, runner.data_for(split, trained_rate(trained), config), faults_of(config)
+            )
             check_channels(how.faults, split, how.data)
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
             if (found := find(plan)) is None:
-                raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first")
+                raise MissingError(
+                    f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first"
+                )
             assert group.evaluation is not None
             trained, how = found, group.evaluation
         calibration = _calibration(trained, split, how.data, runner)
         artefact = runner.ensure(*how.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
-    return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact.folder), **fault_figures(artefact.folder)}
+    return {
+        "folder": str(artefact.folder),
+        "skipped": artefact.skipped,
+        **test_figures(artefact.folder),
+        **fault_figures(artefact.folder),
+    }
 
 
-def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner) -> Artefact | None:
+def _calibration(
+    model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner
+) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
     learnt, found = learnt_spans(model), None
-    if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
+    if model.status == "complete" and (
+        not learnt or set(learnt) == {*split.train, *split.validation}
+    ):
         job = plan_calibrate(model, split, data, runner.output)
         if job is not None:
             found = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests
         found = calibration_of(model.folder, runner.output)
     if found is None:
-        runner.messages.line("note", "calibrate", model.label, "has no calibration, so its estimates have no bands")
+        runner.messages.line(
+            "note", "calibrate", model.label, "has no calibration, so its estimates have no bands"
+        )
     return found

@@ -27,7 +27,13 @@ from vehest.studies.artefacts import read_frame
 STORE = "mlflow.db"
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
-KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output", "vehest.study"
+KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = (
+    "vehest.key",
+    "vehest.stage",
+    "vehest.digest",
+    "vehest.output",
+    "vehest.study",
+)
 METRICS: Mapping[str, Callable[[Path], Mapping[str, float]]] = {
     "train": read_fit_metrics,
     "calibrate": calibration_figures,
@@ -44,7 +50,9 @@ class Tracker:
     warn: Callable[[str], None]  # called with one line when tracking is given up
     should_stop: Callable[[], bool] = lambda: False  # asked while another process logs
     study: str = ""  # name of the study or sweep above the runs
-    complete: bool = field(default=True, init=False)  # whether every artefact was logged; without MLflow too
+    complete: bool = field(
+        default=True, init=False
+    )  # whether every artefact was logged; without MLflow too
 
     @property
     def store(self) -> str:
@@ -64,20 +72,40 @@ class Tracker:
                 self.complete = mine
         except Exception as error:  # results matter more than any failure of a tracking server
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
-            self.warn(f"logging to MLflow at {self._address} failed ({why}); going on without tracking, the next run makes up for it")
+            self.warn(
+                f"logging to MLflow at {self._address} failed ({why}); going on without tracking, the next run makes up for it"
+            )
 
     def _log(self, artefact: Artefact) -> None:
         from mlflow.entities import Metric, Param
 
-        client, tags = self._client, {KEY_TAG: artefact.key, STAGE_TAG: artefact.stage, DIGEST_TAG: artefact.digest}
+        client, tags = (
+            self._client,
+            {KEY_TAG: artefact.key, STAGE_TAG: artefact.stage, DIGEST_TAG: artefact.digest},
+        )
         found = self._runs(tags)
         if any(run.info.status != "RUNNING" for run in found):
             return
-        begun = [run for run in found if run.data.tags.get(OUTPUT_TAG) == self._root]  # by a process that was killed
-        run = begun[0] if begun else self._new_run(artefact.label, tags | ({"mlflow.parentRunId": self._parent()} if self.study else {}))
-        run_id, time = str(run.info.run_id), run.info.start_time  # metrics with the same time are kept once
+        begun = [
+            run for run in found if run.data.tags.get(OUTPUT_TAG) == self._root
+        ]  # by a process that was killed
+        run = (
+            begun[0]
+            if begun
+            else self._new_run(
+                artefact.label,
+                tags | ({"mlflow.parentRunId": self._parent()} if self.study else {}),
+            )
+        )
+        run_id, time = (
+            str(run.info.run_id),
+            run.info.start_time,
+        )  # metrics with the same time are kept once
         parameters = [Param(key, value) for key, value in _flattened(artefact.config).items()]
-        points = [Metric(key, value, time, 0) for key, value in METRICS[artefact.stage](artefact.folder).items()]
+        points = [
+            Metric(key, value, time, 0)
+            for key, value in METRICS[artefact.stage](artefact.folder).items()
+        ]
         if (artefact.folder / HISTORY).is_file():
             history = read_frame(artefact.folder / HISTORY)
             rows = history.melt("epoch").itertuples(index=False) if "epoch" in history else ()
@@ -91,7 +119,9 @@ class Tracker:
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else "KILLED")
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
-        wanted = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())  # hashes and names of files: without quotes
+        wanted = " and ".join(
+            f"tags.`{name}` = '{value}'" for name, value in tags.items()
+        )  # hashes and names of files: without quotes
         return list(self._client.search_runs([self._experiment_id], wanted))
 
     def _new_run(self, name: str, tags: Mapping[str, str]) -> Any:
@@ -116,15 +146,21 @@ class Tracker:
 
         for noisy in ("mlflow", "alembic"):
             logging.getLogger(noisy).setLevel(logging.ERROR)
-        logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # its errors are raised too
+        logging.getLogger("mlflow.store.db.utils").setLevel(
+            logging.CRITICAL
+        )  # its errors are raised too
         if self.store:
             store = self.output / STORE
             remove_leftovers(self.output)
             if not store.exists():
-                with written_aside(store) as aside:  # a process that is killed here leaves no store with half of its tables
+                with written_aside(
+                    store
+                ) as aside:  # a process that is killed here leaves no store with half of its tables
                     MlflowClient(f"sqlite:///{aside.resolve()}").search_experiments(max_results=1)
             address = f"{regular_file(store).resolve().as_uri()}?mode=rw"
-            with closing(sqlite3.connect(address, uri=True)) as connection:  # MLflow retries a damaged store for hours
+            with closing(
+                sqlite3.connect(address, uri=True)
+            ) as connection:  # MLflow retries a damaged store for hours
                 connection.execute("select name from sqlite_master").fetchall()
         return MlflowClient(self._address)
 
@@ -148,5 +184,9 @@ def _flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Dotted key -> start of the value's text."""
     flat: dict[str, str] = {}
     for key, value in config.items():
-        flat |= _flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": str(value)[:VALUE_LENGTH]}
+        flat |= (
+            _flattened(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": str(value)[:VALUE_LENGTH]}
+        )
     return flat

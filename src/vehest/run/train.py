@@ -46,8 +46,16 @@ class TrainJob:
     def group(self) -> tuple[Any, ...]:
         """Jobs of one group may be trained together."""
         key = new_estimator(self.estimator).batch_key
-        training = json.dumps(dict(self.training), sort_keys=True)  # may hold groups of settings, which have no hash
-        return (key, training, self.split.train, self.split.validation, tuple(sorted(self.plan.inputs.items())))
+        training = json.dumps(
+            dict(self.training), sort_keys=True
+        )  # may hold groups of settings, which have no hash
+        return (
+            key,
+            training,
+            self.split.train,
+            self.split.validation,
+            tuple(sorted(self.plan.inputs.items())),
+        )
 
 
 def new_estimator(config: Mapping[str, Any]) -> Estimator:
@@ -69,21 +77,35 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         )
     content = {
         "estimator": dict(config["estimator"]),
-        "training": {key: value for key, value in config["training"].items() if key != "checkpoint_seconds"},
+        "training": {
+            key: value for key, value in config["training"].items() if key != "checkpoint_seconds"
+        },
         "train": [_plain(span) for span in split.train],
         "validation": [_plain(span) for span in split.validation],
         "seed": seed,
-        **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
+        **(
+            {} if estimator.learns else {"downsample": _preparation(data)}
+        ),  # otherwise part of the inputs
     }
-    inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in (*split.train, *split.validation)}
+    inputs = {
+        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
+        for span in (*split.train, *split.validation)
+    }
     label = f"{estimator.name}-{estimator.variant}-seed{seed}"
-    plan = StagePlan(STAGE, label, content, inputs, code_of(STAGE, estimator.name), Path(config["output"]))
+    plan = StagePlan(
+        STAGE, label, content, inputs, code_of(STAGE, estimator.name), Path(config["output"])
+    )
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
 
 
 def _plain(span: Span) -> dict[str, str]:
     """A range as plain text, since JSON has no infinity."""
-    return {"dataset": span.dataset, "recording": span.recording, "start": str(span.start), "stop": str(span.stop)}
+    return {
+        "dataset": span.dataset,
+        "recording": span.recording,
+        "start": str(span.start),
+        "stop": str(span.stop),
+    }
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
@@ -93,7 +115,12 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
         member.seed(job.seed)
     training: Any = settings_from_config(members[0].training_type, first.training, "training")
     train, validation = (
-        [read_recording(recording_file(first.data[span.dataset], span)).cut(span.start, span.stop) for span in spans]
+        [
+            read_recording(recording_file(first.data[span.dataset], span)).cut(
+                span.start, span.stop
+            )
+            for span in spans
+        ]
         for spans in (first.split.train, first.split.validation)
     )
     records = type(members[0]).fit_members(members, FitData(train, validation), training, context)
@@ -113,15 +140,24 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
     }
     save_model(estimator, folder, about)
     if record.history:
-        _write_csv(folder / HISTORY, list(record.history), zip(*record.history.values(), strict=True))
+        _write_csv(
+            folder / HISTORY, list(record.history), zip(*record.history.values(), strict=True)
+        )
     metrics = {**record.metrics, "n_parameters": estimator.n_parameters}
     for file, timed in ((FIT_METRICS, False), (TIMINGS, True)):
-        _write_csv(folder / file, ["metric", "value"], [item for item in metrics.items() if item[0].endswith("_seconds") is timed])
+        _write_csv(
+            folder / file,
+            ["metric", "value"],
+            [item for item in metrics.items() if item[0].endswith("_seconds") is timed],
+        )
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
     config = next(iter(data.values())).config  # the same for all data sets of a job
-    return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
+    return {
+        "method": config["method"],
+        "transforms": [dict(entry) for entry in config["transforms"]],
+    }
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -132,7 +168,11 @@ def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]])
 def read_fit_metrics(folder: Path) -> dict[str, float]:
     """Figures of a fit, such as ``epochs``, and its times."""
     paths = (folder / FIT_METRICS, folder / TIMINGS)
-    return {row["metric"]: number_in(row, "value", path) for path in paths for row in read_rows(path, ("metric", "value"))}
+    return {
+        row["metric"]: number_in(row, "value", path)
+        for path in paths
+        for row in read_rows(path, ("metric", "value"))
+    }
 
 
 def trained_rate(model: Artefact) -> float:
@@ -145,7 +185,12 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
 
     def ranges(config: Mapping[str, Any]) -> list[Span]:
         named = [own for role in roles or ("train", "validation") for own in config[role]]
-        return [Span(str(own["dataset"]), str(own["recording"]), float(own["start"]), float(own["stop"])) for own in named]
+        return [
+            Span(
+                str(own["dataset"]), str(own["recording"]), float(own["start"]), float(own["stop"])
+            )
+            for own in named
+        ]
 
     return _from_manifest(model, ranges)
 
@@ -155,7 +200,9 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
     try:
         return read(model.config)
     except (LookupError, TypeError, ValueError, ConfigurationError) as error:
-        raise DataError(f"'{model.folder / MANIFEST}': config describes no training ({first_line(error)})") from None
+        raise DataError(
+            f"'{model.folder / MANIFEST}': config describes no training ({first_line(error)})"
+        ) from None
 
 
 def recording_file(data: Artefact, span: Span) -> Path:
@@ -169,5 +216,7 @@ def file_digest(data: Artefact, span: Span) -> str:
     name = f"{span.recording}.parquet"
     if name not in data.outputs:
         known = ", ".join(sorted(Path(file).stem for file in data.outputs))
-        raise DataError(f"data set '{span.dataset}' has no recording '{span.recording}' (it has {known}); correct the split")
+        raise DataError(
+            f"data set '{span.dataset}' has no recording '{span.recording}' (it has {known}); correct the split"
+        )
     return data.outputs[name]

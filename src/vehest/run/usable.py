@@ -28,7 +28,9 @@ class Missing:
 
     to_estimate: list[str]
     to_train: list[str]
-    supplies: dict[str, Derivation | None]  # channel -> transforms that make it of channels that are there; None where none do
+    supplies: dict[
+        str, Derivation | None
+    ]  # channel -> transforms that make it of channels that are there; None where none do
 
     @property
     def unsupplied(self) -> list[str]:
@@ -37,7 +39,10 @@ class Missing:
 
     def in_words(self) -> list[str]:
         """Each channel with its supply."""
-        return [f"{channel} ({'not in the log' if own is None else own.in_words()})" for channel, own in self.supplies.items()]
+        return [
+            f"{channel} ({'not in the log' if own is None else own.in_words()})"
+            for channel, own in self.supplies.items()
+        ]
 
 
 @dataclass(frozen=True)
@@ -51,9 +56,13 @@ class Usability:
     gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
     settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
     without: str = ""  # the same in words, with channels that are missing even then
-    patterns: tuple[str, ...] = ()  # overrides that its fit needs, since it asks for recordings by other names
+    patterns: tuple[
+        str, ...
+    ] = ()  # overrides that its fit needs, since it asks for recordings by other names
     to_give: str = ""  # setting that only the user knows, in words; empty if none
-    car: tuple[str, ...] = ()  # keys of the car's parameters, which are those of another car unless given
+    car: tuple[
+        str, ...
+    ] = ()  # keys of the car's parameters, which are those of another car unless given
 
     @property
     def usable(self) -> str:
@@ -71,7 +80,11 @@ class Usability:
             "own_rate_hz": self.own_rate_hz,
             "missing_to_estimate": self.missing.to_estimate,
             "missing_to_train": self.missing.to_train,
-            "supplies": {channel: own.transforms for channel, own in self.missing.supplies.items() if own is not None},
+            "supplies": {
+                channel: own.transforms
+                for channel, own in self.missing.supplies.items()
+                if own is not None
+            },
             "settings": [*self.settings, *self.patterns],
             "to_give": self.to_give,
             "car": list(self.car),
@@ -81,14 +94,19 @@ class Usability:
 
 def all_usabilities(recordings: Sequence[RecordingSummary]) -> list[Usability]:
     """A row for each estimator of conf/estimator, then of other packages that have no file there; there is at least one recording."""
-    configs: dict[str, Config] = {name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")}
+    configs: dict[str, Config] = {
+        name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")
+    }
     for name in estimator_names():
         configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
     return [usability(name, config, recordings) for name, config in configs.items()]
 
 
 def usability(
-    name: str, config: Config, recordings: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary] | None = None
+    name: str,
+    config: Config,
+    recordings: Sequence[RecordingSummary],
+    to_estimate: Sequence[RecordingSummary] | None = None,
 ) -> Usability:
     """Whether the estimator of a configuration can be trained on recordings and used on them."""
     to_estimate = recordings if to_estimate is None else to_estimate
@@ -100,36 +118,67 @@ def usability(
         return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
     missing = _missing(estimator, training, recordings, to_estimate)
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
-    patterns = estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
+    patterns = (
+        estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
+    )
     own_rate = estimator.settings.rate_hz
-    rate, gappy = min([own_rate, *(one.rate_hz for one in both)]), {name for one in both for name in one.gappy}
-    gaps = tuple(channel for channel in estimator.channels if channel in gappy and channel not in estimator.skippable)
-    return Usability(name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own))
+    rate, gappy = (
+        min([own_rate, *(one.rate_hz for one in both)]),
+        {name for one in both for name in one.gappy},
+    )
+    gaps = tuple(
+        channel
+        for channel in estimator.channels
+        if channel in gappy and channel not in estimator.skippable
+    )
+    return Usability(
+        name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own)
+    )
 
 
 def car_parameters(estimator: str) -> tuple[str, ...]:
     """Keys of an estimator's settings that are parameters of the car."""
     car = get_type_hints(estimator_class(estimator).settings_type).get("car")
-    return tuple(f"estimator.car.{parameter.name}" for parameter in fields(car)) if is_dataclass(car) else ()
+    return (
+        tuple(f"estimator.car.{parameter.name}" for parameter in fields(car))
+        if is_dataclass(car)
+        else ()
+    )
 
 
 def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     """A table of estimators, transforms that make channels that some lack, and estimators that take another car's parameters."""
-    supplies = {channel: own.in_words() for row in rows for channel, own in row.missing.supplies.items() if own is not None}
+    supplies = {
+        channel: own.in_words()
+        for row in rows
+        for channel, own in row.missing.supplies.items()
+        if own is not None
+    }
     header = ("estimator", "usable", "rate", "missing", "what could supply it")
-    lines: list[str | TerminalTable] = [TerminalTable("", header, [_cells(row) for row in rows]), ""]
+    lines: list[str | TerminalTable] = [
+        TerminalTable("", header, [_cells(row) for row in rows]),
+        "",
+    ]
     lines += [f"{channel}: {supply}" for channel, supply in supplies.items()]
     borrowing = [row.estimator for row in rows if row.car]
     if borrowing:
         names = ", ".join(borrowing)
-        lines.append(f"your car's parameters, estimator.car.mass=… and so on, are wanted by {names}; else they take those of another car")
+        lines.append(
+            f"your car's parameters, estimator.car.mass=… and so on, are wanted by {names}; else they take those of another car"
+        )
     return lines
 
 
 def _cells(row: Usability) -> list[str]:
     """Cells of the table; the lines below it have the transforms in full."""
-    to_train = ", ".join(name for name in row.missing.to_train if name not in row.missing.to_estimate)
-    made = ", ".join(f"{channel}: {own.transforms[-1]['name']}" for channel, own in row.missing.supplies.items() if own is not None)
+    to_train = ", ".join(
+        name for name in row.missing.to_train if name not in row.missing.to_estimate
+    )
+    made = ", ".join(
+        f"{channel}: {own.transforms[-1]['name']}"
+        for channel, own in row.missing.supplies.items()
+        if own is not None
+    )
     missing = [
         ", ".join(row.missing.to_estimate),
         f"to train {to_train}" if to_train else "",
@@ -148,22 +197,40 @@ def _cells(row: Usability) -> list[str]:
     rate = "" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
     if row.rate_hz is not None and row.rate_hz != row.own_rate_hz:
         rate += f", not {row.own_rate_hz:g}"
-    return [row.estimator, row.usable, rate, *("; ".join(filter(None, texts)) for texts in (missing, supplies))]
+    return [
+        row.estimator,
+        row.usable,
+        rate,
+        *("; ".join(filter(None, texts)) for texts in (missing, supplies)),
+    ]
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
     """Channels that recordings of a split lack and its estimator needs, as one line; empty if none; raises `ConfigurationError`."""
     estimator, training = _built(config)
-    tested = [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
+    tested = (
+        [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
+    )
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
     made = made_by(config["downsample"]["transforms"])  # of references they are no part
     to_train, to_estimate = (
         [replace(own, channels=own.channels | made) for own in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)
     )
-    found, by_scores = usability(estimator.name, config, to_train, to_estimate), absent_channels(SCORED, scored)
-    parts = ((found.missing.to_train, to_train), (found.missing.to_estimate, to_estimate), (by_scores.to_estimate, scored))
-    lacking = list(dict.fromkeys(own.id for wanted, part in parts for own in part if not own.channels.issuperset(wanted)))
+    found, by_scores = (
+        usability(estimator.name, config, to_train, to_estimate),
+        absent_channels(SCORED, scored),
+    )
+    parts = (
+        (found.missing.to_train, to_train),
+        (found.missing.to_estimate, to_estimate),
+        (by_scores.to_estimate, scored),
+    )
+    lacking = list(
+        dict.fromkeys(
+            own.id for wanted, part in parts for own in part if not own.channels.issuperset(wanted)
+        )
+    )
     if lacking:
         others = f" and {len(lacking) - 1} more lack" if len(lacking) > 1 else " lacks"
         reasons = Missing([], [], by_scores.supplies | found.missing.supplies).in_words()
@@ -171,7 +238,11 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         return f"recording '{lacking[0]}'{others} what estimator '{estimator.name}' needs: {'; '.join([*reasons, *without])}"
     trained = [own.id for own in _recordings(split.train, contents)]
     patterns = estimator.unmatched_patterns(training, trained) if trained else ()
-    return f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}" if patterns else ""
+    return (
+        f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}"
+        if patterns
+        else ""
+    )
 
 
 def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
@@ -180,10 +251,17 @@ def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSumma
     return _with_supplies(absent, absent, recordings)
 
 
-def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[RecordingSummary]]) -> list[RecordingSummary]:
+def _recordings(
+    spans: Sequence[Span], contents: Mapping[str, Sequence[RecordingSummary]]
+) -> list[RecordingSummary]:
     """The recordings of ranges, each once; unknown ones are skipped, and reported where they are read."""
     named = {(span.dataset, span.recording) for span in spans}
-    return [own for dataset, recordings in contents.items() for own in recordings if (dataset, own.id) in named]
+    return [
+        own
+        for dataset, recordings in contents.items()
+        for own in recordings
+        if (dataset, own.id) in named
+    ]
 
 
 def _built(config: Config) -> tuple[Estimator, Any]:
@@ -191,27 +269,44 @@ def _built(config: Config) -> tuple[Estimator, Any]:
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 
 
-def _missing(estimator: Estimator, training: Any, to_train: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary]) -> Missing:
+def _missing(
+    estimator: Estimator,
+    training: Any,
+    to_train: Sequence[RecordingSummary],
+    to_estimate: Sequence[RecordingSummary],
+) -> Missing:
     read = [name for own in to_estimate for name in estimator.channels if name not in own.channels]
-    learnt = [name for own in to_train for name in lacking_to_train(estimator, training, own.channels)]
+    learnt = [
+        name for own in to_train for name in lacking_to_train(estimator, training, own.channels)
+    ]
     return _with_supplies(read, learnt, [*to_train, *to_estimate])
 
 
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
     """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks; none where nothing is learnt."""
-    wanted = (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
+    wanted = (
+        (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
+    )
     return [name for name in dict.fromkeys(wanted) if name not in channels]
 
 
-def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
-    held, gappy = common_channels(recordings), frozenset(name for own in recordings for name in own.gappy)
+def _with_supplies(
+    read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
+) -> Missing:
+    held, gappy = (
+        common_channels(recordings),
+        frozenset(name for own in recordings for name in own.gappy),
+    )
     rate = min((own.rate_hz for own in recordings), default=0.0)
     supplies = {name: derivation_of(name, held, gappy, rate) for name in (*read, *learnt)}
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
 
 
 def _settings_without(
-    config: Config, missing: list[str], to_train: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary]
+    config: Config,
+    missing: list[str],
+    to_train: Sequence[RecordingSummary],
+    to_estimate: Sequence[RecordingSummary],
 ) -> tuple[tuple[str, ...], str]:
     """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
     found: dict[str, Any] = {}
@@ -220,12 +315,24 @@ def _settings_without(
         for key, value in _alternatives(config):
             changed = {**config, "estimator": {**config["estimator"], key: value}}
             with suppress(ConfigurationError):
-                tried.append((_missing(*_built(changed), to_train, to_estimate).unsupplied, key, value, changed))
-        left, key, value, changed = min(tried, key=lambda entry: len(entry[0]), default=(missing, "", None, config))
+                tried.append(
+                    (
+                        _missing(*_built(changed), to_train, to_estimate).unsupplied,
+                        key,
+                        value,
+                        changed,
+                    )
+                )
+        left, key, value, changed = min(
+            tried, key=lambda entry: len(entry[0]), default=(missing, "", None, config)
+        )
         if len(left) >= len(missing):
             break
         missing, config, found[key] = left, changed, value
-    settings = tuple(f"estimator.{key}=" + (f"[{','.join(own)}]" if isinstance(own, list) else f"{own}") for key, own in found.items())
+    settings = tuple(
+        f"estimator.{key}=" + (f"[{','.join(own)}]" if isinstance(own, list) else f"{own}")
+        for key, own in found.items()
+    )
     rest = f"only {', '.join(missing)} of those would be missing" if missing else "it does without"
     return settings, f"with {' '.join(settings)} {rest}" if settings else ""
 

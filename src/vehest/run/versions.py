@@ -6,7 +6,15 @@ from vehest.estimators.registry import estimator_class
 from vehest.sources.base import source_class
 from vehest.studies.registry import study_module
 
-VERSIONS = {"ingest": "1", "downsample": "1", "train": "1", "calibrate": "3", "evaluate": "1", "report": "1", "sweep": "2"}
+VERSIONS = {
+    "ingest": "1",
+    "downsample": "1",
+    "train": "1",
+    "calibrate": "3",
+    "evaluate": "1",
+    "report": "1",
+    "sweep": "2",
+}
 """Stage -> its version, raised when its numbers move."""
 FAULTS = "2"  # of an evaluation's faults, likewise
 

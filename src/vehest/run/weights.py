@@ -40,9 +40,15 @@ def write_weights(models: Iterable[Artefact], path: Path) -> None:
     tensors: dict[str, Any] = {}
     about: dict[str, Any] = {}
     for key, model in sorted({model.key: model for model in models}.items()):
-        files = {name: (model.folder / name).read_bytes().decode() for name in FILES if name in model.outputs}
+        files = {
+            name: (model.folder / name).read_bytes().decode()
+            for name in FILES
+            if name in model.outputs
+        }
         about[key] = asdict(PublishedModel(model.label, model.code, files))
-        tensors |= {f"{key}/{name}": values for name, values in load_file(model.folder / WEIGHTS).items()}
+        tensors |= {
+            f"{key}/{name}": values for name, values in load_file(model.folder / WEIGHTS).items()
+        }
     save_file(tensors, path, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
 
 
@@ -55,9 +61,13 @@ class PublishedWeights:
         if path.is_file():
             try:
                 with safe_open(path, framework="np") as file:
-                    self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(file.metadata()[MODELS])
+                    self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
+                        file.metadata()[MODELS]
+                    )
             except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-                raise DataError(f"'{path}' is damaged ({first_line(error)}); remove it, or add --retrain") from error
+                raise DataError(
+                    f"'{path}' is damaged ({first_line(error)}); remove it, or add --retrain"
+                ) from error
 
     def __contains__(self, key: str) -> bool:
         return key in self._models
@@ -70,5 +80,9 @@ class PublishedWeights:
                 (folder / name).write_bytes(files[name].encode())
         (folder / TIMINGS).write_text("metric,value\n", encoding="utf-8")
         with safe_open(self.path, framework="np") as file:
-            tensors = {name.removeprefix(prefix): file.get_tensor(name) for name in file.keys() if name.startswith(prefix)}  # noqa: SIM118
+            tensors = {
+                name.removeprefix(prefix): file.get_tensor(name)
+                for name in file.keys()  # noqa: SIM118
+                if name.startswith(prefix)
+            }
         save_file(tensors, folder / WEIGHTS)

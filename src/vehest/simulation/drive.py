@@ -32,7 +32,9 @@ from vehest.simulation.sensors.recording import described, measure
 RATE_HZ = 100.0  # default sampling rate of recordings [Hz]
 AFTER_STAND = 1.0  # recorded after the car has come to its stand [s]
 LONGEST_STOP = 60.0  # within which a car stands that spun or left the road [s]
-STOPPING_SHARE = 0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
+STOPPING_SHARE = (
+    0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +44,20 @@ class Flags:
     spun: bool  # the car slid beyond the validity of its equations of rolling
     left_road: bool = False  # it was further beside its line than the manoeuvre's half_width
     stood: bool = False  # it stands at the end
-    completed: bool  # the manoeuvre came to its own end, and was not cut off because it took too long
-    gave_up_at: float | None = None  # when the driver began to stop because of a spin or beside the road [s]; none if never
-    largest_lateral_error: float | None = None  # distance from the line [m]; none where there is no line
+    completed: (
+        bool  # the manoeuvre came to its own end, and was not cut off because it took too long
+    )
+    gave_up_at: float | None = (
+        None  # when the driver began to stop because of a spin or beside the road [s]; none if never
+    )
+    largest_lateral_error: float | None = (
+        None  # distance from the line [m]; none where there is no line
+    )
     largest_sideslip: float  # above 1 m/s, either sign [rad]
     largest_ay: float  # either sign [m/s²]
-    stability_share: float | None = None  # of the recorded time in which stability control intervened; none where it is off
+    stability_share: float | None = (
+        None  # of the recorded time in which stability control intervened; none where it is off
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +65,9 @@ class Trip:
     """True motion and outcome of a drive."""
 
     motion: Motion  # true motion, first sample after the settling time
-    lateral_error: FloatArray  # the car's place left of its line [m], (T,); NaN where there is no line
+    lateral_error: (
+        FloatArray  # the car's place left of its line [m], (T,); NaN where there is no line
+    )
     flags: Flags  # how it went
     drawn: dict[str, Any]  # values that the seed drew
 
@@ -84,7 +96,15 @@ def simulate_drive(
     """
     plant = MultiBodyPlant(vehicle)
     with naming(id, seed):
-        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control, stint=stint)
+        trip = drive(
+            plant,
+            manoeuvre,
+            seed,
+            rate_hz=rate_hz,
+            surface=surface,
+            stability_control=stability_control,
+            stint=stint,
+        )
     about = {
         "plant": "CommonRoad multi-body",
         "library": f"{LIBRARY} {LIBRARY_VERSION}",
@@ -98,7 +118,9 @@ def simulate_drive(
         **({"relaxation": vehicle.relaxation} if any(vehicle.relaxation) else {}),
         "stability_control": stability_control,
     }
-    return recording_of(id, vehicle.name, trip, measure(trip.motion, sensors, seed), about, sensors, seed)
+    return recording_of(
+        id, vehicle.name, trip, measure(trip.motion, sensors, seed), about, sensors, seed
+    )
 
 
 @contextmanager
@@ -111,10 +133,21 @@ def naming(id: str, seed: int) -> Iterator[None]:
 
 
 def recording_of(
-    id: str, vehicle: str, trip: Trip, channels: dict[str, FloatArray], about: dict[str, Any], sensors: SensorLevels, seed: int
+    id: str,
+    vehicle: str,
+    trip: Trip,
+    channels: dict[str, FloatArray],
+    about: dict[str, Any],
+    sensors: SensorLevels,
+    seed: int,
 ) -> Recording:
     """The recording of a trip; its provenance is ``about``, then seed, sensors and flags."""
-    provenance = {**about, "seed": seed, "sensors": described(sensors, trip.motion), "flags": asdict(trip.flags)}
+    provenance = {
+        **about,
+        "seed": seed,
+        "sensors": described(sensors, trip.motion),
+        "flags": asdict(trip.flags),
+    }
     return Recording(
         id=id,
         vehicle=vehicle,
@@ -122,7 +155,9 @@ def recording_of(
         start_time=0.0,
         channels=channels,
         kind="simulated",
-        provenance=json.loads(json.dumps(provenance)),  # as it comes back from a file: lists for tuples
+        provenance=json.loads(
+            json.dumps(provenance)
+        ),  # as it comes back from a file: lists for tuples
     )
 
 
@@ -140,7 +175,13 @@ def drive(
     per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     controller = manoeuvre.controller(car_of(plant), surface, seed)
-    ride = _Ride(plant, manoeuvre, controller, make_stability_control(plant) if stability_control else None, stint)
+    ride = _Ride(
+        plant,
+        manoeuvre,
+        controller,
+        make_stability_control(plant) if stability_control else None,
+        stint,
+    )
 
     stride = math.gcd(per_command, per_sample)
     first_sample = math.ceil(SETTLING_TIME / (plant.step * per_command)) * per_command
@@ -154,17 +195,27 @@ def drive(
         try:
             ride.state = plant.advance(ride.state, ride.inputs, stride, ride.decision.friction)
         except SimulationError as error:
-            raise SimulationError(f"manoeuvre '{manoeuvre.name}', {time:.2f} s after the first sample: {error}") from error
+            raise SimulationError(
+                f"manoeuvre '{manoeuvre.name}', {time:.2f} s after the first sample: {error}"
+            ) from error
         now += stride
     return ride.trip(plant, rate_hz, controller.drawn)
 
 
 class _Ride:
     def __init__(
-        self, plant: MultiBodyPlant, manoeuvre: Manoeuvre, controller: Controller, control: StabilityControl | None, stint: Stint | None
+        self,
+        plant: MultiBodyPlant,
+        manoeuvre: Manoeuvre,
+        controller: Controller,
+        control: StabilityControl | None,
+        stint: Stint | None,
     ) -> None:
         self._car, self._controller, self._stint = car_of(plant), controller, stint
-        self._half_width, self._longest = float(getattr(manoeuvre, "half_width", math.inf)), manoeuvre.longest
+        self._half_width, self._longest = (
+            float(getattr(manoeuvre, "half_width", math.inf)),
+            manoeuvre.longest,
+        )
         self.stability_control, self.stability = control, StabilityState()
         self.state = plant.initial_state(*controller.start)
         self.inputs = np.zeros(5)
@@ -196,10 +247,23 @@ class _Ride:
         drag = self._car.drag * seen.speed
         if self.stability_control is not None:
             self.stability = self.stability_control.step(
-                self.stability, 1.0 / DRIVER_RATE_HZ, steer=seen.steer, vx=seen.vx, yaw_rate=seen.yaw_rate, friction=decision.friction
+                self.stability,
+                1.0 / DRIVER_RATE_HZ,
+                steer=seen.steer,
+                vx=seen.vx,
+                yaw_rate=seen.yaw_rate,
+                friction=decision.friction,
             )
         moment = self.stability.moment
-        self.inputs = np.array([steering_velocity, acceleration, moment, along - drag * seen.vx, across - drag * seen.vy])
+        self.inputs = np.array(
+            [
+                steering_velocity,
+                acceleration,
+                moment,
+                along - drag * seen.vx,
+                across - drag * seen.vy,
+            ]
+        )
         return True
 
     def _judge(self, time: float, decision: Command) -> None:
@@ -229,7 +293,10 @@ class _Ride:
             return 0.0, 0.0
         along_road, across_road = road_gravity(decision.bank, decision.grade)
         sine, cosine = math.sin(yaw - decision.heading), math.cos(yaw - decision.heading)
-        along, across = along_road * cosine + across_road * sine, across_road * cosine - along_road * sine
+        along, across = (
+            along_road * cosine + across_road * sine,
+            across_road * cosine - along_road * sine,
+        )
         self.bank, self.grade = math.asin(-across / GRAVITY), math.asin(along / GRAVITY)
         return along, across
 
@@ -238,12 +305,16 @@ class _Ride:
         self._states.append(self.state)
         self._inputs.append(self.inputs)
         self._interventions += self.stability.active
-        self._road.append((self.decision.friction, self.bank, self.grade, self.decision.lateral_error))
+        self._road.append(
+            (self.decision.friction, self.bank, self.grade, self.decision.lateral_error)
+        )
 
     def trip(self, plant: MultiBodyPlant, rate_hz: float, drawn: dict[str, Any]) -> Trip:
         """The samples that were kept."""
         friction, bank, grade, lateral_error = np.array(self._road).T
-        motion = plant.motion(self._states, np.array(self._inputs), rate_hz, friction=friction, bank=bank, grade=grade)
+        motion = plant.motion(
+            self._states, np.array(self._inputs), rate_hz, friction=friction, bank=bank, grade=grade
+        )
         moving = np.hypot(motion.vx, motion.vy) > 1.0
         on_line = np.abs(lateral_error[np.isfinite(lateral_error)])
         flags = Flags(
@@ -255,7 +326,9 @@ class _Ride:
             largest_lateral_error=float(on_line.max()) if len(on_line) else None,
             largest_sideslip=float(np.abs(motion.sideslip[moving]).max(initial=0.0)),
             largest_ay=float(np.abs(motion.ay).max()),
-            stability_share=self._interventions / len(motion) if self.stability_control is not None else None,
+            stability_share=self._interventions / len(motion)
+            if self.stability_control is not None
+            else None,
         )
         return Trip(motion, lateral_error.copy(), flags, drawn)
 

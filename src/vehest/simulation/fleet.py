@@ -12,11 +12,19 @@ import numpy as np
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
-from vehest.simulation.plant.parameters import REAR_TYRE, Vehicle, is_number, library_parameters, rear_tyre
+from vehest.simulation.plant.parameters import (
+    REAR_TYRE,
+    Vehicle,
+    is_number,
+    library_parameters,
+    rear_tyre,
+)
 from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
 
-_STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+_STREAM = (
+    4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+)
 
 
 Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
@@ -32,7 +40,9 @@ class Variation:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.factor[0] <= self.factor[1]:
-            raise ConfigurationError(f"vary: a factor is a pair [lowest, highest] of positive scales, not {list(self.factor)}")
+            raise ConfigurationError(
+                f"vary: a factor is a pair [lowest, highest] of positive scales, not {list(self.factor)}"
+            )
 
     def drawn(self, generator: np.random.Generator) -> float:
         """A scale."""
@@ -65,14 +75,18 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
             target = target.setdefault(part, {})
         value = getattr(holder, last, None)
         if not isinstance(value, int | float):
-            raise ConfigurationError(f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled")
+            raise ConfigurationError(
+                f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled"
+            )
         target[last] = math.prod(factors, start=float(value))
     return replace(vehicle, overrides=overrides)
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
     """The same for a car of the planar plant; raises `ConfigurationError` where a name is no parameter of the plant."""
-    return scaled_car(car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()})
+    return scaled_car(
+        car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()}
+    )
 
 
 def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]:
@@ -90,7 +104,9 @@ def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]
 class SensorVariation:
     """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of error."""
 
-    factors: Mapping[str, tuple[float, float]]  # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
+    factors: Mapping[
+        str, tuple[float, float]
+    ]  # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
     # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it
     roll_share: tuple[float, float] | None = None
 
@@ -99,28 +115,49 @@ class SensorVariation:
         """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``; raises `ConfigurationError` otherwise."""
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
-            raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}")
-        factors = {str(kind): _range(value) for kind, value in entries.items() if kind != "roll_share"}
-        return cls(factors, _range(entries["roll_share"], lowest=-np.inf) if "roll_share" in entries else None)
+            raise ConfigurationError(
+                f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}"
+            )
+        factors = {
+            str(kind): _range(value) for kind, value in entries.items() if kind != "roll_share"
+        }
+        return cls(
+            factors,
+            _range(entries["roll_share"], lowest=-np.inf) if "roll_share" in entries else None,
+        )
 
     def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
         """Levels as the seed scales them; the same ones if nothing varies. References stay as they are."""
         if not self.factors and self.roll_share is None:
             return levels
-        generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
+        generator = np.random.default_rng(
+            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1))
+        )
         changed: dict[str, Any] = {}
         for entry in fields(levels):
             level = getattr(levels, entry.name)
             if isinstance(level, SensorLevel):
-                scales = {kind: float(generator.uniform(*factor)) for kind, factor in self.factors.items()}
-                changed[entry.name] = replace(level, **{kind: getattr(level, kind) * scale for kind, scale in scales.items()})
+                scales = {
+                    kind: float(generator.uniform(*factor)) for kind, factor in self.factors.items()
+                }
+                changed[entry.name] = replace(
+                    level, **{kind: getattr(level, kind) * scale for kind, scale in scales.items()}
+                )
         if self.roll_share is not None:
-            changed["tilt"] = replace(levels.tilt, roll_share=float(generator.uniform(*self.roll_share)))
+            changed["tilt"] = replace(
+                levels.tilt, roll_share=float(generator.uniform(*self.roll_share))
+            )
         return replace(levels, **changed)
 
 
 def _range(value: Any, lowest: float = 0.0) -> tuple[float, float]:
-    numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(is_number(end) for end in value)
+    numbers = (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and all(is_number(end) for end in value)
+    )
     if not numbers or len(value) != 2 or not lowest <= value[0] <= value[1]:
-        raise ConfigurationError(f"vary_sensors: a range is a pair [lowest, highest] of scales, not {value}")
+        raise ConfigurationError(
+            f"vary_sensors: a range is a pair [lowest, highest] of scales, not {value}"
+        )
     return float(value[0]), float(value[1])

@@ -18,9 +18,22 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import measure
 
-PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}  # manoeuvres of the planar plant's cars by name
+PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {
+    Freestyle.name: Freestyle
+}  # manoeuvres of the planar plant's cars by name
 
-CHANNELS = ("vx", "yaw_rate", "ax", "ay", "steer", "motor_speed", "motor_current", "vx_ref", "vy_ref", "yaw_rate_ref")
+CHANNELS = (
+    "vx",
+    "yaw_rate",
+    "ax",
+    "ay",
+    "steer",
+    "motor_speed",
+    "motor_current",
+    "vx_ref",
+    "vy_ref",
+    "yaw_rate_ref",
+)
 """Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
 
 SPUN = np.pi / 2.0  # sideslip angle beyond which a drive counts as one with a spin [rad]
@@ -56,11 +69,18 @@ def simulate_planar_drive(
         "surface": asdict(surface),
         "stability_control": False,
     }
-    return recording_of(id, car.name, trip, {name: shown[name] for name in CHANNELS}, about, sensors, seed)
+    return recording_of(
+        id, car.name, trip, {name: shown[name] for name in CHANNELS}, about, sensors, seed
+    )
 
 
 def drive_freely(
-    plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = RATE_HZ, surface: Surface = SURFACES["dry"]
+    plant: PlanarPlant,
+    manoeuvre: Freestyle,
+    seed: int,
+    *,
+    rate_hz: float = RATE_HZ,
+    surface: Surface = SURFACES["dry"],
 ) -> Trip:
     """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before.
 
@@ -74,7 +94,9 @@ def drive_freely(
     state, kept, acting = plant.initial_state(), [], []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):
         if now % per_command == 0:
-            inputs = driver.inputs(now * plant.step, Observation(*state[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist()))
+            inputs = driver.inputs(
+                now * plant.step, Observation(*state[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
+            )
         if now >= first_sample and (now - first_sample) % per_sample == 0:
             kept.append(state)
             acting.append(inputs)
@@ -82,5 +104,10 @@ def drive_freely(
     motion = plant.motion(kept, acting, rate_hz)
     moving = np.hypot(motion.vx, motion.vy) > 1.0
     sideslip = float(np.abs(motion.sideslip[moving]).max(initial=0.0))
-    flags = Flags(spun=sideslip > SPUN, completed=True, largest_sideslip=sideslip, largest_ay=float(np.abs(motion.ay).max()))
+    flags = Flags(
+        spun=sideslip > SPUN,
+        completed=True,
+        largest_sideslip=sideslip,
+        largest_ay=float(np.abs(motion.ay).max()),
+    )
     return Trip(motion, np.full(len(motion), np.nan), flags, driver.drawn)

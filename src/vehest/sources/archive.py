@@ -21,10 +21,22 @@ from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9
-SMALL, MOST_EXPANSION = 64 * 2**20, 250  # bytes; times its packed size that a larger archive may unpack to
+SMALL, MOST_EXPANSION = (
+    64 * 2**20,
+    250,
+)  # bytes; times its packed size that a larger archive may unpack to
 MOST_FILES = 10_000
 
-_UNSOUND = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, OverflowError, MemoryError)
+_UNSOUND = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+    OverflowError,
+    MemoryError,
+)
 
 
 class _Archive(io.FileIO):
@@ -32,7 +44,11 @@ class _Archive(io.FileIO):
 
     def read(self, size: int | None = -1, /) -> Any:
         asked = os.fstat(self.fileno()).st_size - self.tell() if size is None or size < 0 else size
-        check_limit("text_bytes", asked, f"'{os.fsdecode(str(self.name))}' holds a list of entries of {asked} bytes")
+        check_limit(
+            "text_bytes",
+            asked,
+            f"'{os.fsdecode(str(self.name))}' holds a list of entries of {asked} bytes",
+        )
         return super().read(size)
 
 
@@ -47,21 +63,34 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
-                size, most = sum(entry.file_size for entry in entries), min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size))
+                size, most = (
+                    sum(entry.file_size for entry in entries),
+                    min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size)),
+                )
                 if len(entries) > MOST_FILES or size > most:
                     limits = f"more than the limit of {MOST_FILES} entries and {most / 1e9:.3g} GB; unpack it by hand"
-                    raise DataError(f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, {limits}")
-                targets = {entry: folder / _checked_path(file, entry) for entry in entries if not entry.is_dir()}
+                    raise DataError(
+                        f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, {limits}"
+                    )
+                targets = {
+                    entry: folder / _checked_path(file, entry)
+                    for entry in entries
+                    if not entry.is_dir()
+                }
                 for entry, target in targets.items():
                     target.parent.mkdir(parents=True, exist_ok=True)
                     with archive.open(entry) as packed, open(target, "xb") as plain:
                         shutil.copyfileobj(packed, plain)
         except _UNSOUND as error:
-            raise DataError(f"'{file}' is not a sound zip archive ({first_line(error)}); fetch it again") from None
+            raise DataError(
+                f"'{file}' is not a sound zip archive ({first_line(error)}); fetch it again"
+            ) from None
         except OSError as error:
             if no_room(error) is not None:
                 raise writing_error(folder, error) from None
-            raise DataError(f"'{file}' cannot be unpacked ({error.strerror or error}); fetch it again") from None
+            raise DataError(
+                f"'{file}' cannot be unpacked ({error.strerror or error}); fetch it again"
+            ) from None
         yield folder
 
 
@@ -71,7 +100,9 @@ def temporary_folder(file: Path) -> Iterator[Path]:
     try:
         kept = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
     except OSError as error:
-        raise MissingError(f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR to one") from None
+        raise MissingError(
+            f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR to one"
+        ) from None
     with kept as name:
         yield Path(name)
 
@@ -79,7 +110,15 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))
-    leaves = path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts or not name.isprintable()
+    leaves = (
+        path.is_absolute()
+        or PureWindowsPath(name).drive
+        or ".." in path.parts
+        or not path.parts
+        or not name.isprintable()
+    )
     if leaves or kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise DataError(f"'{file}': entry {name!r} is no file inside the folder, but a link or elsewhere; do not trust this archive")
+        raise DataError(
+            f"'{file}': entry {name!r} is no file inside the folder, but a link or elsewhere; do not trust this archive"
+        )
     return path

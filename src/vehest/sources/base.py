@@ -52,10 +52,16 @@ class CommonOptions:
     licence: str = ""
     citation: str = ""
     accept: Annotated[tuple[str, ...], "a list of checks"] | None = None
-    download: Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None = None
+    download: (
+        Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None
+    ) = None
     transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
-    reference_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
-    imu_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
+    reference_point: (
+        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
+    ) = None
+    imu_point: (
+        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
+    ) = None
 
 
 COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
@@ -72,7 +78,9 @@ def origin_in_words(recording: Recording) -> list[str]:
     if transforms := declared.get("transforms"):
         lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in transforms)}")
     if held := recording.provenance.get("held"):
-        lines.append(f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between")
+        lines.append(
+            f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between"
+        )
     return lines
 
 
@@ -102,7 +110,9 @@ class Source(ABC):
     options_type: ClassVar[type]
     options: Any
     version: ClassVar[str] = "1"
-    slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
+    slow: ClassVar[bool] = (
+        False  # whether a recording takes so long that each is kept as soon as it is made
+    )
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
@@ -119,11 +129,15 @@ class Source(ABC):
             self.transforms = [transform_from_config(entry) for entry in common.transforms or ()]
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.where}: {error}") from None
-        if isinstance(self.reference_point, Point) and any(isinstance(transform, ScaleToWheelbase) for transform in self.transforms):
+        if isinstance(self.reference_point, Point) and any(
+            isinstance(transform, ScaleToWheelbase) for transform in self.transforms
+        ):
             what = "reference_point does not go with scale_to_wheelbase; put the transform reference_lever before it instead"
             raise ConfigurationError(f"{self.where}: {what}")
         if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
-            raise ConfigurationError(f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out")
+            raise ConfigurationError(
+                f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out"
+            )
         self.options = self._validated(self.options_type)
 
     def _validated(self, kind: type[Options]) -> Options:
@@ -164,7 +178,11 @@ class Source(ABC):
     def _prepared(self, recording: Recording) -> Recording:
         """A recording after the data set's transforms and with its reference at the centre of gravity, unless it has been through them."""
         if len(recording) > 1:
-            require_clock(recording.time, f"{self.where}, recording '{recording.id}'", "correct time or rate_hz")
+            require_clock(
+                recording.time,
+                f"{self.where}, recording '{recording.id}'",
+                "correct time or rate_hz",
+            )
         if DERIVED in recording.provenance:
             return recording
         for transform in self.transforms:
@@ -172,10 +190,20 @@ class Source(ABC):
         point, moved = self.reference_point, False
         if isinstance(point, Point) and (point.x or point.y) and "vy_ref" in recording:
             recording, moved = ReferenceLever(point.x, point.y)(recording), True
-        declared = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
+        declared = {
+            key: self.dataset[key]
+            for key in ("transforms", "reference_point", "imu_point")
+            if self.dataset.get(key)
+        }
         if not declared:
             return recording
-        return replace(recording, provenance={**recording.provenance, DERIVED: {**declared, "moved_to_centre_of_gravity": moved}})
+        return replace(
+            recording,
+            provenance={
+                **recording.provenance,
+                DERIVED: {**declared, "moved_to_centre_of_gravity": moved},
+            },
+        )
 
     @abstractmethod
     def read_raw(self, recording_id: str) -> Recording:
@@ -183,7 +211,9 @@ class Source(ABC):
 
     def read_raw_file(self, file: Path) -> Recording:
         """A recording of a file as it is; raises as `read_file` does."""
-        raise ConfigurationError(f"{self.where}: source '{self.dataset.get('source')}' reads no single files")
+        raise ConfigurationError(
+            f"{self.where}: source '{self.dataset.get('source')}' reads no single files"
+        )
 
     def file_names(self) -> list[str]:
         """Files that the configuration alone names, which ``download`` fetches if it lists none."""
@@ -229,7 +259,9 @@ def source_class(dataset: Mapping[str, Any]) -> type[Source]:
     name = str(dataset.get("source"))
     found: type[Source] | None = _source_of(name) if name in _modules() else None
     if found is None:
-        raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}")
+        raise ConfigurationError(
+            f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}"
+        )
     return found
 
 

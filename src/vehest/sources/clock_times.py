@@ -25,14 +25,21 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     if not len(found) or found.null_count:
         return None
     seconds = compute.replace_substring(found.field("second"), ",", ".")
-    hours, minutes, seconds = (compute.cast(part, pa.float64()) for part in (found.field("hour"), found.field("minute"), seconds))
+    hours, minutes, seconds = (
+        compute.cast(part, pa.float64())
+        for part in (found.field("hour"), found.field("minute"), seconds)
+    )
     times = np.asarray(hours) * 3600.0 + np.asarray(minutes) * 60.0 + np.asarray(seconds)
     dates = found.field("date")
     if not compute.any(compute.not_equal(dates, "")).as_py():
         return past_midnight(times)
     padded = compute.replace_substring_regex(dates, r"\b(\d)\.", r"0\1.")
     try:
-        days = compute.replace_substring_regex(padded, r"^(\d+)\.(\d+)\.(\d+)$", r"\3-\2-\1").cast(pa.date32()).cast(pa.int32())
+        days = (
+            compute.replace_substring_regex(padded, r"^(\d+)\.(\d+)\.(\d+)$", r"\3-\2-\1")
+            .cast(pa.date32())
+            .cast(pa.int32())
+        )
     except pa.ArrowInvalid:
         return None
     return np.asarray(times + DAY * np.asarray(days), dtype=np.float64)
@@ -40,4 +47,7 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
 
 def past_midnight(times: FloatArray) -> FloatArray:
     """Times since midnight that go on past the next [s], (N,), of times of day."""
-    return np.asarray(times + DAY * np.concatenate([[0.0], np.cumsum(np.diff(times) < -0.5 * DAY)]), dtype=np.float64)
+    return np.asarray(
+        times + DAY * np.concatenate([[0.0], np.cumsum(np.diff(times) < -0.5 * DAY)]),
+        dtype=np.float64,
+    )

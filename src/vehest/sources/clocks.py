@@ -25,9 +25,15 @@ LATEST_TIME = 1e11  # s; beyond it a double tells no two samples of 1e5 Hz apart
 GAP = 1.5  # median steps
 MOST_JITTER = 0.01  # of a step
 MOST_CLOCK_DRIFT = 0.5  # steps
-MOST_STRETCH = 0.1  # of a step, over a whole recording, by which a plain rate may differ from the one found
-MOST_DRIFT = 0.01  # of a step, over a whole recording, that may come from the resolution of the stamps
-INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
+MOST_STRETCH = (
+    0.1  # of a step, over a whole recording, by which a plain rate may differ from the one found
+)
+MOST_DRIFT = (
+    0.01  # of a step, over a whole recording, that may come from the resolution of the stamps
+)
+INTERPOLATED_TOLERANCE = (
+    5e-3  # an interpolated clock may run at any rate: take a plain one this near
+)
 SLACK = 1e-6  # of a step; times that are nearer are the same
 SORT = "repair, remove or sort the rows"
 BRIDGE = "cut the range out or set dataset.clock=interpolate"
@@ -39,7 +45,9 @@ MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
 RATE_TOLERANCE = 5e-3
 
 
-def require_clock(stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False) -> None:
+def require_clock(
+    stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False
+) -> None:
     """Refuse time stamps that have a `clock_fault`, by a `DataError`; ``where`` names file and signal."""
     if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
         raise DataError(f"{where}: {fault}")
@@ -112,7 +120,9 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, where
     at = int(np.argmax(steps))
     if steps[at] > longest:
         what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > longest).sum()} above {longest:.6g} s"
-        raise DataError(f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time")
+        raise DataError(
+            f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time"
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +132,9 @@ class Clock:
     start_time: float  # s
     rate_hz: float
     n_samples: int
-    stamps: FloatArray | None = None  # the file's own time stamps, where samples must be interpolated [s]
+    stamps: FloatArray | None = (
+        None  # the file's own time stamps, where samples must be interpolated [s]
+    )
 
     def ticks(self) -> FloatArray:
         """Times of the uniform clock [s]."""
@@ -137,11 +149,17 @@ class Clock:
             return samples
         elapsed = self.stamps - self.stamps[0]
         if gappy:
-            return on_nearest(samples, np.minimum(np.rint(elapsed * self.rate_hz), self.n_samples - 1), self.n_samples)
+            return on_nearest(
+                samples,
+                np.minimum(np.rint(elapsed * self.rate_hz), self.n_samples - 1),
+                self.n_samples,
+            )
         return at_ticks(samples, elapsed, np.arange(self.n_samples) / self.rate_hz)
 
 
-def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE) -> Clock:
+def uniform_clock(
+    stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE
+) -> Clock:
     """The uniform clock behind a file's time stamps (T,) [s]; ``where`` is the file, for messages.
 
     By ``policy``, ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the
@@ -155,12 +173,24 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     if policy == "interpolate":
         rate = plain_rate(1.0 / mean_step(steps), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
-        check_limit("samples", n_samples, f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples")
+        check_limit(
+            "samples",
+            n_samples,
+            f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples",
+        )
         return Clock(start, rate, n_samples, stamps)
     rate, deviation = len(steps) / elapsed, MOST_DRIFT
     if policy == "uniform":
-        nominal, deviation = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE), MOST_STRETCH
-        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set dataset.clock=interpolate")
+        nominal, deviation = (
+            plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE),
+            MOST_STRETCH,
+        )
+        times, rate, _ = uniform_times(
+            stamps,
+            nominal,
+            where,
+            fix="leave rows out by drop_rows or set dataset.clock=interpolate",
+        )
         start = float(times[0])
     elif uneven := unevenness(stamps):
         raise DataError(f"{where}: {uneven}; {fix}")
@@ -175,9 +205,14 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
     for block in blocks:
         if not (np.abs(block) <= LATEST_TIME).all():
             return None
-        steps, own = np.diff(block, prepend=before), float(block[-1] - block[0]) / max(len(block) - 1, 1)
+        steps, own = (
+            np.diff(block, prepend=before),
+            float(block[-1] - block[0]) / max(len(block) - 1, 1),
+        )
         intervals += [float(steps.min(initial=math.inf)), float(steps.max(initial=0.0))]
-        most = float(np.abs(block - block[0] - own * np.arange(len(block))).max())  # away from the block's own line
+        most = float(
+            np.abs(block - block[0] - own * np.arange(len(block))).max()
+        )  # away from the block's own line
         lines.append((count, len(block) - 1, float(block[0]), own, most))
         count, before = count + len(block), block[-1:]
     if not FEWEST < count < MOST_STEPS:
@@ -185,9 +220,15 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
     low, high, start = min(intervals), max(intervals), lines[0][2]
     elapsed, n_steps = float(before[0]) - start, count - 1
     step = elapsed / n_steps
-    away = max(abs(first - start - at * step) + abs(own - step) * reach + most for at, reach, first, own, most in lines)
+    away = max(
+        abs(first - start - at * step) + abs(own - step) * reach + most
+        for at, reach, first, own, most in lines
+    )
     if (
-        not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= low <= high <= min(LONGEST_STEP, (1.0 + MOST_JITTER) * low)
+        not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE
+        <= low
+        <= high
+        <= min(LONGEST_STEP, (1.0 + MOST_JITTER) * low)
         or away > MOST_CLOCK_DRIFT * low
     ):
         return None
@@ -195,7 +236,11 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
 
 
 def uniform_times(
-    stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = "cut the range out or set clock: stamps"
+    stamps: FloatArray,
+    rate_hz: float,
+    where: str,
+    tolerated: float = 0.0,
+    fix: str = "cut the range out or set clock: stamps",
 ) -> tuple[FloatArray, float, float]:
     """Times of a sensor that samples evenly (T,) [s], from time stamps with software delay, (T,) [s], which may repeat.
 
@@ -208,7 +253,9 @@ def uniform_times(
     Raises `DataError`: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
     """
     if len(stamps) < FEWEST:
-        raise DataError(f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed")
+        raise DataError(
+            f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed"
+        )
     if fault := _order_fault(stamps, "repair or cut the range out", may_repeat=True):
         raise DataError(f"{where}: {fault}")
     number = np.arange(len(stamps), dtype=np.float64)
@@ -222,7 +269,13 @@ def uniform_times(
     # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by little.
     block = max(round(BLOCK_SECONDS * rate_hz), FEWEST // 2)
     edges = np.arange(0, len(late), block)
-    shifts = np.array([np.median(late[edge : edge + block]) for edge in edges if not edge or len(late) - edge >= block // 2])
+    shifts = np.array(
+        [
+            np.median(late[edge : edge + block])
+            for edge in edges
+            if not edge or len(late) - edge >= block // 2
+        ]
+    )
     worst = int(np.argmax(np.abs(shifts)))
     if abs(shifts[worst]) > max(MOST_WANDERING * step, tolerated):
         raise DataError(
@@ -249,25 +302,46 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
 
 def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
     """Time that all spans [s] have in common; their keys name them in messages; raises `DataError` where there is none."""
-    late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
+    late, early = (
+        max(spans, key=lambda name: spans[name][0]),
+        min(spans, key=lambda name: spans[name][1]),
+    )
     begin, end = spans[late][0], spans[early][1]
     if begin >= end:
         what = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
-        raise DataError(f"{where}: {what}: nothing is common to all; leave one out, declare it gappy or take stamps of one clock")
+        raise DataError(
+            f"{where}: {what}: nothing is common to all; leave one out, declare it gappy or take stamps of one clock"
+        )
     return begin, end
 
 
 def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
     """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], (T,); `DataError` below two or above the limits."""
     n_samples = (end - begin) * rate_hz
-    check_limit("samples", n_samples, f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
-    ticks = np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+    check_limit(
+        "samples",
+        n_samples,
+        f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz",
+    )
+    ticks = (
+        np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1)
+        / rate_hz
+    )
     if len(ticks) < 2:
-        raise DataError(f"{where} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
+        raise DataError(
+            f"{where} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz"
+        )
     return ticks
 
 
-def at_ticks(samples: FloatArray, stamps: FloatArray, ticks: FloatArray, *, hold: bool = False, slack: float = 0.0) -> FloatArray:
+def at_ticks(
+    samples: FloatArray,
+    stamps: FloatArray,
+    ticks: FloatArray,
+    *,
+    hold: bool = False,
+    slack: float = 0.0,
+) -> FloatArray:
     """Samples at other times [s]: along straight lines or, to ``hold``, the last one that is at most ``slack`` [s] later than a tick."""
     if not hold:
         return np.interp(ticks, stamps, samples)
@@ -298,7 +372,11 @@ def plain_rate(rate: float, tolerance: float) -> float:
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale
         interval = round(1e3 * scale / rate) / (1e3 * scale)
-        candidates = [candidate for candidate in (hertz, 1.0 / interval if interval else 0.0) if abs(candidate / rate - 1.0) <= tolerance]
+        candidates = [
+            candidate
+            for candidate in (hertz, 1.0 / interval if interval else 0.0)
+            if abs(candidate / rate - 1.0) <= tolerance
+        ]
         if candidates:
             return min(candidates, key=lambda candidate: abs(candidate - rate))
     return rate

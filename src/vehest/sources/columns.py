@@ -17,7 +17,9 @@ from vehest.data.units import factor_to_si
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
-ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]  # YAML reads 3 as a number
+ColumnName = Annotated[
+    str, BeforeValidator(lambda name: str(name) if type(name) is int else name)
+]  # YAML reads 3 as a number
 Positive = Annotated[float, Field(gt=0)]
 Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 
@@ -38,7 +40,9 @@ class Column:
         return values if factor == 1.0 else values * factor
 
 
-def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column) -> dict[str, Column]:
+def columns_from_config(
+    entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column
+) -> dict[str, Column]:
     """Channel -> its declaration of ``kind``, as a data set declares them; `ConfigurationError` for an unknown channel, unit or key."""
     columns = {}
     for name, entry in entries.items():

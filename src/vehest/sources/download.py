@@ -54,7 +54,9 @@ class Outcome:
     """Result for one file."""
 
     name: str
-    what: Literal["fetched", "matched", "recorded"]  # matched its known checksum; was there and its checksum is recorded on first sight
+    what: Literal[
+        "fetched", "matched", "recorded"
+    ]  # matched its known checksum; was there and its checksum is recorded on first sight
     sha256: str
     size: int  # bytes
     resumed_at: int = 0  # bytes that an earlier attempt had left
@@ -98,7 +100,11 @@ class Download:
     def _outcome(self, name: str, progress: Progress | None) -> Outcome:
         import pooch
 
-        path, recorded, found = self.folder / name, name in _read_checksums(self.folder), self._checked(name)
+        path, recorded, found = (
+            self.folder / name,
+            name in _read_checksums(self.folder),
+            self._checked(name),
+        )
         if found is not None:
             _record(self.folder, name, found)
             return Outcome(name, "matched" if recorded else "recorded", found, path.stat().st_size)
@@ -106,17 +112,29 @@ class Download:
         downloader = ResumingDownloader(under_way / f"{name}.part", progress)
         pooch.get_logger().setLevel("WARNING")
         try:
-            complete = Path(pooch.retrieve(address, self._expected(name), name, under_way, downloader=downloader))
+            complete = Path(
+                pooch.retrieve(
+                    address, self._expected(name), name, under_way, downloader=downloader
+                )
+            )
             found = sha256_of(complete)
             _record(self.folder, name, found)
             os.replace(complete, path)
         except OSError as error:
             if error.errno is not None:
                 raise writing_error(path, error) from error
-            part = "; the same command goes on after what has arrived" if downloader.part.exists() else ""
-            raise MissingError(f"cannot fetch {address}: {str(error)[-200:]}{part}") from None  # the cause comes last
+            part = (
+                "; the same command goes on after what has arrived"
+                if downloader.part.exists()
+                else ""
+            )
+            raise MissingError(
+                f"cannot fetch {address}: {str(error)[-200:]}{part}"
+            ) from None  # the cause comes last
         except ValueError as error:  # of pooch, which has removed the file
-            raise DataError(f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})") from None
+            raise DataError(
+                f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})"
+            ) from None
         return Outcome(name, "fetched", found, path.stat().st_size, downloader.resumed_at)
 
     def _checked(self, name: str) -> str | None:
@@ -127,7 +145,9 @@ class Download:
         found = sha256_of(path)
         if expected not in (None, found):
             what = f"'{path}' has the sha256 {found}, expected is {expected}: it was changed or is damaged"
-            raise DataError(f"{what}; remove the file to fetch it again, or correct download.sha256 or {CHECKSUMS} to accept it")
+            raise DataError(
+                f"{what}; remove the file to fetch it again, or correct download.sha256 or {CHECKSUMS} to accept it"
+            )
         return found
 
     def _expected(self, name: str) -> str | None:
@@ -137,16 +157,35 @@ class Download:
 def download_of(source: Source) -> Download:
     """Option ``download`` of a data set; raises `ConfigurationError` where it is missing or wrong, `MissingError` without a data root."""
     where = f"data set '{source.name}'"
-    options = validated(DownloadOptions, source.dataset.get("download"), where, error=ConfigurationError, group="dataset.download")
+    options = validated(
+        DownloadOptions,
+        source.dataset.get("download"),
+        where,
+        error=ConfigurationError,
+        group="dataset.download",
+    )
     try:
-        files = tuple(map(_file_name, source.file_names())) if options.files is None else options.files
+        files = (
+            tuple(map(_file_name, source.file_names())) if options.files is None else options.files
+        )
     except ValueError as error:
         raise ConfigurationError(f"{where}: {error}") from None
     if not files or len(set(files)) < len(files):
-        raise ConfigurationError(f"{where}: download.files must list the names of files, each once, not {list(files)}")
+        raise ConfigurationError(
+            f"{where}: download.files must list the names of files, each once, not {list(files)}"
+        )
     path = str(source.dataset.get("path") or "None")
-    folder = existing_folder(None, source.name) if path.split("/")[0] in {"None", "null"} else Path(path).expanduser()
-    return Download(folder, options.url, files, {name: digest.lower() for name, digest in (options.sha256 or {}).items()})
+    folder = (
+        existing_folder(None, source.name)
+        if path.split("/")[0] in {"None", "null"}
+        else Path(path).expanduser()
+    )
+    return Download(
+        folder,
+        options.url,
+        files,
+        {name: digest.lower() for name, digest in (options.sha256 or {}).items()},
+    )
 
 
 def _read_checksums(folder: Path) -> dict[str, str]:
@@ -161,7 +200,9 @@ def _read_checksums(folder: Path) -> dict[str, str]:
     try:
         registry.load_registry(file)
     except (OSError, ValueError) as error:
-        raise DataError(f"'{file}' is no record of checksums ({first_line(error)}); repair it, or remove it to record anew") from None
+        raise DataError(
+            f"'{file}' is no record of checksums ({first_line(error)}); repair it, or remove it to record anew"
+        ) from None
     return dict(registry.registry)
 
 
@@ -185,7 +226,9 @@ def _locked(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise MissingError(f"another process is fetching into '{folder}'; run again when it is done") from None
+                raise MissingError(
+                    f"another process is fetching into '{folder}'; run again when it is done"
+                ) from None
         yield
     finally:
         os.close(descriptor)

@@ -41,14 +41,18 @@ class FileSource(Source):
         """Read one recording by its name; raises `MissingError` where there is none, `DataError` where it cannot be used."""
         found = self._found()
         if recording_id not in found:
-            raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {listed(list(found))})")
+            raise MissingError(
+                f"{self.where} has no recording '{recording_id}' (it has {listed(list(found))})"
+            )
         return self._read(*found[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
         """Read a file wherever it is; raises `MissingError` without it, `DataError` where it cannot be used or holds several runs."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
-            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}")
+            raise DataError(
+                f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}"
+            )
         return self._read(file, runs[0])
 
     def _read(self, file: Path, run: int | None) -> Recording:
@@ -57,7 +61,11 @@ class FileSource(Source):
 
     def _found(self) -> dict[str, tuple[Path, int | None]]:
         """Name of each recording -> its file and run."""
-        return {self._name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
+        return {
+            self._name_of(file, run): (file, run)
+            for file in self._files()
+            for run in self._runs_of(file)
+        }
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Number of each run in a file -> its rows; all rows under None where runs are not told apart."""
@@ -75,10 +83,14 @@ class FileSource(Source):
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)
         if not files:
-            raise MissingError(f"{self.where}: no file in '{folder}' matches '{self.options.files}'")
+            raise MissingError(
+                f"{self.where}: no file in '{folder}' matches '{self.options.files}'"
+            )
         names = [self._id_of(file) for file in files]
         if doubled := sorted({name for name in names if names.count(name) > 1}):
-            raise DataError(f"{self.where}: two files are called '{doubled[0]}', a recording's name must be unique")
+            raise DataError(
+                f"{self.where}: two files are called '{doubled[0]}', a recording's name must be unique"
+            )
         return files
 
     def _matching(self, folder: Path) -> list[Path]:
@@ -94,10 +106,17 @@ class FileSource(Source):
         """See that ``files`` is a pattern inside the folder."""
         pattern = self.options.files
         if not pattern or Path(pattern).is_absolute():
-            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '*.csv', not '{pattern}'")
+            raise ConfigurationError(
+                f"{self.where}: files must be a pattern inside path, such as '*.csv', not '{pattern}'"
+            )
 
     def _recording(
-        self, recording_id: str, where: str, clock: Clock, channels: Mapping[str, FloatArray], provenance: Mapping[str, Any]
+        self,
+        recording_id: str,
+        where: str,
+        clock: Clock,
+        channels: Mapping[str, FloatArray],
+        provenance: Mapping[str, Any],
     ) -> Recording:
         """A recording of this data set; raises `DataError` where its channels make none; ``where`` names the file."""
         try:
@@ -114,11 +133,15 @@ class FileSource(Source):
         except DataError as error:
             raise DataError(f"{where}: {error}") from None
 
-    def _declared(self, entries: Mapping[str, Any] | None, kind: type[Column] = Column) -> dict[str, Any]:
+    def _declared(
+        self, entries: Mapping[str, Any] | None, kind: type[Column] = Column
+    ) -> dict[str, Any]:
         """Channel -> its declaration, one at least; those that the option ``gappy`` names are `gappy`."""
         columns = columns_from_config(entries or {}, self.name, kind)
         if not columns:
-            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+            raise ConfigurationError(
+                f"{self.where}: channels must map a channel to its column and unit"
+            )
         self.gappy = self._gappy_among(columns)
         return columns
 
@@ -126,5 +149,7 @@ class FileSource(Source):
         """Channels that the option ``gappy`` names, which must be among the data set's."""
         gappy = frozenset(self.options.gappy or ())
         for name in sorted(gappy - set(channels)):
-            raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")
+            raise ConfigurationError(
+                f"{self.where}: gappy names '{name}', which is not one of its channels"
+            )
         return gappy

@@ -54,8 +54,15 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise, as the file is damaged, or asks for
     more.
     """
-    size = sum(part.stat().st_size for part in (file.rglob("*") if file.is_dir() else [file]) if part.is_file())
-    seconds, memory = SECONDS + SECONDS_PER_BYTE * size, current_limits().memory + MEMORY_PER_BYTE * size
+    size = sum(
+        part.stat().st_size
+        for part in (file.rglob("*") if file.is_dir() else [file])
+        if part.is_file()
+    )
+    seconds, memory = (
+        SECONDS + SECONDS_PER_BYTE * size,
+        current_limits().memory + MEMORY_PER_BYTE * size,
+    )
     order = {
         "reader": reader,
         "file": str(file),
@@ -66,7 +73,13 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     }
     environment = {**os.environ, **_ONE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    with subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
+    with subprocess.Popen(
+        _COMMAND,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment,
+    ) as process:
         timer = threading.Timer(WAITING * seconds, process.kill)
         timer.start()
         try:
@@ -81,21 +94,30 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     answer = json.loads(table.schema.metadata[b"answer"])
     if "error" in answer:
         raise getattr(errors, answer["error"])(answer["message"])
-    arrays = {name: table.column(name).chunk(0).values.to_numpy(zero_copy_only=False) for name in table.column_names}
+    arrays = {
+        name: table.column(name).chunk(0).values.to_numpy(zero_copy_only=False)
+        for name in table.column_names
+    }
     return Reading(arrays, answer)
 
 
 def require_package(module: str, extra: str, what: str) -> None:
     """See that an optional package is installed; raises `MissingError` where it is not."""
     if find_spec(module) is None:
-        raise MissingError(f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'")
+        raise MissingError(
+            f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'"
+        )
 
 
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
-        return DataError(f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format")
+        return DataError(
+            f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format"
+        )
     if code == NO_MEMORY:
-        return DataError(f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise it: limits.memory=NUMBER")
+        return DataError(
+            f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise it: limits.memory=NUMBER"
+        )
     return DataError(f"'{file}' is damaged: reading it ends with status {code}")
 
 
@@ -106,7 +128,10 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
     with suppress(ImportError):
         import resource
 
-        limits = {resource.RLIMIT_DATA: int(order["memory"]), resource.RLIMIT_CPU: int(order["seconds"])}
+        limits = {
+            resource.RLIMIT_DATA: int(order["memory"]),
+            resource.RLIMIT_CPU: int(order["seconds"]),
+        }
         for kind, most in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
             with suppress(ValueError, OSError):
                 resource.setrlimit(kind, (most, most))
@@ -123,7 +148,10 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
 
 
 def _send(stream: BinaryIO, arrays: Arrays, answer: Mapping[str, Any]) -> None:
-    columns = [pa.LargeListArray.from_arrays(pa.array([0, len(array)], pa.int64()), pa.array(array)) for array in arrays.values()]
+    columns = [
+        pa.LargeListArray.from_arrays(pa.array([0, len(array)], pa.int64()), pa.array(array))
+        for array in arrays.values()
+    ]
     kinds = [pa.field(name, column.type) for name, column in zip(arrays, columns, strict=True)]
     schema = pa.schema(kinds, metadata={"answer": json.dumps(answer)})
     with pa.ipc.new_stream(stream, schema) as writer:

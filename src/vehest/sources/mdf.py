@@ -41,13 +41,20 @@ class MdfSource(SignalSource):
     channel_type = MdfChannel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        wanted = {name: (declared.column, declared.group) for name, declared in self.channels.items()}
+        wanted = {
+            name: (declared.column, declared.group) for name, declared in self.channels.items()
+        }
         signals, _, about = read_measurement(file, wanted)
-        rates = {signal.origin.removeprefix("group "): round(signal.rate_hz, 3) for signal in signals.values()}
+        rates = {
+            signal.origin.removeprefix("group "): round(signal.rate_hz, 3)
+            for signal in signals.values()
+        }
         return signals, {"version": about["version"], "measured": about["start"], "groups": rates}
 
 
-def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
+def read_measurement(
+    file: Path, wanted: Wanted | None
+) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
     """Signals of a measurement by their keys, what was not read and why, and ``version``, ``start`` and, by key, ``signals`` of the file.
 
     ``wanted`` is where each signal stands; None for every signal of numbers whose group has times. Raises `MissingError` without file or
@@ -57,12 +64,22 @@ def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signa
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)
     signals, skipped = {}, list(reading.summary["skipped"])
     groups = {place["group"] for place in reading.summary["signals"].values()}
-    faults = {group: clock_fault(reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out") for group in groups}
+    faults = {
+        group: clock_fault(
+            reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out"
+        )
+        for group in groups
+    }
     for key, place in reading.summary["signals"].items():
         reason = faults[place["group"]]
         where = f"signal '{place['name']}' of group {place['title']}"
         if not reason:
-            signals[key] = Signal(f"group {place['title']}", reading.arrays[f"stamps {place['group']}"], reading.arrays[key], place["unit"])
+            signals[key] = Signal(
+                f"group {place['title']}",
+                reading.arrays[f"stamps {place['group']}"],
+                reading.arrays[key],
+                place["unit"],
+            )
         elif wanted is not None:
             raise DataError(f"'{file}': {where}: {reason}")
         else:

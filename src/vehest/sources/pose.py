@@ -23,13 +23,17 @@ class PoseOptions:
 
     window: int = 9  # samples of the Savitzky-Golay filter
     order: int = 2  # of its polynomial
-    lever_x: float = 0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
+    lever_x: float = (
+        0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
+    )
     lever_y: float = 0.0  # to the left [m]
     channels: tuple[PoseChannel, ...] = POSE_CHANNELS
 
     def __post_init__(self) -> None:
         if not 1 <= self.order < self.window or self.window % 2 == 0:
-            raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
+            raise ValueError(
+                f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}"
+            )
 
     def references(
         self,
@@ -53,9 +57,21 @@ class PoseOptions:
         Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
         """
         if len(yaw) < self.window:
-            raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
-        derivative = partial(scipy.signal.savgol_filter, window_length=self.window, polyorder=self.order, deriv=1, delta=interval)
-        velocity_x, velocity_y, yaw_rate = derivative(positions[:, 0]), derivative(positions[:, 1]), derivative(yaw)
+            raise DataError(
+                f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window"
+            )
+        derivative = partial(
+            scipy.signal.savgol_filter,
+            window_length=self.window,
+            polyorder=self.order,
+            deriv=1,
+            delta=interval,
+        )
+        velocity_x, velocity_y, yaw_rate = (
+            derivative(positions[:, 0]),
+            derivative(positions[:, 1]),
+            derivative(yaw),
+        )
         heading = scipy.signal.savgol_filter(yaw, self.window, self.order) + turned
         cosine, sine = np.cos(heading), np.sin(heading)
         made = {
@@ -69,7 +85,9 @@ class PoseOptions:
         return {name: made[name] for name in self.channels}
 
 
-def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:
+def ground_plane(
+    positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str
+) -> tuple[FloatArray, FloatArray]:
     """Positions in the ground plane, (T, 2) [m], and unwrapped yaw, (T,) [rad], z up, of positions x, y, z in the world, (T, 3) [m].
 
     Orientations are quaternions x, y, z, w from the rigid body's axes to the world's, (T, 4); ``up`` is the upward axis of both, ``y`` is

@@ -15,10 +15,22 @@ CHUNK = 1 << 15  # bytes
 TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
 ATTEMPTS = 5  # in a row that bring nothing new
 PAUSE = 1.0  # s, before the second of them; then twice as long each
-CHANGED = frozenset({206, 416})  # statuses of an answer to a range that is of another version of the file
-PASSING = CHANGED | {408, 425, 429, 500, 502, 503, 504}  # statuses that the next attempt may not meet
+CHANGED = frozenset(
+    {206, 416}
+)  # statuses of an answer to a range that is of another version of the file
+PASSING = CHANGED | {
+    408,
+    425,
+    429,
+    500,
+    502,
+    503,
+    504,
+}  # statuses that the next attempt may not meet
 
-Progress = Callable[[str, int, int | None], None]  # file, bytes received, bytes in all where the server states them
+Progress = Callable[
+    [str, int, int | None], None
+]  # file, bytes received, bytes in all where the server states them
 
 
 class ResumingDownloader:
@@ -30,10 +42,16 @@ class ResumingDownloader:
     """
 
     def __init__(self, part: Path, progress: Progress | None = None) -> None:
-        self.part, self.version, self.progress = part, part.with_name(f"{part.name}.version"), progress
+        self.part, self.version, self.progress = (
+            part,
+            part.with_name(f"{part.name}.version"),
+            progress,
+        )
         self.resumed_at = 0
 
-    def __call__(self, url: str, output_file: str, pooch: Any = None, check_only: bool = False) -> None:
+    def __call__(
+        self, url: str, output_file: str, pooch: Any = None, check_only: bool = False
+    ) -> None:
         """Download ``url`` into ``output_file``.
 
         Raises `MissingError`: the server refuses, or sends a web page. Raises `requests.RequestException`: it is out of reach; what has
@@ -48,7 +66,11 @@ class ResumingDownloader:
                 break
             except exceptions.SSLError:
                 raise
-            except (exceptions.ConnectionError, exceptions.Timeout, exceptions.ChunkedEncodingError):
+            except (
+                exceptions.ConnectionError,
+                exceptions.Timeout,
+                exceptions.ChunkedEncodingError,
+            ):
                 failures, most = (failures + 1, most) if self._size() <= most else (1, self._size())
                 if failures == ATTEMPTS:
                     raise
@@ -59,9 +81,16 @@ class ResumingDownloader:
     def _attempt(self, url: str) -> None:
         import requests
 
-        known, _, validator = self.version.read_text(encoding="utf-8").partition("\n") if self.version.is_file() else ("", "", "")
+        known, _, validator = (
+            self.version.read_text(encoding="utf-8").partition("\n")
+            if self.version.is_file()
+            else ("", "", "")
+        )
         have = self._size() if known == url and validator else 0
-        headers = {"Accept-Encoding": "identity", "User-Agent": f"vehest/{__version__}"}  # offsets are those of the file itself
+        headers = {
+            "Accept-Encoding": "identity",
+            "User-Agent": f"vehest/{__version__}",
+        }  # offsets are those of the file itself
         headers |= {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUTS) as response:
             status, about = response.status_code, response.headers
@@ -72,20 +101,32 @@ class ResumingDownloader:
             if status in PASSING and not resumed:
                 raise requests.ConnectionError(f"the server answers {status} {response.reason}")
             if status not in (200, 206):
-                raise MissingError(f"cannot fetch {url}: the server answers {status} {response.reason}; is the address right?")
+                raise MissingError(
+                    f"cannot fetch {url}: the server answers {status} {response.reason}; is the address right?"
+                )
             if "html" in about.get("Content-Type", ""):
-                raise MissingError(f"{url} is a web page, not a file; put the file into the data set's folder by hand")
+                raise MissingError(
+                    f"{url} is a web page, not a file; put the file into the data set's folder by hand"
+                )
             length = about.get("Content-Length", "")
             if not length.isdecimal() and not response.raw.chunked:
-                raise MissingError(f"cannot fetch {url}: the server does not state its length, so that a break would not show")
+                raise MissingError(
+                    f"cannot fetch {url}: the server does not state its length, so that a break would not show"
+                )
             self.resumed_at = have = have if resumed else 0
-            self.version.write_text(f"{url}\n{validator if resumed else _validator(about)}", encoding="utf-8")
+            self.version.write_text(
+                f"{url}\n{validator if resumed else _validator(about)}", encoding="utf-8"
+            )
             with open(self.part, "ab" if resumed else "wb") as stream:
                 for chunk in response.iter_content(CHUNK):  # a short answer is a ConnectionError
                     stream.write(chunk)
                     stream.flush()  # what has arrived survives a kill
                     if self.progress is not None:
-                        self.progress(self.part.stem, stream.tell(), have + int(length) if length.isdecimal() else None)
+                        self.progress(
+                            self.part.stem,
+                            stream.tell(),
+                            have + int(length) if length.isdecimal() else None,
+                        )
 
     def _size(self) -> int:
         return self.part.stat().st_size if self.part.is_file() else 0
@@ -94,4 +135,10 @@ class ResumingDownloader:
 def _validator(headers: Mapping[str, str]) -> str:
     """ETag of a file, unless it is a weak one, else its date; empty where offsets are not those of the file itself."""
     etag = headers.get("ETag", "")
-    return "" if "Content-Encoding" in headers else etag if etag.startswith('"') else headers.get("Last-Modified", "")
+    return (
+        ""
+        if "Content-Encoding" in headers
+        else etag
+        if etag.startswith('"')
+        else headers.get("Last-Modified", "")
+    )

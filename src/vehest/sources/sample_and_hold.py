@@ -21,8 +21,12 @@ class SampleAndHold:
     """Channels whose values stand in every row, though they are new in few: where ``updated`` changes, or else any of their columns."""
 
     channels: Annotated[tuple[str, ...], "a list of channels"]
-    updated: str | int | None = None  # column that changes with every new sample, such as a time stamp of the sensors' own
-    delay: float | dict[str, float] = 0.0  # how much later than it was taken a sample first stands in a row [s], of all channels or some
+    updated: str | int | None = (
+        None  # column that changes with every new sample, such as a time stamp of the sensors' own
+    )
+    delay: float | dict[str, float] = (
+        0.0  # how much later than it was taken a sample first stands in a row [s], of all channels or some
+    )
 
     @property
     def delays(self) -> dict[str, float]:
@@ -36,17 +40,29 @@ class SampleAndHold:
         return {"channels": list(self.channels), "rate_hz": round(rate_hz, 3), "delay": self.delays}
 
     def interpolated(
-        self, columns: Mapping[str, Column], values: Mapping[str, FloatArray], clock: Clock, where: str
+        self,
+        columns: Mapping[str, Column],
+        values: Mapping[str, FloatArray],
+        clock: Clock,
+        where: str,
     ) -> tuple[dict[str, FloatArray], slice, float]:
         """Held channels on every tick of a recording's clock, along straight lines, which look ahead by up to one interval.
 
         NaN outside their samples. With them the ticks between two samples of every channel, and the rate of the samples [Hz]. ``columns``
         are those of the held channels, ``values`` a table's, (T,). Raises `DataError`: there are no such samples.
         """
-        markers = {column.column for column in columns.values()} if self.updated is None else {str(self.updated)}
-        rows = np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1  # the first row's sample may be older
+        markers = (
+            {column.column for column in columns.values()}
+            if self.updated is None
+            else {str(self.updated)}
+        )
+        rows = (
+            np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1
+        )  # the first row's sample may be older
         if len(rows) < 2:
-            raise DataError(f"{where}: the held channels change in {len(rows)} rows; was their sensor connected? leave the file out")
+            raise DataError(
+                f"{where}: the held channels change in {len(rows)} rows; was their sensor connected? leave the file out"
+            )
         ticks = clock.ticks()
         times = (ticks if clock.stamps is None else clock.stamps)[rows]
         found = {}
@@ -54,21 +70,37 @@ class SampleAndHold:
             samples, taken = column.to_si(values[column.column], channel(name).unit)[rows], times
             if self.updated is None:
                 samples, taken = _with_repeats(samples, times)
-            found[name] = np.interp(ticks, taken - self.delays[name], samples, left=np.nan, right=np.nan)
-        begin, end = (times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1))
+            found[name] = np.interp(
+                ticks, taken - self.delays[name], samples, left=np.nan, right=np.nan
+            )
+        begin, end = (
+            times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1)
+        )
         inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
         if not len(inside):
-            raise DataError(f"{where}: no row lies between two samples of every held channel; are their delays in seconds?")
-        return found, slice(int(inside[0]), int(inside[-1]) + 1), (len(rows) - 1) / float(times[-1] - times[0])
+            raise DataError(
+                f"{where}: no row lies between two samples of every held channel; are their delays in seconds?"
+            )
+        return (
+            found,
+            slice(int(inside[0]), int(inside[-1]) + 1),
+            (len(rows) - 1) / float(times[-1] - times[0]),
+        )
 
 
 def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndHold:
     """A data set's declaration of held channels; raises `ConfigurationError` for an undeclared channel, or another mistake."""
     held = validated(SampleAndHold, entry, where, error=ConfigurationError)
     if unknown := [name for name in held.channels if name not in known]:
-        raise ConfigurationError(f"{where} names '{unknown[0]}', which is not one of the data set's channels")
-    if unknown := sorted(set(held.delay if isinstance(held.delay, dict) else ()) - set(held.channels)):
-        raise ConfigurationError(f"{where}: delay names '{unknown[0]}', which is not one of its channels")
+        raise ConfigurationError(
+            f"{where} names '{unknown[0]}', which is not one of the data set's channels"
+        )
+    if unknown := sorted(
+        set(held.delay if isinstance(held.delay, dict) else ()) - set(held.channels)
+    ):
+        raise ConfigurationError(
+            f"{where}: delay names '{unknown[0]}', which is not one of its channels"
+        )
     return held
 
 
@@ -80,4 +112,6 @@ def _with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, F
     intervals = np.diff(times)
     typical = float(np.median(intervals))
     late = np.flatnonzero(intervals > 1.5 * typical)
-    return np.insert(samples, late + 1, samples[late]), np.insert(times, late + 1, times[late + 1] - typical)
+    return np.insert(samples, late + 1, samples[late]), np.insert(
+        times, late + 1, times[late + 1] - typical
+    )

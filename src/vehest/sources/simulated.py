@@ -22,7 +22,9 @@ from vehest.simulation.plant.wear import Stint
 from vehest.sources.base import Source
 
 Whole = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
-SurfaceFile = Annotated[str | dict[str, Any], "one of dry, wet, patchy, or a mapping such as {friction: 0.6}"]
+SurfaceFile = Annotated[
+    str | dict[str, Any], "one of dry, wet, patchy, or a mapping such as {friction: 0.6}"
+]
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,16 @@ class Drive:
 
     id: str | int
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
-    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None  # called ID_001, ID_002 and so on
+    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = (
+        None  # called ID_001, ID_002 and so on
+    )
     seed: Whole | None = None  # None: one that follows from the data set's and the drive's name
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None
     stability_control: bool | None = None
-    sensors: Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None = None
+    sensors: (
+        Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None
+    ) = None
     payload: Payload | None = None
     tyres: Annotated[Stint, "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
 
@@ -106,13 +112,23 @@ class SimulatedSource(Source):
     def read_raw(self, recording_id: str) -> Recording:
         """Simulate one drive."""
         if recording_id not in self.drives:
-            raise MissingError(f"{self.where} has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)")
+            raise MissingError(
+                f"{self.where} has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)"
+            )
         return self._simulation(recording_id, self.variations)()
 
     def seed_of(self, drive_id: str) -> int:
         """Seed of a drive: its own, or one that follows from the data set's and the drive's name, whatever other drives there are."""
         own = self.drives[drive_id].seed
-        return int(np.random.SeedSequence([self.options.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0]) if own is None else own
+        return (
+            int(
+                np.random.SeedSequence(
+                    [self.options.seed, zlib.crc32(drive_id.encode())]
+                ).generate_state(1)[0]
+            )
+            if own is None
+            else own
+        )
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
         from vehest.simulation.driving.manoeuvres import MANOEUVRES, manoeuvre_from_config
@@ -121,13 +137,27 @@ class SimulatedSource(Source):
         from vehest.simulation.sensors.config import sensor_levels_from_config
 
         drive, seed = self.drives[drive_id], self.seed_of(drive_id)
-        name = next(iter(self.vehicles)) if drive.vehicle is None and len(self.vehicles) == 1 else str(drive.vehicle)
+        name = (
+            next(iter(self.vehicles))
+            if drive.vehicle is None and len(self.vehicles) == 1
+            else str(drive.vehicle)
+        )
         if name not in self.vehicles:
-            raise ConfigurationError(f"drive '{drive.id}': vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
+            raise ConfigurationError(
+                f"drive '{drive.id}': vehicle '{name}' is not one of: {', '.join(self.vehicles)}"
+            )
         vehicle = self.vehicles[name]
-        stability_control = self.options.stability_control if drive.stability_control is None else drive.stability_control
-        sensors = self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
-        manoeuvres: Mapping[str, Any] = PLANAR_MANOEUVRES if vehicle.get("plant") == PLANAR else MANOEUVRES
+        stability_control = (
+            self.options.stability_control
+            if drive.stability_control is None
+            else drive.stability_control
+        )
+        sensors = (
+            self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
+        )
+        manoeuvres: Mapping[str, Any] = (
+            PLANAR_MANOEUVRES if vehicle.get("plant") == PLANAR else MANOEUVRES
+        )
         return partial(
             _simulator_of(vehicle, variations, seed, drive, stability_control),
             id=drive_id,
@@ -135,16 +165,24 @@ class SimulatedSource(Source):
             seed=seed,
             rate_hz=self.options.rate_hz,
             sensors=self.sensor_variation.applied(sensors, seed),
-            surface=surface_from_config(self.options.surface if drive.surface is None else drive.surface),
+            surface=surface_from_config(
+                self.options.surface if drive.surface is None else drive.surface
+            ),
         )
 
     def _vehicles(self) -> dict[str, Mapping[str, Any]]:
         one, several = self.dataset.get("vehicle"), self.options.vehicles
         if isinstance(one, Mapping) and not several:
             return {"": one}
-        if one is None and several and all(isinstance(entry, Mapping) for entry in several.values()):
+        if (
+            one is None
+            and several
+            and all(isinstance(entry, Mapping) for entry in several.values())
+        ):
             return several
-        raise ConfigurationError(f"{self.where}: a simulated data set needs a vehicle from conf/vehicle, or vehicles, a mapping of several")
+        raise ConfigurationError(
+            f"{self.where}: a simulated data set needs a vehicle from conf/vehicle, or vehicles, a mapping of several"
+        )
 
     def _drives(self) -> dict[str, Drive]:
         drives: dict[str, Drive] = {}
@@ -154,18 +192,35 @@ class SimulatedSource(Source):
                 raise ConfigurationError(f"{where}: an id is a name of 1 to 100 characters")
             check_name(name, f"{where}: id")
             if entry.seed is not None and entry.count is not None:
-                raise ConfigurationError(f"{where}: give seed for a single drive, or count, not both")
+                raise ConfigurationError(
+                    f"{where}: give seed for a single drive, or count, not both"
+                )
             n_drives = len(drives) + (entry.count or 0)
-            check_limit("jobs", n_drives, f"{where}: the data set would have {n_drives} drives", ConfigurationError)
-            own = [name] if entry.count is None else [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
+            check_limit(
+                "jobs",
+                n_drives,
+                f"{where}: the data set would have {n_drives} drives",
+                ConfigurationError,
+            )
+            own = (
+                [name]
+                if entry.count is None
+                else [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
+            )
             if doubled := [drive_id for drive_id in own if drive_id in drives]:
-                raise ConfigurationError(f"{self.where}: two drives are called '{doubled[0]}', names must differ")
+                raise ConfigurationError(
+                    f"{self.where}: two drives are called '{doubled[0]}', names must differ"
+                )
             drives |= dict.fromkeys(own, entry)
         return drives
 
 
 def _simulator_of(
-    vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int, drive: Drive | None = None, stability_control: bool = False
+    vehicle: Mapping[str, Any],
+    variations: Sequence[Any],
+    seed: int,
+    drive: Drive | None = None,
+    stability_control: bool = False,
 ) -> partial[Recording]:
     """The simulator of a vehicle, varied by the seed of a drive, with the drive's payload and tyres that age."""
     from vehest.simulation.drive import simulate_drive
@@ -176,10 +231,17 @@ def _simulator_of(
     payload, tyres = (drive.payload, drive.tyres) if drive else (None, None)
     if vehicle.get("plant") == PLANAR:
         if payload or tyres:
-            raise ConfigurationError(f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out")
+            raise ConfigurationError(
+                f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out"
+            )
         if stability_control:
-            raise ConfigurationError(f"vehicle '{vehicle.get('name')}' has no stability control; leave stability_control out")
-        return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
+            raise ConfigurationError(
+                f"vehicle '{vehicle.get('name')}' has no stability control; leave stability_control out"
+            )
+        return partial(
+            simulate_planar_drive,
+            car=varied_planar(planar_car_from_configuration(vehicle), variations, seed),
+        )
     own = varied(vehicle_from_configuration(vehicle), variations, seed)
     if payload:
         own = loaded(own, payload.mass, payload.forward, payload.up)

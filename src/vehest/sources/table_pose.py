@@ -25,23 +25,34 @@ class TablePose(PoseOptions):
     x: Column  # column of the position and its unit, z up
     y: Column  # the same
     yaw: Column  # column of the yaw angle and its unit
-    yaw_offset: float = 0.0  # from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
+    yaw_offset: float = (
+        0.0  # from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
+    )
 
     @property
     def columns(self) -> dict[str, Column]:
         """Columns of ``x``, ``y`` and ``yaw``."""
         return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
-    def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
+    def made_of(
+        self, values: Mapping[str, FloatArray], clock: Clock, where: str
+    ) -> dict[str, FloatArray]:
         """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window; raises `DataError`."""
-        poses = {name: column.to_si(values[column.column], UNITS[name]) for name, column in self.columns.items()}
+        poses = {
+            name: column.to_si(values[column.column], UNITS[name])
+            for name, column in self.columns.items()
+        }
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
                 what = f"pose column '{self.columns[name].column}' holds no number in {len(odd)} rows of the run, first in row {odd[0] + 1}"
                 raise DataError(f"{where}: {what}; leave them out by drop_rows")
-        x, y, yaw = (clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"])))
-        return self.references(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where)
+        x, y, yaw = (
+            clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"]))
+        )
+        return self.references(
+            np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where
+        )
 
 
 def table_pose_from_config(entry: Any, where: str) -> TablePose:

@@ -16,16 +16,23 @@ from vehest.data.errors import ConfigurationError, DataError
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
 
 
-def dropped_rows_from_config(entries: Mapping[str, Iterable[int | str]], where: str) -> dict[str, list[slice]]:
+def dropped_rows_from_config(
+    entries: Mapping[str, Iterable[int | str]], where: str
+) -> dict[str, list[slice]]:
     """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or ranges; raises `ConfigurationError`."""
-    return {str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows] for stem, rows in entries.items()}
+    return {
+        str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows]
+        for stem, rows in entries.items()
+    }
 
 
 def _rows(row: int | str, where: str) -> slice:
     found = RANGE.fullmatch(str(row).strip())
     first, last = found.groups(default=found[1]) if found else ("", "")
     if not first or (last and int(last) < int(first)):
-        raise ConfigurationError(f'{where}: \'{row}\' is neither a data row, counted from 1, nor a range such as "700-750" or "700-"')
+        raise ConfigurationError(
+            f'{where}: \'{row}\' is neither a data row, counted from 1, nor a range such as "700-750" or "700-"'
+        )
     return slice(int(first) - 1, int(last) if last else None)
 
 
@@ -35,7 +42,9 @@ def kept_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.b
     for rows in dropped:
         last = rows.stop or rows.start + 1
         if last > n_rows:
-            raise DataError(f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another version of the file?")
+            raise DataError(
+                f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another version of the file?"
+            )
         kept[rows] = False
     return kept
 
@@ -50,12 +59,16 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
     for rows in stretches(np.diff(numbers) != 0, len(numbers)):
         run = int(numbers[rows.start])
         if run in runs:
-            raise DataError(f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is uninterrupted, sort the rows")
+            raise DataError(
+                f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is uninterrupted, sort the rows"
+            )
         runs[run] = rows
     return runs
 
 
-def timed_runs(times: FloatArray, max_gap: float | None, *, restarts: bool) -> dict[int | None, slice]:
+def timed_runs(
+    times: FloatArray, max_gap: float | None, *, restarts: bool
+) -> dict[int | None, slice]:
     """Rows of each run, which begins where times [s], (N,), go backwards, if ``restarts``, or leave a gap longer than ``max_gap`` [s].
 
     Pieces between gaps that last less than ``max_gap`` are left out.
@@ -65,7 +78,11 @@ def timed_runs(times: FloatArray, max_gap: float | None, *, restarts: bool) -> d
     if max_gap is None:
         return {**dict(enumerate(stretches(begins, len(times))))}
     runs = stretches(begins | (steps > max_gap), len(times))
-    return {**dict(enumerate(rows for rows in runs if times[rows.stop - 1] - times[rows.start] >= max_gap))}
+    return {
+        **dict(
+            enumerate(rows for rows in runs if times[rows.stop - 1] - times[rows.start] >= max_gap)
+        )
+    }
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:

@@ -60,7 +60,9 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
     else:
         decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
         try:
-            lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))[layout.skip_rows :]
+            lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))[
+                layout.skip_rows :
+            ]
             names = next(csv.reader(filter(None, lines), delimiter=layout.delimiter), [])
         except (ValueError, csv.Error) as error:
             raise _unreadable(file, error) from None
@@ -82,12 +84,18 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
     for name in wanted:
         count = names.count(name)
         if count > 1:
-            raise DataError(f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one")
+            raise DataError(
+                f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one"
+            )
         if not count:
-            raise DataError(f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset")
+            raise DataError(
+                f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset"
+            )
 
 
-def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None) -> dict[str, FloatArray]:
+def read_columns(
+    file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None
+) -> dict[str, FloatArray]:
     """Columns of numbers, shape (T,) each, NaN where a sample is missing; ``text`` is that of the table where it is not the file's own.
 
     Raises `MissingError`: there is no such file. Raises `DataError`: it cannot be read, lacks a column, or holds text where numbers belong.
@@ -110,10 +118,17 @@ def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLay
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
     del table  # so that a column is dropped as soon as it is converted
-    return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else numbers_of(columns.pop(name)) for name in wanted}
+    return {
+        name: _seconds(file, name, columns.pop(name))
+        if name == layout.clock
+        else numbers_of(columns.pop(name))
+        for name in wanted
+    }
 
 
-def column_parts(file: Path, wanted: Sequence[str], layout: TextLayout, lengths: Iterable[int]) -> Iterator[dict[str, FloatArray]]:
+def column_parts(
+    file: Path, wanted: Sequence[str], layout: TextLayout, lengths: Iterable[int]
+) -> Iterator[dict[str, FloatArray]]:
     """Columns as `read_columns` gives them, so many rows at a time, at most as many as there are; raises as it does."""
     require_columns(file, column_names(file, layout), wanted)
     try:
@@ -135,19 +150,31 @@ def column_parts(file: Path, wanted: Sequence[str], layout: TextLayout, lengths:
                         batch, at = next(batches, None), 0
                 for column in values.values():
                     column.flags.writeable = False  # so that a recording shares it
-                yield values if done == length else {name: column[:done] for name, column in values.items()}
+                yield (
+                    values
+                    if done == length
+                    else {name: column[:done] for name, column in values.items()}
+                )
     except DAMAGE:
         read_columns(file, wanted, layout)  # whose errors state the row
         raise
 
 
-def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:
+def parse_table(
+    opened: Callable[[], pa.NativeFile],
+    layout: TextLayout,
+    convert: pc.ConvertOptions,
+    *,
+    threads: bool = True,
+) -> pa.Table:
     """Table of text as pyarrow converts it; raises what pyarrow raises."""
     with opened() as stream:
         return pc.read_csv(stream, **_options(layout, convert, threads=threads))
 
 
-def _options(layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> dict[str, Any]:
+def _options(
+    layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True
+) -> dict[str, Any]:
     read = pc.ReadOptions(
         use_threads=threads,
         block_size=BLOCK,
@@ -156,12 +183,18 @@ def _options(layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = 
         skip_rows_after_names=layout.rows_below_names,
         column_names=None if layout.names is None else list(layout.names),
     )
-    return {"read_options": read, "parse_options": pc.ParseOptions(delimiter=layout.delimiter), "convert_options": convert}
+    return {
+        "read_options": read,
+        "parse_options": pc.ParseOptions(delimiter=layout.delimiter),
+        "convert_options": convert,
+    }
 
 
 def _conversion(wanted: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
     return pc.ConvertOptions(
-        column_types={name: pa.string() if name == layout.clock else pa.float64() for name in wanted},
+        column_types={
+            name: pa.string() if name == layout.clock else pa.float64() for name in wanted
+        },
         include_columns=list(wanted),
         decimal_point=layout.decimal,
         null_values=[*pc.ConvertOptions().null_values, *layout.missing],
@@ -188,22 +221,37 @@ def table_stream(file: Path) -> pa.NativeFile:
 
 def listed(names: Sequence[str]) -> str:
     """Names for a message."""
-    return ", ".join(printable(name[:60]) for name in names[:12]) + (", …" if len(names) > 12 else "")
+    return ", ".join(printable(name[:60]) for name in names[:12]) + (
+        ", …" if len(names) > 12 else ""
+    )
 
 
 def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
     seconds = seconds_of_text(cells)
     if seconds is None:
-        raise DataError(f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or 2024-05-03T10:59:30.25")
+        raise DataError(
+            f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or 2024-05-03T10:59:30.25"
+        )
     return seconds
 
 
 def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) -> DataError:
     """The error of pyarrow in one line; with a layout, a cell of text by its column's name."""
-    cell = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", str(error), re.DOTALL)
+    cell = re.search(
+        r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", str(error), re.DOTALL
+    )
     if cell is not None and layout is not None:
-        name, above = column_names(file, layout)[int(cell[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
+        name, above = (
+            column_names(file, layout)[int(cell[1])],
+            layout.skip_rows + layout.rows_below_names + (layout.names is None),
+        )
         where = f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row {int(cell[2]) - above}"
         return DataError(f"'{file}': {where}; numbers are needed")
-    problem = f"a line is longer than {BLOCK} bytes" if "straddl" in str(error) else printable(first_line(error))
-    return DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?")
+    problem = (
+        f"a line is longer than {BLOCK} bytes"
+        if "straddl" in str(error)
+        else printable(first_line(error))
+    )
+    return DataError(
+        f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?"
+    )

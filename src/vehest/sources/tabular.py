@@ -19,12 +19,27 @@ from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
 from vehest.sources.clocks import Clock, ClockPolicy, even_clock, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName, Positive, column_from_config, columns_from_config
+from vehest.sources.columns import (
+    ChannelMap,
+    ChannelNames,
+    Column,
+    ColumnName,
+    Positive,
+    column_from_config,
+    columns_from_config,
+)
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, timed_runs
-from vehest.sources.tables import TextLayout, column_names, column_parts, is_parquet, listed, read_columns
+from vehest.sources.tables import (
+    TextLayout,
+    column_names,
+    column_parts,
+    is_parquet,
+    listed,
+    read_columns,
+)
 
 LARGE = 1 << 25  # bytes of a table of text from which on it is read in parts
 
@@ -47,7 +62,12 @@ class TabularOptions:
     path: str | None = None
     files: str = "*.csv"
     exclude: Annotated[tuple[str, ...], "a list of patterns over the files' stems"] | None = None
-    drop_rows: Annotated[dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"] | None = None
+    drop_rows: (
+        Annotated[
+            dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"
+        ]
+        | None
+    ) = None
     runs: ColumnName | None = None
     time_restarts: bool = False
     max_gap: Positive | None = None
@@ -73,45 +93,88 @@ class TabularSource(FileSource):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         options, where = self.options, self.where
-        self.columns = None if options.channels is None else columns_from_config(options.channels, self.name)
-        self.time = None if options.time is None else column_from_config(options.time, f"{where}: time", "s")
+        self.columns = (
+            None if options.channels is None else columns_from_config(options.channels, self.name)
+        )
+        self.time = (
+            None
+            if options.time is None
+            else column_from_config(options.time, f"{where}: time", "s")
+        )
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
         self._cuts = options.time_restarts or options.max_gap is not None
         if self._cuts and (options.runs is not None or self.time is None):
-            raise ConfigurationError(f"{where}: time_restarts and max_gap need a time column, and no column that counts runs")
+            raise ConfigurationError(
+                f"{where}: time_restarts and max_gap need a time column, and no column that counts runs"
+            )
         self.dropped = dropped_rows_from_config(options.drop_rows or {}, where)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
-        self.held = None if options.held is None else held_from_config(options.held, list(self.columns or ()), f"{where}: held")
-        self.pose = None if options.pose is None else table_pose_from_config(options.pose, f"{where}: pose")
+        self.held = (
+            None
+            if options.held is None
+            else held_from_config(options.held, list(self.columns or ()), f"{where}: held")
+        )
+        self.pose = (
+            None if options.pose is None else table_pose_from_config(options.pose, f"{where}: pose")
+        )
         doubled = sorted(set(self.columns or ()) & set(self.pose.channels if self.pose else ()))
         if doubled:
-            raise ConfigurationError(f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out")
+            raise ConfigurationError(
+                f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out"
+            )
         self._require_pattern()
-        self.layout = TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
+        self.layout = TextLayout(
+            options.delimiter, options.decimal, options.encoding, options.skip_rows
+        )
 
     def file_parts(self, file: Path) -> Iterator[Recording]:
         """`read_file` in parts, of a large table whose clock is even and whose rows can be read one after another."""
         options, time = self.options, self.time
-        apart = not (self._cuts or options.runs or self.held or self.pose or self.dropped or self.transforms or self.reference_point)
+        apart = not (
+            self._cuts
+            or options.runs
+            or self.held
+            or self.pose
+            or self.dropped
+            or self.transforms
+            or self.reference_point
+        )
         require_files([file], self.name)
         small = not is_parquet(file) and file.stat().st_size < LARGE
-        if small or not apart or time is None or options.clock != "strict" or is_stored_recording(file):
+        if (
+            small
+            or not apart
+            or time is None
+            or options.clock != "strict"
+            or is_stored_recording(file)
+        ):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
         wanted = list(dict.fromkeys(column.column for column in columns.values()))
         try:
             blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
-            clock = even_clock(time.to_si(block[time.column], "s") for block in takewhile(lambda block: len(block[time.column]), blocks))
+            clock = even_clock(
+                time.to_si(block[time.column], "s")
+                for block in takewhile(lambda block: len(block[time.column]), blocks)
+            )
             if clock is None:
                 yield self.read_file(file)
                 return
             slices = part_slices(clock.n_samples, clock.rate_hz)
-            parts = column_parts(file, wanted, self.layout, (rows.stop - rows.start for rows in slices))
+            parts = column_parts(
+                file, wanted, self.layout, (rows.stop - rows.start for rows in slices)
+            )
             for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
-                own = replace(clock, start_time=clock.start_time + rows.start / clock.rate_hz, n_samples=rows.stop - rows.start)
-                yield self._prepared(self._made_of(file, None, columns, values, own, [number, len(slices)]))
+                own = replace(
+                    clock,
+                    start_time=clock.start_time + rows.start / clock.rate_hz,
+                    n_samples=rows.stop - rows.start,
+                )
+                yield self._prepared(
+                    self._made_of(file, None, columns, values, own, [number, len(slices)])
+                )
         except DataError:
             self.read_file(file)  # whose errors are of all its rows
             raise
@@ -121,20 +184,31 @@ class TabularSource(FileSource):
         if is_stored_recording(file):
             return read_recording(file)
         columns = self._columns_of(file)
-        wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
+        wanted = [
+            column.column
+            for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))
+        ]
         extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
-        values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
+        values = self._values(
+            file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)]))
+        )
         rows = self._runs_of(file)[run]
-        return self._made_of(file, run, columns, {name: samples[rows] for name, samples in values.items()})
+        return self._made_of(
+            file, run, columns, {name: samples[rows] for name, samples in values.items()}
+        )
 
     def _columns_of(self, file: Path) -> Mapping[str, Column]:
         """Column of each channel: those of the data set, else those that are named like channels."""
         names, columns = column_names(file, self.layout), self.columns
         if columns is None:
-            columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
+            columns = {
+                name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS
+            }
         if not columns:
             what = f"has no column that is named like a channel (it has {listed(names)})"
-            raise DataError(f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME")
+            raise DataError(
+                f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME"
+            )
         return columns
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
@@ -159,15 +233,23 @@ class TabularSource(FileSource):
         n_rows = len(next(iter(values.values())))
         where = f"'{file}'" if run is None else f"'{file}', run {run}"
         if clock is None and self.time is not None:
-            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock)
+            clock = uniform_clock(
+                self.time.to_si(values[self.time.column], "s"), where, self.options.clock
+            )
         clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         held = () if self.held is None else self.held.channels
         channels = {
-            name: clock.align(column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy)
+            name: clock.align(
+                column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy
+            )
             for name, column in columns.items()
             if name not in held
         }
-        provenance: dict[str, Any] = {"file": file.name} | ({} if run is None else {"run": run}) | ({PART: part} if part[1] > 1 else {})
+        provenance: dict[str, Any] = (
+            {"file": file.name}
+            | ({} if run is None else {"run": run})
+            | ({PART: part} if part[1] > 1 else {})
+        )
         if file.stem in self.dropped:
             provenance["dropped_rows"] = list(self.options.drop_rows[file.stem])
         if self.pose is not None:
@@ -176,7 +258,12 @@ class TabularSource(FileSource):
             own = {name: column for name, column in columns.items() if name in held}
             lines, inside, rate = self.held.interpolated(own, values, clock, where)
             channels = {name: samples[inside] for name, samples in {**channels, **lines}.items()}
-            clock = replace(clock, start_time=float(clock.ticks()[inside.start]), n_samples=inside.stop - inside.start, stamps=None)
+            clock = replace(
+                clock,
+                start_time=float(clock.ticks()[inside.start]),
+                n_samples=inside.stop - inside.start,
+                stamps=None,
+            )
             provenance["held"] = self.held.description(rate)
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
@@ -187,8 +274,14 @@ class TabularSource(FileSource):
         for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
             for name in named:
                 if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):
-                    raise MissingError(f"{self.where}: {option} names '{name}', which no file is called")
-        kept = [file for file in found if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)]
+                    raise MissingError(
+                        f"{self.where}: {option} names '{name}', which no file is called"
+                    )
+        kept = [
+            file
+            for file in found
+            if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
+        ]
         if not kept:
             raise MissingError(f"{self.where}: exclude leaves none of its files")
         return kept
@@ -201,7 +294,11 @@ class TabularSource(FileSource):
         require_files([file], self.name)
         numbers = self._values(file, [counter])[counter]
         if self.time is not None and self._cuts:
-            return timed_runs(self.time.to_si(numbers, "s"), self.options.max_gap, restarts=self.options.time_restarts)
+            return timed_runs(
+                self.time.to_si(numbers, "s"),
+                self.options.max_gap,
+                restarts=self.options.time_restarts,
+            )
         return counted_runs(numbers, counter, file)
 
 
@@ -213,7 +310,11 @@ def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list
     table = file or next(Path(entry) for entry in source.inputs().values())
     if is_stored_recording(table):
         return []
-    channels = CHANNELS if source.columns is None else [column.column for column in source.columns.values()]
+    channels = (
+        CHANNELS
+        if source.columns is None
+        else [column.column for column in source.columns.values()]
+    )
     used = {"", source.options.runs, source.time and source.time.column, *channels}
     return [name for name in column_names(table, source.layout) if name not in used]
 

@@ -53,7 +53,10 @@ class TextLogSource(TabularSource):
             times = self.time.to_si(values[clock], "s")
         else:
             times = np.arange(len(next(iter(values.values())))) / (self.options.rate_hz or 1.0)
-        return {name: samples if name == clock else bridged(samples, times, longest) for name, samples in values.items()}
+        return {
+            name: samples if name == clock else bridged(samples, times, longest)
+            for name, samples in values.items()
+        }
 
 
 def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
@@ -70,10 +73,19 @@ def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArra
     longest *= 1.0 + 1e-9
     steps = np.diff(times, prepend=times[0])
     run = np.cumsum((steps < 0.0) | (steps > longest))
-    before, after = np.where(run[before] == run, before, after), np.where(run[after] == run, after, before)
-    near = (run[before] == run) & (np.abs(times[after] - times[before]) <= longest) & (np.abs(times - times[before]) <= longest)
+    before, after = (
+        np.where(run[before] == run, before, after),
+        np.where(run[after] == run, after, before),
+    )
+    near = (
+        (run[before] == run)
+        & (np.abs(times[after] - times[before]) <= longest)
+        & (np.abs(times - times[before]) <= longest)
+    )
     slope = (samples[after] - samples[before]) / np.maximum(after - before, 1)
-    return np.where(np.isfinite(samples) | near, slope * (places - before) + samples[before], np.nan)
+    return np.where(
+        np.isfinite(samples) | near, slope * (places - before) + samples[before], np.nan
+    )
 
 
 SOURCE = TextLogSource

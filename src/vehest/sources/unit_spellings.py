@@ -15,13 +15,29 @@ _SPELLINGS = {
     **dict.fromkeys(("mph", "mi/h", "mile/h", "miles/h"), "mph"),
     **dict.fromkeys(("kt", "kts", "knot", "knots", "knoten", "noeuds", "nœuds"), "knots"),
     **dict.fromkeys(("ft/s", "fps"), "ft/s"),
-    **dict.fromkeys(("m/s²", "m/s^2", "m/s2", "m/s/s", "mps2", "mps^2", "meter/s^2", "meters/s^2", "ms-2", "ms^-2"), "m/s²"),
+    **dict.fromkeys(
+        (
+            "m/s²",
+            "m/s^2",
+            "m/s2",
+            "m/s/s",
+            "mps2",
+            "mps^2",
+            "meter/s^2",
+            "meters/s^2",
+            "ms-2",
+            "ms^-2",
+        ),
+        "m/s²",
+    ),
     **dict.fromkeys(("ft/s²", "ft/s^2", "ft/s2"), "ft/s²"),
     **dict.fromkeys(("g", "gs", "g's", "gn", "g0"), "g"),
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
     **dict.fromkeys(("deg", "°", "degree", "degrees"), "deg"),
     **dict.fromkeys(("rad/s", "radian/s", "radians/s", "rads-1", "rads^-1"), "rad/s"),
-    **dict.fromkeys(("deg/s", "°/s", "degree/s", "degrees/s", "degs-1", "degs^-1", "°s-1", "dps"), "deg/s"),
+    **dict.fromkeys(
+        ("deg/s", "°/s", "degree/s", "degrees/s", "degs-1", "degs^-1", "°s-1", "dps"), "deg/s"
+    ),
     **dict.fromkeys(("rpm", "1/min", "u/min", "r/min", "rev/min", "upm", "min-1", "min^-1"), "rpm"),
     **{unit: unit for unit in ("cm/s", "mm/s", "mrad", "mrad/s", "mg")},
     **{f"{unit}/s{square}": f"{unit}/s²" for unit in ("cm", "mm") for square in ("²", "^2", "2")},
@@ -37,9 +53,16 @@ _SPELLINGS = {
     **dict.fromkeys(("%", "percent"), "%"),
     **dict.fromkeys(("°c", "degc"), "°C"),
     **dict.fromkeys(("m", "meter", "metre"), "m"),
-    **dict.fromkeys(("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"),
+    **dict.fromkeys(
+        ("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"
+    ),
 }
-_CASES = {"kN": "kN", "kn": "knots", "Mpa": "MPa", "mPa": "another unit"}  # where upper and lower case differ in meaning
+_CASES = {
+    "kN": "kN",
+    "kn": "knots",
+    "Mpa": "MPa",
+    "mPa": "another unit",
+}  # where upper and lower case differ in meaning
 
 
 def plain_unit(text: str) -> str | None:
@@ -58,4 +81,6 @@ def require_unit(written: str, column: Column, si_unit: str, where: str, fix: st
             return
     except DataError:  # of another quantity
         pass
-    raise DataError(f"{where} is in '{written}' by the file and in '{column.unit}' by conf/dataset; correct the unit there, or {fix}")
+    raise DataError(
+        f"{where} is in '{written}' by the file and in '{column.unit}' by conf/dataset; correct the unit there, or {fix}"
+    )

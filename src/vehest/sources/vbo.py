@@ -31,15 +31,24 @@ from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
-UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}  # units that the format has without saying so
+UNITS = {
+    "velocity": "km/h",
+    "vert-vel": "km/h",
+    "Longacc": "g",
+    "Latacc": "g",
+}  # units that the format has without saying so
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels says nothing
 FEWEST = 100  # samples that turn
 LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
 SLIP_CHECK = "slip_offsets"
-SLIP_AT_A_POINT = re.compile(r"Slip_(COG|[FR][LR])")  # Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
-OFFSETS = re.compile(r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}")
+SLIP_AT_A_POINT = re.compile(
+    r"Slip_(COG|[FR][LR])"
+)  # Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
+OFFSETS = re.compile(
+    r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}"
+)
 
 
 @dataclass(frozen=True)
@@ -62,9 +71,15 @@ class Log:
     columns: Mapping[str, FloatArray]  # name -> values in the file's unit, (T,)
     units: Mapping[str, str]  # name -> unit as the file writes it; only of columns that have one
     seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
-    modules: Mapping[str, str]  # name -> module of the logger that it comes from; only of columns that have one
-    offsets: Mapping[str, tuple[float, float]]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
-    provenance: Mapping[str, Any]  # first line, offsets, and rows at the end that were cut off or came late
+    modules: Mapping[
+        str, str
+    ]  # name -> module of the logger that it comes from; only of columns that have one
+    offsets: Mapping[
+        str, tuple[float, float]
+    ]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
+    provenance: Mapping[
+        str, Any
+    ]  # first line, offsets, and rows at the end that were cut off or came late
 
 
 class VboSource(FileSource):
@@ -82,20 +97,35 @@ class VboSource(FileSource):
         """Rows between pauses."""
         require_files([file], self.name)
         longest = self.options.max_gap
-        return super()._runs(file) if longest is None else timed_runs(self._log(file).seconds, longest, restarts=False)
+        return (
+            super()._runs(file)
+            if longest is None
+            else timed_runs(self._log(file).seconds, longest, restarts=False)
+        )
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a log; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
-        log, rows, number = self._log(file), self._runs_of(file)[run], {} if run is None else {"run": run}
+        log, rows, number = (
+            self._log(file),
+            self._runs_of(file)[run],
+            {} if run is None else {"run": run},
+        )
         used = [column.column for column in self.columns.values()]
         require_columns(file, list(log.columns), used)
-        if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (self.dataset.get("accept") or []):
+        if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (
+            self.dataset.get("accept") or []
+        ):
             require_slip_offsets(log, f"'{file}'")
         clock, channels = uniform_clock(log.seconds[rows], f"'{file}'", self.options.clock), {}
         for name, column in self.columns.items():
-            unit, where = channel(name).unit, f"'{file}': column '{column.column}', for channel '{name}',"
+            unit, where = (
+                channel(name).unit,
+                f"'{file}': column '{column.column}', for channel '{name}',",
+            )
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
-            channels[name] = clock.align(column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy)
+            channels[name] = clock.align(
+                column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy
+            )
         provenance = {"file": file.name, **number, **log.provenance}
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
@@ -110,28 +140,47 @@ def read_log(file: Path) -> Log:
         raise DataError(f"'{file}' has no section [data]; is it a log of a VBOX?")
     lines = "\n".join(head.decode("latin-1").splitlines())
     first, *parts = re.split(r"^\[([^\]\n]+)\]\s*?$", lines, flags=re.MULTILINE)
-    sections = {title.strip().lower(): text for title, text in zip(parts[::2], parts[1::2], strict=True)}
+    sections = {
+        title.strip().lower(): text for title, text in zip(parts[::2], parts[1::2], strict=True)
+    }
     names = sections.get("column names", "").split()
     text = re.sub(rb" ?\r?\n ?", b"\n", re.sub(rb"[ \t]+", b" ", rows.strip()))
     last = text.rfind(b"\n") + 1
     cut_off = last > 0 and text.count(b" ", last) < len(names) - 1
     columns = read_columns(
-        file, list(dict.fromkeys(["time", *names])), TextLayout(delimiter=" ", names=tuple(names)), text=text[:last] if cut_off else text
+        file,
+        list(dict.fromkeys(["time", *names])),
+        TextLayout(delimiter=" ", names=tuple(names)),
+        text=text[:last] if cut_off else text,
     )
     seconds = _seconds(columns.pop("time"), file)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
         columns, seconds = {name: own[:-1] for name, own in columns.items()}, seconds[:-1]
 
-    own, modules = (_of_last_columns(names, sections.get(title, "")) for title in ("channel units", "module information"))
+    own, modules = (
+        _of_last_columns(names, sections.get(title, ""))
+        for title in ("channel units", "module information")
+    )
     found = OFFSETS.findall(sections.get("comments", ""))
-    offsets = {point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found}
+    offsets = {
+        point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found
+    }
     provenance = {
         "created": printable(" ".join(first.partition("\n")[0].split()))[:80],
-        "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in offsets.items()},
+        "slip_offsets_lateral_longitudinal_m": {
+            point: list(pair) for point, pair in offsets.items()
+        },
         "rows_dropped_at_the_end": cut_off + late,
     }
-    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, modules, offsets, provenance)
+    return Log(
+        columns,
+        {name: unit for name, unit in {**UNITS, **own}.items() if unit},
+        seconds,
+        modules,
+        offsets,
+        provenance,
+    )
 
 
 def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
@@ -139,7 +188,11 @@ def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
     lines = [line.strip() for line in section.splitlines()[1:]]
     while lines and not lines[-1]:
         lines.pop()
-    return dict(zip(names[len(names) - len(lines) :], lines, strict=True)) if len(lines) <= len(names) else {}
+    return (
+        dict(zip(names[len(names) - len(lines) :], lines, strict=True))
+        if len(lines) <= len(names)
+        else {}
+    )
 
 
 def require_slip_offsets(log: Log, where: str) -> None:
@@ -157,7 +210,9 @@ def require_slip_offsets(log: Log, where: str) -> None:
     if turns.sum() < FEWEST:
         return
     apart = abs(log.offsets["FL"][1] - log.offsets["RL"][1])
-    expected = float(np.sqrt(np.mean(np.square(np.degrees(apart * yaw_rate[turns] / speed[turns])))))
+    expected = float(
+        np.sqrt(np.mean(np.square(np.degrees(apart * yaw_rate[turns] / speed[turns]))))
+    )
     found = float(np.sqrt(np.mean(np.square(front[turns] - rear[turns]))))
     if found < LEAST_DIFFERENCE * expected:
         raise DataError(
@@ -170,10 +225,18 @@ def require_slip_offsets(log: Log, where: str) -> None:
 def _seconds(stamps: FloatArray, file: Path) -> FloatArray:
     """Clock times hhmmss.ss as seconds since midnight, going on past it."""
     milliseconds = np.rint(np.where(np.isfinite(stamps), stamps, -1.0) * 1000.0)  # hh mm ss.sss
-    hours, minutes, seconds = milliseconds // 1e7, milliseconds // 1e5 % 100.0, milliseconds % 1e5 / 1000.0
-    odd = np.flatnonzero(~((milliseconds >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)))
+    hours, minutes, seconds = (
+        milliseconds // 1e7,
+        milliseconds // 1e5 % 100.0,
+        milliseconds % 1e5 / 1000.0,
+    )
+    odd = np.flatnonzero(
+        ~((milliseconds >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0))
+    )
     if len(odd):
-        raise DataError(f"'{file}': time {stamps[odd[0]]} in data row {odd[0] + 1} is no clock time hhmmss")
+        raise DataError(
+            f"'{file}': time {stamps[odd[0]]} in data row {odd[0] + 1} is no clock time hhmmss"
+        )
     return past_midnight(3600.0 * hours + 60.0 * minutes + seconds)
 
 

@@ -20,7 +20,9 @@ from vehest.evaluation.blocks import Segments, read_segments
 from vehest.evaluation.metrics import Protocol, Scored, score_all
 
 
-def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()) -> pd.DataFrame:
+def read_frame(
+    path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()
+) -> pd.DataFrame:
     """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which ``numbers`` hold numbers; else a `DataError`."""
     text = read_text(path)
     try:
@@ -36,7 +38,19 @@ def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str
     return table
 
 
-HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
+HEAD = (
+    "estimator",
+    "variant",
+    "trained_on",
+    "dataset",
+    "kind",
+    "test_set",
+    "subset",
+    "condition",
+    "rate_hz",
+    "mode",
+    "seed",
+)
 METRIC_COLUMNS = ("study", *HEAD, "metric", "value", "unit", "low", "high")
 
 
@@ -102,7 +116,9 @@ class PartArtefacts:
     # (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split
     references: Mapping[tuple[str, str], Path]
     facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
-    failed: Mapping[str, str] = field(default_factory=dict)  # name of what is left out, since it failed or is not there -> why
+    failed: Mapping[str, str] = field(
+        default_factory=dict
+    )  # name of what is left out, since it failed or is not there -> why
 
     def reference(self, span: Span, channels: Iterable[str] | None = None) -> Recording:
         """The recording of a range at the evaluation rate, with all or some of its channels."""
@@ -115,12 +131,20 @@ class PartArtefacts:
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
         """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""
         spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
-        return score_all(lambda position: model.estimate(test_set, position), spans, self.reference, self.protocol)
+        return score_all(
+            lambda position: model.estimate(test_set, position),
+            spans,
+            self.reference,
+            self.protocol,
+        )
 
 
 def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Tables of all parts as one; ``trained_on`` is followed by the part, where it has a name."""
-    named = [table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") if name else table for name, table in tables.items()]
+    named = [
+        table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") if name else table
+        for name, table in tables.items()
+    ]
     return pd.concat(named, ignore_index=True)
 
 
@@ -159,11 +183,15 @@ class StudyArtefacts:
     title: str  # its title
     about: str  # a paragraph on what is compared or shown, from the pipeline file
     command: str  # the command that makes this report
-    titles: Mapping[str, str] = field(default_factory=dict)  # part -> title, of all there are in the pipeline file
+    titles: Mapping[str, str] = field(
+        default_factory=dict
+    )  # part -> title, of all there are in the pipeline file
     # part -> what was compared in it; a study that is not in parts has one without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
     absent: Sequence[str] = ()  # parts whose raw files were not here
-    datasets: Sequence[StoredDataset] = ()  # of a study of recordings alone, in the order of the pipeline file
+    datasets: Sequence[
+        StoredDataset
+    ] = ()  # of a study of recordings alone, in the order of the pipeline file
     absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
 
     @property

@@ -19,13 +19,29 @@ from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, ModelLink, Table, as_code, as_text
+from vehest.report.document import (
+    PATENT_NOTE,
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    ModelLink,
+    Table,
+    as_code,
+    as_text,
+)
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
-from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
+from vehest.studies.kit.standing import (
+    interval_in_words,
+    ranking_of,
+    standing_columns,
+    verdict_sentences,
+)
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
@@ -58,7 +74,8 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
     lines = lines_of(dict.fromkeys(model.name for model in artefacts.models))
     titles = {name: as_text(models[0].title) for name, models in by_name(artefacts.models).items()}
     verdicts = [
-        verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
+        verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set))
+        for test_set in artefacts.split.tests
     ]
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
     blocks.append("\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)]))
@@ -66,10 +83,24 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
     if warned:
         blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
     for test_set in artefacts.split.tests:
-        blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines, (named or {}).get(test_set))
+        blocks += _test_set(
+            artefacts,
+            board[board["test_set"] == test_set],
+            test_set,
+            lines,
+            (named or {}).get(test_set),
+        )
     first = next(iter(artefacts.split.tests))
-    traces = [block for block in blocks if isinstance(block, Figure) and block.name == f"traces_{file_of(first)}"]
-    blocks = [_bars(artefacts, board[board["test_set"] == first], first), *traces, *(block for block in blocks if block not in traces)]
+    traces = [
+        block
+        for block in blocks
+        if isinstance(block, Figure) and block.name == f"traces_{file_of(first)}"
+    ]
+    blocks = [
+        _bars(artefacts, board[board["test_set"] == first], first),
+        *traces,
+        *(block for block in blocks if block not in traces),
+    ]
     blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
@@ -97,14 +128,28 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             seed = chosen_seed(seeds, name, runs)
             own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
             shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
-            row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": models[0].title, "test_set": test_set}
+            row: dict[str, object] = {
+                "estimator": name[0],
+                "variant": name[1],
+                "title": models[0].title,
+                "test_set": test_set,
+            }
             row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
             chosen = shown.pop("rmse_sideslip")
             finite = name in ranking.order and math.isfinite(chosen)
-            row |= {"rmse_sideslip": ranking.rmse[name] if finite else math.nan, "rmse_sideslip_chosen": chosen}
+            row |= {
+                "rmse_sideslip": ranking.rmse[name] if finite else math.nan,
+                "rmse_sideslip_chosen": chosen,
+            }
             row |= {**standing_columns(ranking, name), **_spread_of(own["rmse_sideslip"])}
-            row |= {f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0] for role in (TRAINING, VALIDATION)}
-            row |= {"rmse_vy": shown["rmse_vy"], "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0]}
+            row |= {
+                f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0]
+                for role in (TRAINING, VALIDATION)
+            }
+            row |= {
+                "rmse_vy": shown["rmse_vy"],
+                "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0],
+            }
             row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
             placed.append((ranking.order.index(name) if finite else math.inf, row))
@@ -119,7 +164,13 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
     if not len(finite):
         return dict.fromkeys(_SPREAD, math.nan)
     deviation = float(np.std(finite, ddof=1)) if len(finite) > 1 else math.nan
-    return dict(zip(_SPREAD, (float(np.median(finite)), float(finite.min()), float(finite.max()), deviation), strict=True))
+    return dict(
+        zip(
+            _SPREAD,
+            (float(np.median(finite)), float(finite.min()), float(finite.max()), deviation),
+            strict=True,
+        )
+    )
 
 
 # The words
@@ -127,7 +178,10 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 
 def _where(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
-    ranges = "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}" for span in spans[:3])
+    ranges = "; ".join(
+        f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}"
+        for span in spans[:3]
+    )
     if len(spans) > 3:
         ranges = f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
     return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {ranges})"
@@ -148,13 +202,25 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
     """How many estimators, seeds and epochs stand behind the numbers."""
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
-    seeds = f"{counts[0]} seed{'s' * (counts[0] != 1)} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
+    seeds = (
+        f"{counts[0]} seed{'s' * (counts[0] != 1)} each"
+        if len(counts) == 1
+        else f"{counts[0]} to {counts[-1]} seeds each"
+    )
     words = f"Compared are {len(groups)} estimator{'s' * (len(groups) != 1)} with {seeds}, {len(artefacts.models)} fits in all"
     runs = runs_of(artefacts)
-    epochs = np.array([of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models])
+    epochs = np.array(
+        [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]
+    )
     if (epochs > 0).any():
-        fewest, most = (fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max()))
-        words += f"; training took {fewest} epochs a network" if fewest == most else f"; training took {fewest} to {most} epochs a network"
+        fewest, most = (
+            fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max())
+        )
+        words += (
+            f"; training took {fewest} epochs a network"
+            if fewest == most
+            else f"; training took {fewest} to {most} epochs a network"
+        )
     return words + "."
 
 
@@ -162,13 +228,18 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     """How one of several parts was made; its tables are called after it."""
     made, ranges = how_it_was_made(part)
     title = f"## Appendix: {as_text(part.title)}, how it was made"
-    return [made.replace("## Appendix: how it was made", title), replace(ranges, name=f"ranges_{name}")]
+    return [
+        made.replace("## Appendix: how it was made", title),
+        replace(ranges, name=f"ranges_{name}"),
+    ]
 
 
 CHOICE = "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing."
 
 
-def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) -> tuple[str, Table]:
+def how_it_was_made(
+    artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)
+) -> tuple[str, Table]:
     """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table ``ranges``."""
     protocol = artefacts.protocol
     lines = [
@@ -181,7 +252,11 @@ def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,))
         *artefacts.facts,
     ]
     split = artefacts.split
-    roles = {"training": split.train, "validation": split.validation, **{f"test: {name}": spans for name, spans in split.tests.items()}}
+    roles = {
+        "training": split.train,
+        "validation": split.validation,
+        **{f"test: {name}": spans for name, spans in split.tests.items()},
+    }
     rows = [
         {
             "role": role,
@@ -189,7 +264,9 @@ def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,))
             "kind": artefacts.kinds[span.dataset],
             "recording": printable(span.recording),
             "range": _range_in_words(artefacts, span),
-            "seconds": span.stop - span.start if math.isfinite(span.stop - span.start) else math.nan,
+            "seconds": span.stop - span.start
+            if math.isfinite(span.stop - span.start)
+            else math.nan,
         }
         for role, spans in roles.items()
         for span in spans
@@ -219,7 +296,11 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     start, stop, after = span.start - begin, span.stop - begin, " after its start" if begin else ""
     if span.start == -math.inf:
         return "all of it" if span.stop == math.inf else f"up to {stop:.7g} s{after}"
-    return f"from {start:.7g} s{after}" if span.stop == math.inf else f"{start:.7g} to {stop:.7g} s{after}"
+    return (
+        f"from {start:.7g} s{after}"
+        if span.stop == math.inf
+        else f"{start:.7g} to {stop:.7g} s{after}"
+    )
 
 
 # One test set
@@ -230,9 +311,18 @@ def file_of(test_set: str) -> str:
     return re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
 
 
-def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], named: Name | None) -> list[Block]:
+def _test_set(
+    artefacts: PartArtefacts,
+    board: pd.DataFrame,
+    test_set: str,
+    lines: dict[Name, Line],
+    named: Name | None,
+) -> list[Block]:
     file = file_of(test_set)
-    blocks: list[Block] = [f"## Test set `{test_set}`", *_leaderboard_table(artefacts, board, f"leaderboard_{file}", test_set)]
+    blocks: list[Block] = [
+        f"## Test set `{test_set}`",
+        *_leaderboard_table(artefacts, board, f"leaderboard_{file}", test_set),
+    ]
     lost = board[~np.isfinite(board["rmse_sideslip"])]
     if len(lost):
         blocks.append(f"No finite error, and so not in the figures: {', '.join(lost['title'])}.")
@@ -240,38 +330,66 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     finite = board[np.isfinite(board["rmse_sideslip"])]
     if finite.empty:
         return blocks
-    chosen = {(row["estimator"], row["variant"]): (row["title"], row["seed"]) for row in finite.to_dict("records")}
+    chosen = {
+        (row["estimator"], row["variant"]): (row["title"], row["seed"])
+        for row in finite.to_dict("records")
+    }
     by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}")
     if by_regime is not None:
         blocks.append(by_regime)
     shown = _shown(finite, named)
     if len(shown) < len(finite):
-        first = dict.fromkeys([chosen[named][0], finite.iloc[0]["title"]]) if named is not None and named in chosen else ()
+        first = (
+            dict.fromkeys([chosen[named][0], finite.iloc[0]["title"]])
+            if named is not None and named in chosen
+            else ()
+        )
         which = f"{', '.join(first)} and those" if first else "those"
         lowest = "with the lowest RMSE(v) on the validation range"
-        blocks.append(f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}.")
-    in_bands = {name: chosen[name] for name in zip(shown["estimator"], shown["variant"], strict=True)}
-    return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(artefacts, shown, test_set, lines, file)]
+        blocks.append(
+            f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}."
+        )
+    in_bands = {
+        name: chosen[name] for name in zip(shown["estimator"], shown["variant"], strict=True)
+    }
+    return [
+        *blocks,
+        *band_blocks(artefacts, test_set, in_bands, lines, file),
+        *_figures_of(artefacts, shown, test_set, lines, file),
+    ]
 
 
-_INTERVAL = Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high"))
+_INTERVAL = Column(
+    "95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")
+)
 
 
 def _bars(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> Table:
-    interval = [interval_in_words(row, decimals_for(board["rmse_sideslip"].tolist())) for row in board.to_dict("records")]
+    interval = [
+        interval_in_words(row, decimals_for(board["rmse_sideslip"].tolist()))
+        for row in board.to_dict("records")
+    ]
     caption = f"RMSE(β) of every estimator over all its seeds, with its 95 % interval, on {_where(artefacts, test_set)}."
-    columns = {"title": Column("estimator"), "rmse_sideslip": Column("RMSE(β) [deg]"), "interval": _INTERVAL}
+    columns = {
+        "title": Column("estimator"),
+        "rmse_sideslip": Column("RMSE(β) [deg]"),
+        "interval": _INTERVAL,
+    }
     return Table(f"bars_{file_of(test_set)}", caption, board.assign(interval=interval), columns)
 
 
-def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str) -> list[Block]:
+def _leaderboard_table(
+    artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str
+) -> list[Block]:
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
     decimals, has_bound = decimals_for(frame["rmse_sideslip"].tolist()), frame[_BOUND].notna().any()
     bound = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
     frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
-    chosen = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
+    chosen = [
+        folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")
+    ]
     standing = Table(
         name,
         f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
@@ -295,7 +413,13 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
             **({_BOUND: Column("bound [deg]", decimals=decimals)} if has_bound else {}),
         },
         # a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY
-        [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in chosen],
+        [
+            ModelLink(
+                f"../../{own.parent.name}/{own.name}/",
+                f"vehest estimate {own.name} lap.csv -o out.parquet",
+            )
+            for own in chosen
+        ],
     )
     seeds = Table(
         f"{name}_seeds",
@@ -322,9 +446,18 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
     """At most `MOST_SHOWN` rows in the order of the board, picked by validation; where one is ``named``, it comes first, and the lowest
     error on the test is among them, since the verdict names both."""
-    ours = (board["estimator"] == named[0]) & (board["variant"] == named[1]) if named else board["seed"].isna()
+    ours = (
+        (board["estimator"] == named[0]) & (board["variant"] == named[1])
+        if named
+        else board["seed"].isna()
+    )
     sure = ours | (board.index == board.index[0]) if named else ours
-    kept = board["rmse_vy_validation"].where(~sure, -math.inf).sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
+    kept = (
+        board["rmse_vy_validation"]
+        .where(~sure, -math.inf)
+        .sort_values(kind="stable", na_position="last")
+        .index[:MOST_SHOWN]
+    )
     return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
 
 
@@ -359,11 +492,15 @@ def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[fl
     return float(time[first]), float(time[first + length - 1])
 
 
-def _figures_of(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], file: str) -> list[Block]:
+def _figures_of(
+    artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], file: str
+) -> list[Block]:
     """Traces and errors of the board's rows over all scored ranges of a test set, on one time axis with a gap of NaN between two ranges."""
     models = {(*model.name, model.seed): model for model in artefacts.models}
     rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
-    shown = {name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()}
+    shown = {
+        name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()
+    }
     parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
     step = 1.0 / artefacts.protocol.rate_hz
     drives = {name: _joined(own, step) for name, own in parts.items()}
@@ -373,11 +510,20 @@ def _figures_of(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, li
     begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
     axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
     reference = figures.Traces("measured", REFERENCE, drive.vy_ref, np.degrees(drive.sideslip_ref))
-    traces = [figures.Traces(rows[name]["title"], lines[name], own.vy, np.degrees(own.sideslip)) for name, own in drives.items()]
+    traces = [
+        figures.Traces(rows[name]["title"], lines[name], own.vy, np.degrees(own.sideslip))
+        for name, own in drives.items()
+    ]
     inside = (drive.time >= zoom[0]) & (drive.time <= zoom[1])
-    zoomed = [figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside]) for t in (reference, *traces)]
+    zoomed = [
+        figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside])
+        for t in (reference, *traces)
+    ]
     scored = ~np.isnan(drive.vy_ref)  # samples, not gaps
-    errors = [(str(rows[name]["title"]), lines[name], np.degrees(own.sideslip - own.sideslip_ref)[scored]) for name, own in drives.items()]
+    errors = [
+        (str(rows[name]["title"]), lines[name], np.degrees(own.sideslip - own.sideslip_ref)[scored])
+        for name, own in drives.items()
+    ]
     has_ay = bool(np.isfinite(drive.ay[scored]).all())
     found: list[Block] = [
         Figure(
@@ -391,7 +537,13 @@ def _figures_of(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, li
             f"zoom_{file}",
             f"The {zoom[1] - zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
             f"its error (estimate − measured){', and the measured lateral acceleration' * has_ay}.",
-            figures.zoom_figure(drive.time[inside], drive.ay[inside] if has_ay else None, zoomed[0], zoomed[1:], label),
+            figures.zoom_figure(
+                drive.time[inside],
+                drive.ay[inside] if has_ay else None,
+                zoomed[0],
+                zoomed[1:],
+                label,
+            ),
         ),
         Figure(
             f"errors_{file}",
@@ -404,14 +556,20 @@ def _figures_of(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, li
             "Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
             f"{figures.LEAST_SAMPLES} samples show no error."
         )
-        found.append(Figure(f"errors_over_ay_{file}", caption, figures.error_over_ay(drive.ay[scored], errors)))
+        found.append(
+            Figure(
+                f"errors_over_ay_{file}", caption, figures.error_over_ay(drive.ay[scored], errors)
+            )
+        )
     return found
 
 
 # The training
 
 
-def _training(artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, Line]) -> list[Block]:
+def _training(
+    artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, Line]
+) -> list[Block]:
     models = {(*model.name, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []

@@ -35,23 +35,45 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
-    ranking = rank({name: [joined(own) for own in seeds] for name, seeds in folds.items()}, first.protocol.rate_hz)
+    ranking = rank(
+        {name: [joined(own) for own in seeds] for name, seeds in folds.items()},
+        first.protocol.rate_hz,
+    )
     titles = {model.name: as_text(model.title) for part in parts.values() for model in part.models}
     kinds = " and ".join(sorted(set(first.kinds.values())))
-    number = f"all {len(parts)} folds" if set(artefacts.titles) <= set(parts) else f"{len(parts)} of {len(artefacts.titles)} folds"
+    number = (
+        f"all {len(parts)} folds"
+        if set(artefacts.titles) <= set(parts)
+        else f"{len(parts)} of {len(artefacts.titles)} folds"
+    )
     where = f"{number} ({kinds} data), each estimated by models that had not seen it"
     board = overview(ranking, folds, titles, list(parts))
-    blocks: list[Block] = [_table(board, list(parts)), *([artefacts.about] if artefacts.about.strip() else [])]
-    blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), f"In each fold: {budget_sentence(first)}"]))
+    blocks: list[Block] = [
+        _table(board, list(parts)),
+        *([artefacts.about] if artefacts.about.strip() else []),
+    ]
+    blocks.append(
+        "\n\n".join(
+            [
+                data_sentence(first),
+                verdict_sentences(ranking, titles, where),
+                f"In each fold: {budget_sentence(first)}",
+            ]
+        )
+    )
     left_out = _left_out(parts, folds, titles)
     lost = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
-    left_out += [f"{title} is not here: nothing could be trained or scored on it." for title in lost]
+    left_out += [
+        f"{title} is not here: nothing could be trained or scored on it." for title in lost
+    ]
     if left_out:
         blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in left_out))
     blocks += how_it_was_made(first)[:1]
     for name, part in parts.items():
         warned = [line for line in warnings_of(part) if "is left out" not in line]
-        blocks.append(f"## Appendix: {as_text(part.title)}\n\n" + "\n".join(f"- {line}" for line in warned))
+        blocks.append(
+            f"## Appendix: {as_text(part.title)}\n\n" + "\n".join(f"- {line}" for line in warned)
+        )
         blocks.append(replace(how_it_was_made(part)[1], name=f"ranges_{name}"))
     if any(name[0] == "ksnn" for name in folds):
         blocks.append(PATENT_NOTE)
@@ -60,13 +82,23 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
     """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold."""
-    groups = [{name: {model.seed: model for model in own} for name, own in by_name(part.models).items()} for part in parts.values()]
+    groups = [
+        {name: {model.seed: model for model in own} for name, own in by_name(part.models).items()}
+        for part in parts.values()
+    ]
     found = {}
     for name in groups[0]:
         if not all(name in group and set(group[name]) == set(groups[0][name]) for group in groups):
             continue
-        seeds = [[group[name][seed].segments(TEST) for group in groups] for seed in sorted(groups[0][name])]
-        if all(math.isfinite(float(own.squared_error_sideslip.sum())) for folds in seeds for own in folds):
+        seeds = [
+            [group[name][seed].segments(TEST) for group in groups]
+            for seed in sorted(groups[0][name])
+        ]
+        if all(
+            math.isfinite(float(own.squared_error_sideslip.sum()))
+            for folds in seeds
+            for own in folds
+        ):
             found[name] = seeds
     if not found:
         raise DataError("no estimator has finite errors in all folds")
@@ -74,25 +106,49 @@ def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[lis
 
 
 def overview(
-    ranking: Ranking, folds: Mapping[Name, Sequence[Sequence[Segments]]], titles: Mapping[Name, str], parts: Sequence[str]
+    ranking: Ranking,
+    folds: Mapping[Name, Sequence[Sequence[Segments]]],
+    titles: Mapping[Name, str],
+    parts: Sequence[str],
 ) -> pd.DataFrame:
     """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands, and its error in each fold [deg]."""
     rows = []
     for name in ranking.order:
         seeds = folds[name]
-        row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": titles[name], "n_seeds": len(seeds)}
+        row: dict[str, object] = {
+            "estimator": name[0],
+            "variant": name[1],
+            "title": titles[name],
+            "n_seeds": len(seeds),
+        }
         row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
         for fold, part in enumerate(parts):
-            square = np.mean([own[fold].squared_error_sideslip.sum() / own[fold].samples.sum() for own in seeds])
+            square = np.mean(
+                [own[fold].squared_error_sideslip.sum() / own[fold].samples.sum() for own in seeds]
+            )
             row[part] = float(np.sqrt(square))
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _left_out(parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]) -> list[str]:
-    lines = [f"{as_text(part.title)}: {line}" for part in parts.values() for line in warnings_of(part) if "is left out" in line]
+def _left_out(
+    parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]
+) -> list[str]:
+    lines = [
+        f"{as_text(part.title)}: {line}"
+        for part in parts.values()
+        for line in warnings_of(part)
+        if "is left out" in line
+    ]
     lost = [titles[name] for name in titles if name not in folds]
-    return [*lines, *([f"Not in every fold with a finite error, and so not in the table: {listed(lost)}."] if lost else [])]
+    return [
+        *lines,
+        *(
+            [f"Not in every fold with a finite error, and so not in the table: {listed(lost)}."]
+            if lost
+            else []
+        ),
+    ]
 
 
 def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
@@ -101,7 +157,9 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "title": Column("estimator"),
         "n_seeds": Column("seeds"),
         "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
-        "interval": Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")),
+        "interval": Column(
+            "95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")
+        ),
         "against_best": Column("to the lowest [deg]"),
         "beats_zero": Column("beats v = 0"),
         "beats_static_map": Column("beats static map"),

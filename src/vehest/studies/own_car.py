@@ -37,29 +37,47 @@ PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have t
 
 VERSION = "6"
 leaderboard = drive.leaderboard
-Verdict = tuple[list[str], EvaluatedModel | None]  # sentences in Markdown, and the model to go on with, if one can be recommended
+Verdict = tuple[
+    list[str], EvaluatedModel | None
+]  # sentences in Markdown, and the model to go on with, if one can be recommended
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    compared = drive.comparison(part, {name: model.name for name, (_, model) in verdicts.items() if model is not None})
+    compared = drive.comparison(
+        part, {name: model.name for name, (_, model) in verdicts.items() if model is not None}
+    )
     texts = [
         f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(sentences)}"
         for name, (sentences, _) in verdicts.items()
     ]
-    opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
+    opening = next(
+        n for n, block in enumerate(compared.blocks) if isinstance(block, str)
+    )  # bars, and traces where there are any
     blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
     commands = "\n".join(_commands(part, verdicts, artefacts.study))
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     absent = not_compared(part)
-    folded: list[Block] = ["## Not compared\n\n" + "\n".join(f"- {as_text(line)}" for line in absent)] if absent else []
+    folded: list[Block] = (
+        ["## Not compared\n\n" + "\n".join(f"- {as_text(line)}" for line in absent)]
+        if absent
+        else []
+    )
     curves = curves_of(list(artefacts.parts.values()))
-    learnt = [block for curve in curves for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))]
+    learnt = [
+        block
+        for curve in curves
+        for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))
+    ]
     needed: list[Block] = ["## How much reference is needed", *learnt] if learnt else []
-    further = [block for name, other in list(artefacts.parts.items())[1:] for block in drive.appendix_of(name, other)]
+    further = [
+        block
+        for name, other in list(artefacts.parts.items())[1:]
+        for block in drive.appendix_of(name, other)
+    ]
     whole = [*blocks, *folded, *needed, "## The comparison", *compared.blocks[opening:], *further]
     return {REPORT: replace(compared, title=artefacts.title, blocks=whole, open_blocks=len(blocks))}
 
@@ -68,7 +86,9 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    lines = [" ".join(sentences).replace("**", "").replace("`", "") for sentences, _ in verdicts.values()]
+    lines = [
+        " ".join(sentences).replace("**", "").replace("`", "") for sentences, _ in verdicts.values()
+    ]
     commands = _commands(part, verdicts, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 
@@ -86,9 +106,15 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     if not ranking.order:
         return [f"No estimator gave a finite error on test set `{test_set}`."], None
     if ranking.n_blocks < LEAST_BLOCKS:
-        silent = [f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least", *silent]
+        silent = [
+            f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least",
+            *silent,
+        ]
     if silent:
-        return [f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)], None
+        return [
+            f"**These recordings cannot rank estimators**, because {listed(silent)}.",
+            _wanted(part),
+        ], None
     model = _to_go_on_with(part, ranking)
     name = model.name
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
@@ -97,7 +123,11 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
         words = f"**Use {titles[name]}.** Expected {expected}."
     elif ranking.order[0][0] in PLAIN:
         none = "no estimator that learns is worth its while on these data"
-        why = none if any(other not in PLAIN for other, *_ in ranking.order) else "none that learns was compared"
+        why = (
+            none
+            if any(other not in PLAIN for other, *_ in ranking.order)
+            else "none that learns was compared"
+        )
         words = f"**Nothing beats {titles[name]} here**, which has {expected}: {why}."
     elif level:
         others = listed(level) if len(level) <= 6 else f"{len(level)} others"
@@ -119,12 +149,22 @@ def _figure(ranking: Ranking, name: Name) -> str:
 
 def _beaten(ranking: Ranking, name: Name, titles: Mapping[Name, str]) -> str:
     """Which of the plain estimators that it was compared with it beats, and which beat it, by more than chance."""
-    sentences = {"lower": "It beats", "not told apart": "It is not told apart from", "higher": "It has a higher error than"}
+    sentences = {
+        "lower": "It beats",
+        "not told apart": "It is not told apart from",
+        "higher": "It has a higher error than",
+    }
     found: dict[str, list[str]] = {verdict: [] for verdict in sentences}
     for other in (other for other in ranking.order if other[0] in PLAIN and name[0] not in PLAIN):
         if (name, other) in ranking.pairs:
-            found[ranking.pairs[name, other].verdict].append(BASELINE_TITLES.get(other[0], titles[other]))
-    return " ".join(f"{words} {listed(found[verdict])}." for verdict, words in sentences.items() if found[verdict])
+            found[ranking.pairs[name, other].verdict].append(
+                BASELINE_TITLES.get(other[0], titles[other])
+            )
+    return " ".join(
+        f"{words} {listed(found[verdict])}."
+        for verdict, words in sentences.items()
+        if found[verdict]
+    )
 
 
 def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
@@ -137,7 +177,12 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
         seeds = sorted(model.seed for model in groups[name])
         seed = chosen_seed(seeds, name, runs)
         error = values_of(runs, name, [seed], "validation", "rmse_vy")[0]
-        chosen.append((error if math.isfinite(error) else math.inf, next(model for model in groups[name] if model.seed == seed)))
+        chosen.append(
+            (
+                error if math.isfinite(error) else math.inf,
+                next(model for model in groups[name] if model.seed == seed),
+            )
+        )
     return min(chosen, key=lambda pair: pair[0])[1]
 
 
@@ -146,15 +191,22 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     protocol, scored, hidden, standing = part.protocol, list[FloatArray](), list[FloatArray](), 0
     ranges = pieces_of(part.split.tests[test_set], part.reference, protocol)
     for recording, piece in ranges:
-        begin, (first, end) = recording.index_range(piece.start, piece.stop)[0], scored_range(recording, piece, protocol)
+        begin, (first, end) = (
+            recording.index_range(piece.start, piece.stop)[0],
+            scored_range(recording, piece, protocol),
+        )
         still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed
-        sideslip = np.degrees(np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"]))))
+        sideslip = np.degrees(
+            np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"])))
+        )
         standing += int(still[first:end].sum())
         hidden.append(sideslip[begin:first])
         scored.append(sideslip[first:end])
     counted, left_out = np.concatenate(scored), np.concatenate(hidden)
     share = 100.0 * len(counted) / max(len(counted) + len(left_out), 1)
-    most, most_hidden = (float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out))
+    most, most_hidden = (
+        float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out)
+    )
     words = f"The score counts {fixed(share, 0)} % of the test"
     words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
     if most_hidden > most:
@@ -166,7 +218,11 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
 
 def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
-    models = [(model, part.split.tests[name][0].dataset) for name, (_, model) in verdicts.items() if model is not None]
+    models = [
+        (model, part.split.tests[name][0].dataset)
+        for name, (_, model) in verdicts.items()
+        if model is not None
+    ]
     if not models:
         return []
     name, dataset = models[0][0].model_folder.name, models[0][1]
@@ -181,15 +237,25 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
     """How hard the test was driven: 99 % of its lateral accelerations, else of its speeds."""
     ay = _samples(part, part.split.tests[test_set], "ay")
     if len(ay):
-        return f"|ay| up to {fixed(float(np.quantile(np.abs(ay), 0.99)), 1)} m/s² (99 % of the test)"
+        return (
+            f"|ay| up to {fixed(float(np.quantile(np.abs(ay), 0.99)), 1)} m/s² (99 % of the test)"
+        )
     speed = _samples(part, part.split.tests[test_set], "vx")
-    return f"speeds up to {fixed(float(np.quantile(speed, 0.99)), 0)} m/s (99 % of the test)" if len(speed) else "the test's driving"
+    return (
+        f"speeds up to {fixed(float(np.quantile(speed, 0.99)), 0)} m/s (99 % of the test)"
+        if len(speed)
+        else "the test's driving"
+    )
 
 
 def _wanted(part: PartArtefacts) -> str:
     """How much hard driving there is, and how much more would halve the interval: its width goes as one over the root of the time."""
     split = part.split
-    spans = [*split.train, *split.validation, *(span for spans in split.tests.values() for span in spans)]
+    spans = [
+        *split.train,
+        *split.validation,
+        *(span for spans in split.tests.values() for span in spans),
+    ]
     ay = _samples(part, spans, "ay")
     if not len(ay):
         return ""
@@ -216,9 +282,15 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
 def not_compared(part: PartArtefacts) -> list[str]:
     """Families that were not compared, each with the channels that its plainest form lacks; those that failed or had no time come first."""
     lines = [f"{name}: {reason}" for name, reason in part.failed.items()]
-    there = {model.estimator for model in part.models} | {name.split("-")[0] for name in part.failed}
+    there = {model.estimator for model in part.models} | {
+        name.split("-")[0] for name in part.failed
+    }
     spans = [*part.split.train, *(span for spans in part.split.tests.values() for span in spans)]
-    files = [part.references[key] for span in spans if (key := (span.dataset, span.recording)) in part.references]
+    files = [
+        part.references[key]
+        for span in spans
+        if (key := (span.dataset, span.recording)) in part.references
+    ]
     if not files:
         return lines
     channels = set(read_recording(files[0]).channels)
@@ -226,6 +298,10 @@ def not_compared(part: PartArtefacts) -> list[str]:
         if name in there:
             continue
         reads = getattr(estimator_class(name), "channels", None)
-        lacking = [channel for channel in reads if channel not in channels] if isinstance(reads, tuple) else []
+        lacking = (
+            [channel for channel in reads if channel not in channels]
+            if isinstance(reads, tuple)
+            else []
+        )
         lines.append(f"{name}: {f'lacks {listed(lacking)}' if lacking else 'not in the pipeline'}")
     return lines

@@ -19,7 +19,16 @@ import pandas as pd
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import Segments
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.document import (
+    PATENT_NOTE,
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    Table,
+    as_text,
+)
 from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
@@ -43,14 +52,24 @@ NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take o
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """A section a curve, and the table of all as the overview."""
     curves = curves_of(list(artefacts.parts.values()))
-    rows = [{"curve": f"{curve.title}, {curve.test_set}", **row} for curve in curves for row in rows_of_curve(curve)]
+    rows = [
+        {"curve": f"{curve.title}, {curve.test_set}", **row}
+        for curve in curves
+        for row in rows_of_curve(curve)
+    ]
     overview = Table(
-        "overview", "RMSE(β) by minutes of reference, all curves.", pd.DataFrame(rows), {"curve": Column("test set"), **COLUMNS}
+        "overview",
+        "RMSE(β) by minutes of reference, all curves.",
+        pd.DataFrame(rows),
+        {"curve": Column("test set"), **COLUMNS},
     )
     data = list(dict.fromkeys(data_sentence(part) for part in artefacts.parts.values()))
     blocks: list[Block] = [artefacts.about, "\n\n".join(data)]
     for number, curve in enumerate(curves, start=1):
-        blocks += [f"## {curve.title}, test set `{curve.test_set}`", *blocks_of_curve(curve, str(number))]
+        blocks += [
+            f"## {curve.title}, test set `{curve.test_set}`",
+            *blocks_of_curve(curve, str(number)),
+        ]
     blocks += ["## All curves", overview, *how_it_was_made(artefacts.first), PATENT_NOTE]
     return {REPORT: Document(artefacts.title, blocks)}
 
@@ -69,7 +88,12 @@ class Point:
     @property
     def name(self) -> Name:
         """Under which it is ranked."""
-        return (self.estimator, "" if self.estimator in BASELINES[:1] else f"{self.variant}|{self.start}|{self.minutes:g}")
+        return (
+            self.estimator,
+            ""
+            if self.estimator in BASELINES[:1]
+            else f"{self.variant}|{self.start}|{self.minutes:g}",
+        )
 
 
 @dataclass(frozen=True)
@@ -79,7 +103,9 @@ class Curve:
     title: str  # of the first of its parts
     test_set: str  # that was tested on
     points: Sequence[Point]  # by estimator, start and minutes
-    ranking: Ranking  # of all of them, whose intervals are missing where the test is too short for them
+    ranking: (
+        Ranking  # of all of them, whose intervals are missing where the test is too short for them
+    )
 
 
 def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
@@ -96,28 +122,55 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
         named, there = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name), minutes_of(part)
-        wanted = float(named[1]) if named is not None else math.nan  # by split.minutes, which the split's name then ends in
+        wanted = (
+            float(named[1]) if named is not None else math.nan
+        )  # by split.minutes, which the split's name then ends in
         minutes = wanted if abs(there - wanted) <= NEARLY * wanted else round(there, 2)
         for model in part.models:
             models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
     points = {
-        Point(estimator, variant, as_text(own[0].title.removesuffix(start_in_words(own[0].training))), start, minutes, len(own)): own
+        Point(
+            estimator,
+            variant,
+            as_text(own[0].title.removesuffix(start_in_words(own[0].training))),
+            start,
+            minutes,
+            len(own),
+        ): own
         for (estimator, variant, start, minutes), own in models.items()
         if counts[estimator, variant] > 1 or estimator in BASELINES
     }
     segments: dict[Name, list[Segments]] = {}
     for point, own in points.items():
         segments.setdefault(point.name, []).extend(model.segments(test_set) for model in own)
-    finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
-    ordered = sorted((point for point in points if point.name in finite), key=lambda p: (p.estimator, p.variant, p.start, p.minutes))
-    asked = [(tuned.name, plain.name) for plain in ordered for tuned in ordered if _same(plain, tuned)]
-    return Curve(as_text(parts[0].title), test_set, ordered, rank(finite, parts[0].protocol.rate_hz, asked=asked))
+    finite = {
+        name: own
+        for name, own in segments.items()
+        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)
+    }
+    ordered = sorted(
+        (point for point in points if point.name in finite),
+        key=lambda p: (p.estimator, p.variant, p.start, p.minutes),
+    )
+    asked = [
+        (tuned.name, plain.name) for plain in ordered for tuned in ordered if _same(plain, tuned)
+    ]
+    return Curve(
+        as_text(parts[0].title),
+        test_set,
+        ordered,
+        rank(finite, parts[0].protocol.rate_hz, asked=asked),
+    )
 
 
 def _same(plain: Point, tuned: Point) -> bool:
     """Whether two points differ in what their trainings start from alone."""
-    same = (plain.estimator, plain.variant, plain.minutes) == (tuned.estimator, tuned.variant, tuned.minutes)
+    same = (plain.estimator, plain.variant, plain.minutes) == (
+        tuned.estimator,
+        tuned.variant,
+        tuned.minutes,
+    )
     return same and plain.start == SCRATCH != tuned.start
 
 
@@ -171,7 +224,10 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
             low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
             row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
             row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
-            row |= {"interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–", "n_trainings": point.n_trainings}
+            row |= {
+                "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
+                "n_trainings": point.n_trainings,
+            }
             rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
     return rows
 
@@ -197,8 +253,12 @@ def _in_words(curve: Curve) -> str:
             f"{first.title}{how}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
             f"{fixed(curve.ranking.rmse[last.name], 2)}° after {last.minutes:g} min."
         )
-    better = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"]
-    worse = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"]
+    better = [
+        f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"
+    ]
+    worse = [
+        f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"
+    ]
     if any(_against_scratch(curve, point) for point in curve.points):
         found = [f"lower by more than chance with {listed(better)} min"] if better else []
         found += [f"higher with {listed(worse)} min"] if worse else []
@@ -220,15 +280,29 @@ def _figure(curve: Curve) -> MatplotlibFigure:
         for shift, own in enumerate(drawn):
             line, start = line_of(own[0].estimator, own[0].variant), own[0].start
             apart = 1.03 ** (shift - len(drawn) / 2)
-            minutes, errors = [point.minutes * apart for point in own], [ranking.rmse[point.name] for point in own]
+            minutes, errors = (
+                [point.minutes * apart for point in own],
+                [ranking.rmse[point.name] for point in own],
+            )
             dash = "solid" if start == SCRATCH else "dashed"
             label = own[0].title + ("" if start == SCRATCH else f", {start}")
-            axes.plot(minutes, errors, color=line.colour, linestyle=dash, marker=line.marker, markersize=3.5, linewidth=1.1, label=label)
+            axes.plot(
+                minutes,
+                errors,
+                color=line.colour,
+                linestyle=dash,
+                marker=line.marker,
+                markersize=3.5,
+                linewidth=1.1,
+                label=label,
+            )
             for at, point in zip(minutes, own, strict=True):
                 low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
                 if math.isfinite(low):
                     axes.plot([at, at], [low, high], color=line.colour, linewidth=0.8)
-        nothing = next((ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan)
+        nothing = next(
+            (ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan
+        )
         if math.isfinite(nothing):
             axes.axhline(nothing, color="black", linewidth=0.7, linestyle=(0, (4, 3)))
         axes.set_xscale("log")
@@ -238,7 +312,28 @@ def _figure(curve: Curve) -> MatplotlibFigure:
             axis.set_minor_formatter(NullFormatter())
         axes.set_xticks(sorted({round(point.minutes, 1) for point in curve.points}))
         low, high = axes.get_ylim()
-        axes.set_yticks([tick for tick in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0) if low <= tick <= high])
+        axes.set_yticks(
+            [
+                tick
+                for tick in (
+                    0.1,
+                    0.2,
+                    0.3,
+                    0.5,
+                    0.7,
+                    1.0,
+                    1.5,
+                    2.0,
+                    3.0,
+                    5.0,
+                    7.0,
+                    10.0,
+                    15.0,
+                    20.0,
+                )
+                if low <= tick <= high
+            ]
+        )
         axes.set_xlabel("recording with a reference [min]")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=6.5, frameon=False)

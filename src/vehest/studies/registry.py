@@ -37,5 +37,7 @@ def study_module(name: str) -> ModuleType:
         return importlib.import_module(f"{ENTRY_POINTS}.{name}")
     point = next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)
     if point is None:
-        raise ConfigurationError(f"there is no study module '{name}'; there are: {', '.join(study_names())}")
+        raise ConfigurationError(
+            f"there is no study module '{name}'; there are: {', '.join(study_names())}"
+        )
     return importlib.import_module(point.module)

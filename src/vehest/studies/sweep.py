@@ -18,7 +18,14 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.splits import VALIDATION
 from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, SINGLE_COLUMN, MatplotlibFigure, decimals_for, fixed, new_figure
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    SINGLE_COLUMN,
+    MatplotlibFigure,
+    decimals_for,
+    fixed,
+    new_figure,
+)
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
 
@@ -41,7 +48,9 @@ class SweepArtefacts:
     """Everything that tables and figures of a sweep are made from."""
 
     part: PartArtefacts  # the comparison of all combinations
-    keys: Sequence[str]  # those that take several values, the seed aside, in the order of the command
+    keys: Sequence[
+        str
+    ]  # those that take several values, the seed aside, in the order of the command
     # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
     # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
     # combination with a fault count the samples while it lasts
@@ -63,25 +72,39 @@ class SweepArtefacts:
         rows = []
         for number, own in self.jobs.groupby("combination", sort=False):
             done = own[own["status"] == DONE]
-            row: dict[str, object] = {"combination": number, **{name: own.iloc[0][name] for name in ("title", *self.keys)}}
+            row: dict[str, object] = {
+                "combination": number,
+                **{name: own.iloc[0][name] for name in ("title", *self.keys)},
+            }
             row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
             row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
             for name in self.sets:
-                row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(done[f"{METRIC}.{name}"].to_numpy(dtype=float))
+                row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(
+                    done[f"{METRIC}.{name}"].to_numpy(dtype=float)
+                )
             rows.append(row)
         table = pd.DataFrame(rows)
         table["chosen"] = False
         if VALIDATION in self.sets and not any(key.split(".")[0] == "fault" for key in self.keys):
-            mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
+            mean = (
+                table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
+            )
             if np.isfinite(mean).any():
-                table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
+                table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = (
+                    True
+                )
         return table
 
 
 def build(artefacts: SweepArtefacts) -> Document:
     """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
     part = artefacts.part
-    blocks: list[Block] = [data_sentence(part), _chosen_sentence(artefacts), "## Combinations", _table(artefacts)]
+    blocks: list[Block] = [
+        data_sentence(part),
+        _chosen_sentence(artefacts),
+        "## Combinations",
+        _table(artefacts),
+    ]
     if part.failed:
         listed = "\n".join(f"- {name}: {reason}" for name, reason in part.failed.items())
         blocks.append(f"## What failed\n\n{listed}")
@@ -118,10 +141,19 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
     decimals = {name: decimals_for(table[f"{METRIC}.{name}"].tolist()) for name in artefacts.sets}
     rows = []
     for row in table.to_dict("records"):
-        seeds = f"{row['n_seeds']} ({row['n_failed']} failed)" if row["n_failed"] else str(row["n_seeds"])
+        seeds = (
+            f"{row['n_seeds']} ({row['n_failed']} failed)"
+            if row["n_failed"]
+            else str(row["n_seeds"])
+        )
         which = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
-        scores = [mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name]) for name in artefacts.sets]
-        rows.append(["*" if row["chosen"] else "", *which, fixed(row["n_parameters"], 0), seeds, *scores])
+        scores = [
+            mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name])
+            for name in artefacts.sets
+        ]
+        rows.append(
+            ["*" if row["chosen"] else "", *which, fixed(row["n_parameters"], 0), seeds, *scores]
+        )
     return header, rows
 
 
@@ -129,8 +161,14 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
     """A heat map for each set, where two numeric keys vary and any others are booleans; else none."""
     table = artefacts.table
     varied = [key for key in artefacts.keys if table[key].nunique() > 1]
-    switches = [key for key in varied if all(isinstance(value, bool | np.bool_) for value in table[key])]
-    numeric = [key for key in varied if key not in switches and all(_is_number(value) for value in table[key])]
+    switches = [
+        key for key in varied if all(isinstance(value, bool | np.bool_) for value in table[key])
+    ]
+    numeric = [
+        key
+        for key in varied
+        if key not in switches and all(_is_number(value) for value in table[key])
+    ]
     if len(numeric) != 2 or len(numeric) + len(switches) != len(varied):
         return []
     cells = [sorted(table[key].unique()) for key in numeric]
@@ -140,7 +178,10 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
     for name in artefacts.sets:
         panels = []
         for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
-            title = ", ".join(f"{names[switch]} = {shown_value(value)}" for switch, value in zip(switches, key, strict=True))
+            title = ", ".join(
+                f"{names[switch]} = {shown_value(value)}"
+                for switch, value in zip(switches, key, strict=True)
+            )
             panels.append(_panel(own, title, name, numeric, cells))
         where = _set_in_words(name)
         caption = (
@@ -156,7 +197,9 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
 def short_names(keys: Sequence[str]) -> dict[str, str]:
     """Key -> its last part, or all of it where two keys share that."""
     last = [key.rsplit(".", 1)[-1] for key in keys]
-    return {key: name if last.count(name) == 1 else key for key, name in zip(keys, last, strict=True)}
+    return {
+        key: name if last.count(name) == 1 else key for key, name in zip(keys, last, strict=True)
+    }
 
 
 def shown_value(value: object) -> str:
@@ -165,21 +208,32 @@ def shown_value(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(
+        value, bool | np.bool_
+    )
 
 
-def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: list[list[float]]) -> Panel:
+def _panel(
+    table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: list[list[float]]
+) -> Panel:
     """Combinations with two numeric keys of these values, across and up."""
     across, up = numeric
     mean, half, chosen = (
-        table.pivot(index=up, columns=across, values=shown).reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float)
+        table.pivot(index=up, columns=across, values=shown)
+        .reindex(index=cells[1], columns=cells[0])
+        .to_numpy(dtype=float)
         for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
     )
     return title, mean, half, np.argwhere(chosen == 1.0).tolist()
 
 
 def heat_map(
-    panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
+    panels: Sequence[Panel],
+    columns: Sequence[str],
+    rows: Sequence[str],
+    column_label: str,
+    row_label: str,
+    quantity: str,
 ) -> MatplotlibFigure:
     """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
     import matplotlib
@@ -189,13 +243,23 @@ def heat_map(
     values = np.concatenate([mean.ravel() for _, mean, *_ in panels])
     finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
     low, high = float(finite.min()), float(finite.max())
-    scale = LogNorm(low, high) if low > 0 and high / low > LOGARITHMIC_FROM else Normalize(low, high if high > low else low + 1.0)
+    scale = (
+        LogNorm(low, high)
+        if low > 0 and high / low > LOGARITHMIC_FROM
+        else Normalize(low, high if high > low else low + 1.0)
+    )
     across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
-    width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
+    width = (
+        SINGLE_COLUMN
+        if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE
+        else DOUBLE_COLUMN
+    )
     with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
-        shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
+        shades = LinearSegmentedColormap.from_list(
+            "shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64))
+        )
         colours = ScalarMappable(scale, shades)
         for axes, panel in zip(grid.flat, panels, strict=False):
             _draw(axes, panel, colours, decimals_for(finite.tolist()))
@@ -208,7 +272,9 @@ def heat_map(
             axes.set_xlabel(column_label)
         for axes in grid[:, 0]:
             axes.set_ylabel(row_label)
-        figure.colorbar(colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25).outline.set_visible(False)
+        figure.colorbar(
+            colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25
+        ).outline.set_visible(False)
     return figure
 
 
@@ -217,15 +283,34 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
 
     _, means, halves, marked = panel
     edges = [np.arange(number + 1) - 0.5 for number in means.T.shape]
-    axes.pcolormesh(*edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
+    axes.pcolormesh(
+        *edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8
+    )
     axes.set_facecolor(NO_VALUE)
     for row, column in np.ndindex(means.shape):
         mean, half = float(means[row, column]), float(halves[row, column])
-        words = fixed(mean, decimals) + (f"\n±{fixed(half, decimals)}" if math.isfinite(half) else "")
-        ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45 else "#111111"
-        axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
+        words = fixed(mean, decimals) + (
+            f"\n±{fixed(half, decimals)}" if math.isfinite(half) else ""
+        )
+        ink = (
+            "white"
+            if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45
+            else "#111111"
+        )
+        axes.text(
+            column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1
+        )
     for row, column in marked:
-        axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
+        axes.add_patch(
+            Rectangle(
+                (column - 0.46, row - 0.46),
+                0.92,
+                0.92,
+                fill=False,
+                edgecolor="#d6336c",
+                linewidth=1.8,
+            )
+        )
     axes.grid(visible=False)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
@@ -249,7 +334,10 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     names = short_names(artefacts.keys)
     which = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
     words = f"Chosen on the validation range: **{row['title']}**" + (f" ({which})" if which else "")
-    figures = [f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})" for name in artefacts.sets]
+    figures = [
+        f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})"
+        for name in artefacts.sets
+    ]
     seeds = int(row["n_seeds"])
     words += f", with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
     mean, half = float(row[f"{METRIC}.{VALIDATION}"]), float(row[f"{METRIC}_half.{VALIDATION}"])
@@ -270,7 +358,11 @@ def _with_interval(row: pd.Series, name: str) -> str:
 
 def mean_and_half(mean: float, half: float, decimals: int) -> str:
     """``0.312 ± 0.021``; the mean alone where there is no interval."""
-    return f"{fixed(mean, decimals)} ± {fixed(half, decimals)}" if math.isfinite(half) else fixed(mean, decimals)
+    return (
+        f"{fixed(mean, decimals)} ± {fixed(half, decimals)}"
+        if math.isfinite(half)
+        else fixed(mean, decimals)
+    )
 
 
 def _budget(jobs: pd.DataFrame) -> str:
@@ -278,7 +370,11 @@ def _budget(jobs: pd.DataFrame) -> str:
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
     fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
-    took = f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs" if len(epochs) else ""
+    took = (
+        f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs"
+        if len(epochs)
+        else ""
+    )
     counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
     return f"Budget: {counts}{took}"
 
@@ -294,7 +390,11 @@ INTERVAL_AND_CHOICE = (
 def _table(artefacts: SweepArtefacts) -> Table:
     names, table = short_names(artefacts.keys), artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
-    columns |= {"n_parameters": Column("params", decimals=0), "n_seeds": Column("seeds"), "n_failed": Column("failed")}
+    columns |= {
+        "n_parameters": Column("params", decimals=0),
+        "n_seeds": Column("seeds"),
+        "n_failed": Column("failed"),
+    }
     for name in artefacts.sets:
         decimals = decimals_for(table[f"{METRIC}.{name}"].tolist())
         columns[f"{METRIC}.{name}"] = Column(f"RMSE(β), {name} [deg]", decimals=decimals)

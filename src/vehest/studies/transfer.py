@@ -14,12 +14,35 @@ import numpy as np
 import pandas as pd
 
 from vehest.evaluation.ranking import BASELINES, Name, Ranking
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.style import DOUBLE_COLUMN, MISSING, MatplotlibFigure, decimals_for, fixed, lines_of, listed, new_figure
+from vehest.report.document import (
+    PATENT_NOTE,
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    Table,
+    as_text,
+)
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    MISSING,
+    MatplotlibFigure,
+    decimals_for,
+    fixed,
+    lines_of,
+    listed,
+    new_figure,
+)
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of, budget_sentence, data_sentence
 from vehest.studies.kit.runs import by_name
-from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
+from vehest.studies.kit.standing import (
+    interval_in_words,
+    ranking_of,
+    standing_columns,
+    verdict_sentences,
+)
 from vehest.studies.kit.warnings import warnings_of
 
 VERSION = "2"
@@ -28,21 +51,40 @@ SHOWS_FAILED = True
 COLUMNS = 4
 TITLE_WIDTH = 24
 ROW = 0.16  # in, height of an estimator
-REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")  # baselines, in the order in which tables show them first
+REFERENCES = (
+    "zero",
+    "static_map",
+    "kinematic",
+    "data_sheet",
+)  # baselines, in the order in which tables show them first
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how it was made; raises `DataError`."""
     parts = artefacts.parts
-    rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
+    rankings = {
+        (name, test_set): ranking_of(part, test_set)
+        for name, part in parts.items()
+        for test_set in part.split.tests
+    }
     board = overview(parts, rankings)
     caption = (
         "RMSE(β) over that of v = 0, with 95 % intervals: left of 1, an estimator knows more than nothing. The vertical line in each row "
         "is the static map, which learns two numbers from the same ranges."
     )
-    blocks: list[Block] = [Figure("transfer", caption, _drawn(board)), *([artefacts.about] if artefacts.about.strip() else [])]
+    blocks: list[Block] = [
+        Figure("transfer", caption, _drawn(board)),
+        *([artefacts.about] if artefacts.about.strip() else []),
+    ]
     absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
-    blocks.append(carried_over(board) + (f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}." if absent else ""))
+    blocks.append(
+        carried_over(board)
+        + (
+            f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}."
+            if absent
+            else ""
+        )
+    )
     blocks.append(_matrix(board))
     for name, part in parts.items():
         blocks += _part(name, part, board[board["part"] == name], rankings)
@@ -52,17 +94,29 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: Document(artefacts.title, blocks)}
 
 
-def overview(parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]) -> pd.DataFrame:
+def overview(
+    parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
+) -> pd.DataFrame:
     """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its interval [deg], and what it beats."""
     nothing: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
-    nothing |= dict.fromkeys((*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING)
+    nothing |= dict.fromkeys(
+        (*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING
+    )
     rows = []
     for (part, test_set), ranking in rankings.items():
-        titles = {name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()}
+        titles = {
+            name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()
+        }
         order = [name for baseline in REFERENCES for name in titles if name[0] == baseline]
-        order += [name for name in ranking.order if name not in order] + [name for name in titles if name not in ranking.order]
+        order += [name for name in ranking.order if name not in order] + [
+            name for name in titles if name not in ranking.order
+        ]
         for name in dict.fromkeys(order):
-            row: dict[str, Any] = {"part": part, "title": as_text(parts[part].title), "test_set": test_set}
+            row: dict[str, Any] = {
+                "part": part,
+                "title": as_text(parts[part].title),
+                "test_set": test_set,
+            }
             row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
             row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
             row |= standing_columns(ranking, name) if name in ranking.rmse else nothing
@@ -74,12 +128,22 @@ def overview(parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, st
 def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str, float]:
     """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m]; NaN where the point is known."""
     metrics = part.metrics
-    own = metrics[(metrics["condition"] == "best_lever_arm") & (metrics["test_set"] == test_set) & (metrics["subset"] == "all")]
+    own = metrics[
+        (metrics["condition"] == "best_lever_arm")
+        & (metrics["test_set"] == test_set)
+        & (metrics["subset"] == "all")
+    ]
     own = own[(own["estimator"] == name[0]) & (own["variant"].fillna("") == name[1])]
-    errors, arms = (own.loc[own["metric"] == metric, "value"].to_numpy(dtype=float) for metric in ("rmse_sideslip", "lever_arm"))
+    errors, arms = (
+        own.loc[own["metric"] == metric, "value"].to_numpy(dtype=float)
+        for metric in ("rmse_sideslip", "lever_arm")
+    )
     if not len(errors):
         return {"rmse_sideslip_best_lever": math.nan, "lever_arm": math.nan}
-    return {"rmse_sideslip_best_lever": float(np.sqrt(np.mean(np.square(errors)))), "lever_arm": float(np.mean(arms))}
+    return {
+        "rmse_sideslip_best_lever": float(np.sqrt(np.mean(np.square(errors)))),
+        "lever_arm": float(np.mean(arms)),
+    }
 
 
 def carried_over(board: pd.DataFrame) -> str:
@@ -93,12 +157,17 @@ def carried_over(board: pd.DataFrame) -> str:
         where = [_place(row, board) for row in names.to_dict("records")]
         if len(names) == len(own) == len(places):
             everywhere.append(str(title))
-        lines.append(f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}")
+        lines.append(
+            f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}"
+        )
     if everywhere:
         first = f"On every one of {len(places)} tests {listed(everywhere)} beat v = 0 and the static map, each by more than chance."
     else:
         first = f"**No estimator beats both v = 0 and the static map on each of the {len(places)} tests.**"
-    return f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten:\n\n" + "\n".join(lines)
+    return (
+        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten:\n\n"
+        + "\n".join(lines)
+    )
 
 
 def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
@@ -107,7 +176,9 @@ def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
 
 
 def _matrix(board: pd.DataFrame) -> Table:
-    rows: dict[str, dict[str, Any]] = {title: {"estimator": title} for title in board["estimator_title"]}
+    rows: dict[str, dict[str, Any]] = {
+        title: {"estimator": title} for title in board["estimator_title"]
+    }
     columns = {"estimator": Column("estimator")}
     for place, (_, own) in enumerate(board.groupby(["part", "test_set"], sort=False)):
         found = own.drop_duplicates("estimator_title").to_dict("records")
@@ -136,7 +207,11 @@ def _cell(row: Mapping[Any, Any]) -> str:
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     """A panel a test, a row an estimator: RMSE(β) over that of v = 0 with its interval, and the static map as a vertical line."""
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
-    names = list(dict.fromkeys(zip(board["estimator"], board["variant"], board["estimator_title"], strict=True)))
+    names = list(
+        dict.fromkeys(
+            zip(board["estimator"], board["variant"], board["estimator_title"], strict=True)
+        )
+    )
     names = [name for name in names if name[0] != "zero"]
     lines = lines_of([name[:2] for name in names])
     columns = min(COLUMNS, len(places))
@@ -148,15 +223,28 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)
         for axes, (part, test_set) in zip(grid.flat, places, strict=False):
-            own = board[(board["part"] == part) & (board["test_set"] == test_set)].set_index(["estimator", "variant"])
+            own = board[(board["part"] == part) & (board["test_set"] == test_set)].set_index(
+                ["estimator", "variant"]
+            )
             nothing = _first(own, "zero")
             for height, name in enumerate(names):
-                if name[:2] not in own.index or not math.isfinite(own.loc[name[:2], "rmse_sideslip"]):
+                if name[:2] not in own.index or not math.isfinite(
+                    own.loc[name[:2], "rmse_sideslip"]
+                ):
                     continue
-                value, low, high = (float(own.loc[name[:2], f"rmse_sideslip{end}"]) / nothing for end in ("", "_low", "_high"))
+                value, low, high = (
+                    float(own.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
+                    for end in ("", "_low", "_high")
+                )
                 colour = lines[name[:2]].colour
                 if math.isfinite(low):
-                    axes.plot([low, high], [height, height], color=colour, linewidth=1.4, solid_capstyle="butt")
+                    axes.plot(
+                        [low, high],
+                        [height, height],
+                        color=colour,
+                        linewidth=1.4,
+                        solid_capstyle="butt",
+                    )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
             axes.axvline(1.0, color="black", linewidth=0.7)
             static = _first(own, "static_map") / nothing
@@ -164,7 +252,10 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                 axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
             title = str(own["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
-            lines_of_title = [*textwrap.wrap(title, TITLE_WIDTH), *([test_set.replace("_", " ")] if several else [])]
+            lines_of_title = [
+                *textwrap.wrap(title, TITLE_WIDTH),
+                *([test_set.replace("_", " ")] if several else []),
+            ]
             axes.set_title("\n".join(lines_of_title), fontsize=6.5, loc="left")
             axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
@@ -182,19 +273,29 @@ def _first(own: pd.DataFrame, estimator: str) -> float:
     return float(found.iloc[0]) if len(found) else math.nan
 
 
-def _part(name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]) -> list[Block]:
-    titles: dict[Name, str] = {own: as_text(models[0].title) for own, models in by_name(part.models).items()}
+def _part(
+    name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]
+) -> list[Block]:
+    titles: dict[Name, str] = {
+        own: as_text(models[0].title) for own, models in by_name(part.models).items()
+    }
     blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
     for test_set in part.split.tests:
         kinds = part.kinds_of(part.split.tests[test_set])
-        blocks.append(verdict_sentences(rankings[name, test_set], titles, f"test set `{test_set}` ({kinds})"))
+        blocks.append(
+            verdict_sentences(rankings[name, test_set], titles, f"test set `{test_set}` ({kinds})")
+        )
     warned = warnings_of(part)
     if warned:
         blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
     blocks.append(budget_sentence(part))
     decimals = decimals_for(board["rmse_sideslip"].tolist())
-    shown = board.assign(interval=[interval_in_words(row, decimals) for row in board.to_dict("records")])
-    columns: dict[str, Column] = {"test_set": Column("test set")} if board["test_set"].nunique() > 1 else {}
+    shown = board.assign(
+        interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
+    )
+    columns: dict[str, Column] = (
+        {"test_set": Column("test set")} if board["test_set"].nunique() > 1 else {}
+    )
     columns |= {
         "estimator_title": Column("estimator"),
         "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),

@@ -24,8 +24,14 @@ class Adam:
     Source: Kingma & Ba, Adam, 2015; Loshchilov & Hutter, Decoupled weight decay regularization, 2019.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
-        self.parameters, self.learning_rate, self.weight_decay = list(parameters), learning_rate, weight_decay
+    def __init__(
+        self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0
+    ) -> None:
+        self.parameters, self.learning_rate, self.weight_decay = (
+            list(parameters),
+            learning_rate,
+            weight_decay,
+        )
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
     def zero_grad(self) -> None:

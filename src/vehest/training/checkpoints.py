@@ -30,10 +30,14 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint in ``folder`` in one step. Raises `MissingError`: it cannot be written."""
     with written_aside(folder / _FILE) as aside:
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
+        tensors = {
+            name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()
+        }
         try:
             values = json.dumps(dict(checkpoint.values))
-            save_file(tensors, aside, metadata={"values": values, "digest": _digest(values, tensors)})
+            save_file(
+                tensors, aside, metadata={"values": values, "digest": _digest(values, tensors)}
+            )
         except SafetensorError as error:
             raise as_os_error(error) from error
 
@@ -49,7 +53,9 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
             if kept.get("digest") != _digest(kept.get("values", ""), tensors):
                 return None
             values = parse_json(kept["values"], f"'{path}'")
-            sound = isinstance(values.get("epoch"), int) and isinstance(values.setdefault("finished", False), bool)
+            sound = isinstance(values.get("epoch"), int) and isinstance(
+                values.setdefault("finished", False), bool
+            )
             return Checkpoint(tensors, values) if sound else None
     except (SafetensorError, VehestError, ValueError, OSError):
         return None

@@ -22,8 +22,12 @@ class Progress:
 class FitContext:
     """Surroundings of a fit."""
 
-    checkpoint_folders: Sequence[Path] = ()  # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
-    should_stop: Callable[[], bool] = lambda: False  # asked after every batch; True ends the fit cleanly with the best so far
+    checkpoint_folders: Sequence[
+        Path
+    ] = ()  # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
+    should_stop: Callable[[], bool] = lambda: (
+        False
+    )  # asked after every batch; True ends the fit cleanly with the best so far
     on_progress: Callable[[Progress], None] = lambda progress: None  # called after every epoch
 
 
@@ -33,7 +37,9 @@ class FitRecord:
 
     # column -> values, one row an epoch or a search; empty where there is nothing to show
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    metrics: Mapping[str, float] = field(default_factory=dict)  # figures such as ``epochs`` and ``train_seconds``
+    metrics: Mapping[str, float] = field(
+        default_factory=dict
+    )  # figures such as ``epochs`` and ``train_seconds``
     interrupted: bool = False  # whether the fit was stopped before it was over
 
 
@@ -46,8 +52,17 @@ def record_of_epochs(
 ) -> FitRecord:
     """The record of a fit with one row an epoch: ``columns``, then epoch and losses."""
     epochs = len(train_loss)
-    history = {**columns, "epoch": range(1, epochs + 1), "train_loss": train_loss, "validation_loss": validation_loss}
-    return FitRecord({name: list(values) for name, values in history.items()}, {"epochs": epochs, **metrics}, interrupted)
+    history = {
+        **columns,
+        "epoch": range(1, epochs + 1),
+        "train_loss": train_loss,
+        "validation_loss": validation_loss,
+    }
+    return FitRecord(
+        {name: list(values) for name, values in history.items()},
+        {"epochs": epochs, **metrics},
+        interrupted,
+    )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,9 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 
-MOST_WINDOWS = 1024  # evaluated at once where no gradient is wanted: each is laid out by itself in memory
+MOST_WINDOWS = (
+    1024  # evaluated at once where no gradient is wanted: each is laid out by itself in memory
+)
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
@@ -56,8 +58,14 @@ def random_numbers(seed: int) -> Iterator[None]:
 
 def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
     """Buffers and parameters that no gradient is wanted of, by name, (M, ...)."""
-    frozen = [{name: p.detach() for name, p in module.named_parameters() if not p.requires_grad} for module in modules]
-    own = [parameters | dict(module.named_buffers()) for parameters, module in zip(frozen, modules, strict=True)]
+    frozen = [
+        {name: p.detach() for name, p in module.named_parameters() if not p.requires_grad}
+        for module in modules
+    ]
+    own = [
+        parameters | dict(module.named_buffers())
+        for parameters, module in zip(frozen, modules, strict=True)
+    ]
     return {name: torch.stack([state[name] for state in own]) for name in own[0]}
 
 
@@ -70,22 +78,33 @@ class FlatParameters:
 
     def pack(self, modules: Sequence[nn.Module]) -> Tensor:
         """Rows of parameters, shape (M, K)."""
-        return torch.stack([torch.cat([p.detach().reshape(-1) for _, p in _trained(module)]) for module in modules])
+        return torch.stack(
+            [torch.cat([p.detach().reshape(-1) for _, p in _trained(module)]) for module in modules]
+        )
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Parameters by name, each of shape (M, ...), as views of ``flat`` (M, K)."""
         pieces = flat.split([shape.numel() for shape in self.shapes.values()], dim=1)
-        return {name: piece.view(len(flat), *shape) for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)}
+        return {
+            name: piece.view(len(flat), *shape)
+            for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)
+        }
 
     def unpack(self, row: Tensor, module: nn.Module) -> None:
         """Copy one row, shape (K,), into a module."""
         with torch.no_grad():
-            for (_, parameter), values in zip(_trained(module), self.views(row.unsqueeze(0)).values(), strict=True):
+            for (_, parameter), values in zip(
+                _trained(module), self.views(row.unsqueeze(0)).values(), strict=True
+            ):
                 parameter.copy_(values[0])
 
 
 def _trained(module: nn.Module) -> list[tuple[str, nn.Parameter]]:
-    return [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]
+    return [
+        (name, parameter)
+        for name, parameter in module.named_parameters()
+        if parameter.requires_grad
+    ]
 
 
 def predict_members(
@@ -123,14 +142,22 @@ def predict_members(
         return result
     offsets = torch.arange(n_window, device=starts.device)
     pieces = [starts] if torch.is_grad_enabled() else starts.split(MOST_WINDOWS, dim=1)
-    return torch.cat([_plain(network, parameters, prepared[piece.unsqueeze(-1) + offsets], seeds) for piece in pieces], dim=1)
+    return torch.cat(
+        [
+            _plain(network, parameters, prepared[piece.unsqueeze(-1) + offsets], seeds)
+            for piece in pieces
+        ],
+        dim=1,
+    )
 
 
 _ONE_BY_ONE: WeakSet[nn.Module] = WeakSet()
 """Networks with a layer that torch cannot batch."""
 
 
-def _plain(network: nn.Module, parameters: Mapping[str, Tensor], windows: Tensor, seeds: Sequence[int]) -> Tensor:
+def _plain(
+    network: nn.Module, parameters: Mapping[str, Tensor], windows: Tensor, seeds: Sequence[int]
+) -> Tensor:
     """Predictions of M members by PyTorch alone, windows (M, B, N, C) -> (M, B)."""
 
     def predict(own: Mapping[str, Tensor], batch: Tensor) -> Tensor:
@@ -145,12 +172,16 @@ def _plain(network: nn.Module, parameters: Mapping[str, Tensor], windows: Tensor
     if len(windows) > 1 and network not in _ONE_BY_ONE:
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="There is a performance drop")  # one layer goes member by member: still right
+                warnings.filterwarnings(
+                    "ignore", message="There is a performance drop"
+                )  # one layer goes member by member: still right
                 return torch.func.vmap(predict)(dict(parameters), windows)
         except RuntimeError:  # what is wrong with the network itself is raised again below
             _ONE_BY_ONE.add(network)
     predictions = []
     for member, batch in enumerate(windows):
         with random_numbers(seeds[member]) if seeds else nullcontext():
-            predictions.append(predict({name: values[member] for name, values in parameters.items()}, batch))
+            predictions.append(
+                predict({name: values[member] for name, values in parameters.items()}, batch)
+            )
     return torch.stack(predictions)

@@ -9,7 +9,14 @@ from typing import ClassVar, Literal
 from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext
-from vehest.training.search import Box, Cost, DirectSearchSettings, SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import (
+    Box,
+    Cost,
+    DirectSearchSettings,
+    SearchRecord,
+    nelder_mead_over_grid,
+    optuna_search,
+)
 
 BAD = 1e6  # rad², instead of a cost that is not finite
 LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
@@ -26,17 +33,33 @@ class NoiseTuningSettings(Group):
         "data: sensors' levels are read off measured signals, the rest is assumed; nelder_mead, optuna (extra tuning): those with the "
         "smallest error of sideslip on the training recordings",
     )
-    curves_from: str = setting("*", "pattern of the ids of those training recordings that axle curves are fitted to")
+    curves_from: str = setting(
+        "*", "pattern of the ids of those training recordings that axle curves are fitted to"
+    )
     grid: int = setting(2, "starts of Nelder-Mead along each level", least=1)
     max_evaluations: int = setting(80, "evaluations allowed from each start", least=1)
-    tolerance: float = setting(1e-3, "relative change of the levels at which a search ends", positive=True)
+    tolerance: float = setting(
+        1e-3, "relative change of the levels at which a search ends", positive=True
+    )
     trials: int = setting(200, "evaluations of Optuna", least=1)
-    skip_seconds: float = setting(1.5, "first seconds of each recording that do not count", unit="s", least=0.0)
+    skip_seconds: float = setting(
+        1.5, "first seconds of each recording that do not count", unit="s", least=0.0
+    )
 
-    def search(self, cost: Cost, boxes: Box, starts: Box, seed: int, context: FitContext, trials: int | None = None) -> SearchRecord:
+    def search(
+        self,
+        cost: Cost,
+        boxes: Box,
+        starts: Box,
+        seed: int,
+        context: FitContext,
+        trials: int | None = None,
+    ) -> SearchRecord:
         """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see `vehest.training.search`."""
         if self.method == "optuna":
-            staged = {name: getattr(self, name) for name in ("stages", "shrink") if hasattr(self, name)}
+            staged = {
+                name: getattr(self, name) for name in ("stages", "shrink") if hasattr(self, name)
+            }
             return optuna_search(cost, boxes, trials or self.trials, seed, context, **staged)
         limits = DirectSearchSettings(self.grid, self.max_evaluations, self.tolerance)
         return nelder_mead_over_grid(cost, boxes, starts, limits, context)
@@ -47,11 +70,23 @@ class IdentificationSettings(NoiseTuningSettings):
     """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section III-B)."""
 
     group = "identification"
-    method: Literal["data", "nelder_mead", "optuna"] = setting("optuna", "as above; data takes process noise as the paper has it")
+    method: Literal["data", "nelder_mead", "optuna"] = setting(
+        "optuna", "as above; data takes process noise as the paper has it"
+    )
     trials: int = setting(60, "evaluations of Optuna in all stages together", least=1)
-    stages: int = setting(2, "of Optuna; after the first, the box shrinks around the best so far", least=1)
-    shrink: float = setting(0.3, "width of the box of a stage, relative to that of the stage before", above=0.0, most=1.0)
-    tyres_from: str = setting("*skidpad*", "pattern of the names of those training recordings that tyres are identified on")
+    stages: int = setting(
+        2, "of Optuna; after the first, the box shrinks around the best so far", least=1
+    )
+    shrink: float = setting(
+        0.3,
+        "width of the box of a stage, relative to that of the stage before",
+        above=0.0,
+        most=1.0,
+    )
+    tyres_from: str = setting(
+        "*skidpad*",
+        "pattern of the names of those training recordings that tyres are identified on",
+    )
     restarts: int = setting(5, "genetic searches for the tyres, of which the best counts", least=1)
     generations: int = setting(200, "of each, at most", least=1)
     most_process_yaw_rate: float = setting(
@@ -70,7 +105,9 @@ class IdentificationSettings(NoiseTuningSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stages > self.trials:
-            raise ConfigurationError(f"identification.stages must be at most its trials ({self.trials}), not {self.stages}")
+            raise ConfigurationError(
+                f"identification.stages must be at most its trials ({self.trials}), not {self.stages}"
+            )
 
 
 def finite(error: float) -> float:

@@ -33,7 +33,10 @@ class SampleSettings(Group):
 
     group = "training"
     version: ClassVar[str] = "1"
-    phase: PhaseSettings = setting(PhaseSettings(learning_rate=1e-3, max_epochs=300, patience=20), "step size, epochs, patience")
+    phase: PhaseSettings = setting(
+        PhaseSettings(learning_rate=1e-3, max_epochs=300, patience=20),
+        "step size, epochs, patience",
+    )
     batch_size: int = setting(1024, "samples in a batch", least=1)
     dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
@@ -63,8 +66,17 @@ def sample_phase(
     """
 
     def batches(generator: torch.Generator) -> Iterator[Draw]:
-        order = torch.stack([torch.randperm(n_samples, generator=generator) for _ in range(members)])
+        order = torch.stack(
+            [torch.randperm(n_samples, generator=generator) for _ in range(members)]
+        )
         for rows in order.split(batch_size, dim=1):
             yield Draw(rows, torch.randint(2**62, (members,), generator=generator))
 
-    return Phase(name, settings, module, batches, lambda draw: losses(draw).sum(), lambda: float(judge().double().mean()))
+    return Phase(
+        name,
+        settings,
+        module,
+        batches,
+        lambda draw: losses(draw).sum(),
+        lambda: float(judge().double().mean()),
+    )

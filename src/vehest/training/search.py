@@ -29,7 +29,9 @@ class DirectSearchSettings(Group):
     version: ClassVar[str] = "1"
     grid: int = setting(4, "starts along each parameter", least=1)
     max_evaluations: int = setting(400, "evaluations allowed from each start", least=1)
-    tolerance: float = setting(1e-4, "relative change of the parameters at which a search ends", positive=True)
+    tolerance: float = setting(
+        1e-4, "relative change of the parameters at which a search ends", positive=True
+    )
 
 
 class SearchRecord(NamedTuple):
@@ -47,7 +49,9 @@ class SearchRecord(NamedTuple):
         return dict(zip(columns, self.starts.T.tolist(), strict=True))
 
 
-def nelder_mead_over_grid(cost: Cost, box: Box, start_range: Box, settings: DirectSearchSettings, context: FitContext) -> SearchRecord:
+def nelder_mead_over_grid(
+    cost: Cost, box: Box, start_range: Box, settings: DirectSearchSettings, context: FitContext
+) -> SearchRecord:
     """Minimise a cost that need not be smooth, keeping the best of several local searches.
 
     Args:
@@ -63,7 +67,9 @@ def nelder_mead_over_grid(cost: Cost, box: Box, start_range: Box, settings: Dire
     scale = np.array([high - low for low, high in box])
     bounds = [(low / own, high / own) for (low, high), own in zip(box, scale, strict=True)]
     limits = {"maxfev": settings.max_evaluations, "xatol": settings.tolerance, "fatol": 1e-12}
-    starts = list(itertools.product(*(np.linspace(low, high, settings.grid) for low, high in start_range)))
+    starts = list(
+        itertools.product(*(np.linspace(low, high, settings.grid) for low, high in start_range))
+    )
     rows: list[FloatArray] = []
     evaluations = 0
     for start in starts:
@@ -71,10 +77,18 @@ def nelder_mead_over_grid(cost: Cost, box: Box, start_range: Box, settings: Dire
             break
         first = np.array(start) / scale
         options = {**limits, "initial_simplex": _simplex(first, bounds)}
-        result = scipy.optimize.minimize(lambda unit: cost(unit * scale), first, method="Nelder-Mead", bounds=bounds, options=options)
+        result = scipy.optimize.minimize(
+            lambda unit: cost(unit * scale),
+            first,
+            method="Nelder-Mead",
+            bounds=bounds,
+            options=options,
+        )
         evaluations += result.nfev
         rows.append(np.concatenate([start, result.x * scale, [result.fun]]))
-        context.on_progress(Progress(len(rows), len(starts), 1, 1, float(min(row[-1] for row in rows))))
+        context.on_progress(
+            Progress(len(rows), len(starts), 1, 1, float(min(row[-1] for row in rows)))
+        )
     return _record(rows, evaluations, len(rows) < len(starts))
 
 
@@ -95,7 +109,14 @@ def _simplex(start: FloatArray, box: Box) -> FloatArray:
 
 
 def optuna_search(
-    cost: Cost, box: Box, trials: int, seed: int, context: FitContext, *, stages: int = 1, shrink: float = 0.3
+    cost: Cost,
+    box: Box,
+    trials: int,
+    seed: int,
+    context: FitContext,
+    *,
+    stages: int = 1,
+    shrink: float = 0.3,
 ) -> SearchRecord:
     """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
 
@@ -126,12 +147,20 @@ def optuna_search(
     for stage in range(stages):
         if rows:
             best, width = _record(rows, len(rows), False).best, width * shrink
-            widths = [width * (high - low) for low, high in box]  # of ranges about the best, moved inside the bounds
-            starts = [min(max(v - 0.5 * w, low), high - w) for v, w, (low, high) in zip(best, widths, box, strict=True)]
+            widths = [
+                width * (high - low) for low, high in box
+            ]  # of ranges about the best, moved inside the bounds
+            starts = [
+                min(max(v - 0.5 * w, low), high - w)
+                for v, w, (low, high) in zip(best, widths, box, strict=True)
+            ]
             own = [(start, start + w) for start, w in zip(starts, widths, strict=True)]
         share = trials * (stage + 1) // stages - trials * stage // stages
         study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed + stage))
-        distributions = {str(k): optuna.distributions.FloatDistribution(low, high) for k, (low, high) in enumerate(own)}
+        distributions = {
+            str(k): optuna.distributions.FloatDistribution(low, high)
+            for k, (low, high) in enumerate(own)
+        }
         lowest = math.inf
         for number in range(share):
             if context.should_stop() and number:

@@ -19,7 +19,9 @@ from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 
-SKIPS_ALLOWED = 20  # steps in a row without a finite loss and gradient after which training gives up
+SKIPS_ALLOWED = (
+    20  # steps in a row without a finite loss and gradient after which training gives up
+)
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,24 @@ class PhaseSettings(Group):
 
     group = "training: phase"
     learning_rate: float = setting(5e-4, "AdamW's step size", positive=True)
-    max_epochs: int = setting(1000, "epochs after which the phase ends in any case; 0 leaves it out", least=0)
-    patience: int = setting(0, "epochs without a better validation loss after which it ends; 0 never ends it early", least=0)
-    validate_every: int = setting(1, "epochs between two validations; the last epoch is always validated", least=1)
-    clip: float = setting(1e3, "bound on the magnitude of each element of the gradient; 0 for none", least=0.0)
+    max_epochs: int = setting(
+        1000, "epochs after which the phase ends in any case; 0 leaves it out", least=0
+    )
+    patience: int = setting(
+        0,
+        "epochs without a better validation loss after which it ends; 0 never ends it early",
+        least=0,
+    )
+    validate_every: int = setting(
+        1, "epochs between two validations; the last epoch is always validated", least=1
+    )
+    clip: float = setting(
+        1e3, "bound on the magnitude of each element of the gradient; 0 for none", least=0.0
+    )
     weight_decay: float = setting(0.0, "AdamW's decoupled weight decay", least=0.0)
-    schedule: Literal["constant", "cosine"] = setting("constant", "step size: constant, or a cosine to zero over max_epochs")
+    schedule: Literal["constant", "cosine"] = setting(
+        "constant", "step size: constant, or a cosine to zero over max_epochs"
+    )
 
 
 @dataclass(frozen=True)
@@ -47,11 +61,19 @@ class Phase:
     name: str  # for people and for the checkpoint; unique among the phases of a training
     settings: PhaseSettings  # step size, epochs, patience, clipping
     module: nn.Module  # its parameters are changed in place
-    batches: Callable[[torch.Generator], Iterable[Any]]  # of one epoch; random numbers are drawn from the generator and from no other
+    batches: Callable[
+        [torch.Generator], Iterable[Any]
+    ]  # of one epoch; random numbers are drawn from the generator and from no other
     loss: Callable[[Any], Tensor]  # scalar to minimise, of one batch; ``backward`` is called on it
-    validation: Callable[[], float]  # loss on the validation data with the parameters as they stand; called without gradients
-    trainable: Callable[[str], bool] | None = None  # which parameters learn, by name, while the others are frozen; all if None
-    prepare: Callable[[], None] | None = None  # called once before the first validation; may set parameters that this phase starts from
+    validation: Callable[
+        [], float
+    ]  # loss on the validation data with the parameters as they stand; called without gradients
+    trainable: Callable[[str], bool] | None = (
+        None  # which parameters learn, by name, while the others are frozen; all if None
+    )
+    prepare: Callable[[], None] | None = (
+        None  # called once before the first validation; may set parameters that this phase starts from
+    )
 
 
 @dataclass
@@ -59,11 +81,19 @@ class PhaseRecord:
     """How a phase goes; plain values, which a checkpoint keeps as they are."""
 
     name: str  # of the phase
-    best_epoch: int = 0  # epoch (from 1) whose parameters were kept; 0 if none was better than the start
+    best_epoch: int = (
+        0  # epoch (from 1) whose parameters were kept; 0 if none was better than the start
+    )
     best_loss: float = math.inf  # validation loss of the parameters that were kept
-    start_loss: float = math.nan  # validation loss before the first epoch; NaN if it was stopped before
-    train_loss: list[float] = field(default_factory=list)  # mean over the batches of each epoch, skipped ones left out
-    validation_loss: list[float] = field(default_factory=list)  # after each epoch; NaN where not validated
+    start_loss: float = (
+        math.nan
+    )  # validation loss before the first epoch; NaN if it was stopped before
+    train_loss: list[float] = field(
+        default_factory=list
+    )  # mean over the batches of each epoch, skipped ones left out
+    validation_loss: list[float] = field(
+        default_factory=list
+    )  # after each epoch; NaN where not validated
     seconds: float = 0.0  # wall time, earlier runs that a checkpoint continues included [s]
     skipped_steps: int = 0  # batches whose loss or gradient was not finite
     skipped_in_a_row: int = 0  # the last of them
@@ -128,8 +158,14 @@ def train_phases(
         Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
     """
     if len({phase.name for phase in phases}) != len(phases):
-        raise ConfigurationError(f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}")
-    folders = [context.checkpoint_folders[i] for i in (folder_index, *twins) if i < len(context.checkpoint_folders)]
+        raise ConfigurationError(
+            f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}"
+        )
+    folders = [
+        context.checkpoint_folders[i]
+        for i in (folder_index, *twins)
+        if i < len(context.checkpoint_folders)
+    ]
     run = _Run(phases, seed, context, folder_index, checkpoint_seconds, folders)
     run.resume()
     while run.position < len(phases) and not run.now.interrupted:
@@ -168,9 +204,13 @@ class _Run:
         self.records.append(PhaseRecord(phase.name))
         self.generator = torch.Generator().manual_seed(_stream(self.seed, position))
         named = phase.module.named_parameters()
-        self.learning = {name: value for name, value in named if phase.trainable is None or phase.trainable(name)}
+        self.learning = {
+            name: value for name, value in named if phase.trainable is None or phase.trainable(name)
+        }
         if not self.learning:
-            raise ConfigurationError(f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable")
+            raise ConfigurationError(
+                f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable"
+            )
         settings = phase.settings
         self.adam = Adam(self.learning.values(), settings.learning_rate, settings.weight_decay)
 
@@ -217,7 +257,11 @@ class _Run:
             now.start_loss, now.validated = self._validate(), True
         before = self._checkpoint()
         if settings.schedule == "cosine":
-            self.adam.learning_rate = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
+            self.adam.learning_rate = (
+                settings.learning_rate
+                * 0.5
+                * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
+            )
         total, taken = 0.0, 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
             if self.context.should_stop():
@@ -231,9 +275,15 @@ class _Run:
         now.validation_loss.append(self._validate() if judged else math.nan)
         now.seconds = time.monotonic() - started
         done = sum(record.epochs for record in self.records)
-        allowed = done - now.epochs + sum(phase.settings.max_epochs for phase in self.phases[self.position :])
+        allowed = (
+            done
+            - now.epochs
+            + sum(phase.settings.max_epochs for phase in self.phases[self.position :])
+        )
         members = max(len(self.context.checkpoint_folders), self.folder_index + 1)
-        self.context.on_progress(Progress(done, allowed, members - self.folder_index, members, now.best_loss))
+        self.context.on_progress(
+            Progress(done, allowed, members - self.folder_index, members, now.best_loss)
+        )
         self._save_now_and_then()
 
     def _stop(self, before: Checkpoint) -> None:
@@ -249,7 +299,9 @@ class _Run:
         value = float(loss.detach())
         if math.isfinite(value):
             loss.backward()
-            gradients = [parameter.grad for parameter in self.learning.values() if parameter.grad is not None]
+            gradients = [
+                parameter.grad for parameter in self.learning.values() if parameter.grad is not None
+            ]
             if all(np.isfinite(gradient.numpy()).all() for gradient in gradients):
                 if self.phase.settings.clip:
                     nn.utils.clip_grad_value_(self.learning.values(), self.phase.settings.clip)
@@ -278,13 +330,20 @@ class _Run:
         """The state as it stands, copied."""
         finished = self.position == len(self.phases)
         epoch = sum(record.epochs for record in self.records)
-        values = {"finished": finished, "epoch": epoch, "phases": [asdict(record) for record in self.records]}
+        values = {
+            "finished": finished,
+            "epoch": epoch,
+            "phases": [asdict(record) for record in self.records],
+        }
         tensors = {f"best.{name}": value for name, value in self.best.items()}
         if not finished:
             tensors |= {f"now.{name}": value for name, value in _copies(self.state).items()}
             tensors["generator"] = self.generator.get_state()
             for number, parameter in enumerate(self.learning.values()):
-                tensors |= {f"adam.{number}.{name}": value.clone() for name, value in self.adam.state.get(parameter, {}).items()}
+                tensors |= {
+                    f"adam.{number}.{name}": value.clone()
+                    for name, value in self.adam.state.get(parameter, {}).items()
+                }
         return Checkpoint(tensors, values)
 
     def _save_now_and_then(self, in_any_case: bool = False) -> None:
@@ -301,7 +360,10 @@ class _Run:
         checkpoint = load_checkpoint(self.folders[0]) if self.folders else None
         if checkpoint is None or not self._fits(checkpoint):
             return
-        finished, records = checkpoint.values["finished"], [PhaseRecord(**record) for record in checkpoint.values["phases"]]
+        finished, records = (
+            checkpoint.values["finished"],
+            [PhaseRecord(**record) for record in checkpoint.values["phases"]],
+        )
         best = _named(checkpoint, "best.")
         _put_back(self.state, best if finished else _named(checkpoint, "now."))
         self._begin(len(records) if finished else len(records) - 1)
@@ -317,7 +379,11 @@ class _Run:
         known = [phase.name for phase in self.phases]
         shapes = {name: value.shape for name, value in _named(checkpoint, "best.").items()}
         enough = len(names) == len(known) if checkpoint.values["finished"] else bool(names)
-        return enough and names == known[: len(names)] and shapes == {name: value.shape for name, value in self.state.items()}
+        return (
+            enough
+            and names == known[: len(names)]
+            and shapes == {name: value.shape for name, value in self.state.items()}
+        )
 
 
 def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator) -> Tensor:
@@ -359,9 +425,15 @@ def _put_back(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None
 
 
 def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in checkpoint.tensors.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): value
+        for name, value in checkpoint.tensors.items()
+        if name.startswith(prefix)
+    }
 
 
 def _stream(seed: int, position: int) -> int:
     """A stream for the batches of a phase that has nothing to do with the one the initial weights were drawn from."""
-    return int(np.random.SeedSequence([seed, 1, position]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    return int(
+        np.random.SeedSequence([seed, 1, position]).generate_state(1, np.uint64)[0] >> np.uint64(1)
+    )

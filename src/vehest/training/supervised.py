@@ -16,7 +16,14 @@ from vehest.data.windows import WindowSet
 from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
-from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
+from vehest.training.members import (
+    FlatParameters,
+    constrain,
+    fixed_state,
+    is_plain,
+    predict_members,
+    prepare,
+)
 from vehest.training.supervised_settings import SupervisedSettings
 
 BATCHES = 64  # that compiled networks take before a training looks whether it should stop
@@ -76,13 +83,18 @@ class _Run:
         self.network = self.networks[0]
         self.layout = FlatParameters(self.network)
         self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
-        self.train, self.validation = (_Prepared(self.network, own, self.settings) for own in (self.train_windows, self.validation_windows))
+        self.train, self.validation = (
+            _Prepared(self.network, own, self.settings)
+            for own in (self.train_windows, self.validation_windows)
+        )
         flat = self.layout.pack(self.networks)
         self.best = flat.clone()
         self.best_loss = torch.full((members,), math.inf, dtype=torch.float64)
         self.best_epoch = torch.zeros(members, dtype=torch.int64)
         self.active = torch.arange(members)
-        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds]
+        self.generators = [
+            torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds
+        ]
         self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in self.networks]
         self.epoch = 0  # of the members still active
         self.interrupted = False
@@ -94,7 +106,10 @@ class _Run:
         held = {"parameters": self.flat.detach(), **self.adam.state.get(self.flat, {})}
         if self.average is not None:
             held["average"] = self.average
-        return {name: (values[rows] if values.dim() else values).clone() for name, values in held.items()}
+        return {
+            name: (values[rows] if values.dim() else values).clone()
+            for name, values in held.items()
+        }
 
     def _go_on_with(self, rows: dict[str, Tensor]) -> None:
         """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
@@ -107,7 +122,12 @@ class _Run:
     def train_epoch(self) -> None:
         """One pass over the training windows, then the validation loss and the decisions that hang on it."""
         before = self._checkpoints()
-        order = torch.stack([torch.randperm(len(self.train), generator=self.generators[m]) for m in self.active.tolist()])
+        order = torch.stack(
+            [
+                torch.randperm(len(self.train), generator=self.generators[m])
+                for m in self.active.tolist()
+            ]
+        )
         total = torch.zeros(len(self.active), dtype=torch.float64)
         self.network.train()
         compiled = self.settings.compiled and hasattr(self.network, "compiled_descent")
@@ -124,7 +144,10 @@ class _Run:
         """One step of Adam; sums of squared errors of the members, (M,)."""
         self.adam.zero_grad()
         views = self.layout.views(self.flat)
-        error = self._predict(views, self.train, self.train.starts[batch], self._batch_seeds()) - self.train.targets[batch]
+        error = (
+            self._predict(views, self.train, self.train.starts[batch], self._batch_seeds())
+            - self.train.targets[batch]
+        )
         losses = error.square().mean(dim=1)
         losses.sum().backward()
         self.adam.step()
@@ -138,7 +161,11 @@ class _Run:
         """The same for several batches by compiled code."""
         own, flat, state = self.settings, self.flat.detach(), self.adam.state[self.flat]
         if not state:
-            state |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(flat), "exp_avg_sq": torch.zeros_like(flat)}
+            state |= {
+                "step": torch.tensor(0.0),
+                "exp_avg": torch.zeros_like(flat),
+                "exp_avg_sq": torch.zeros_like(flat),
+            }
         if own.averaging and self.average is None:
             self.average = torch.zeros_like(flat)
         moments = state | ({"average": self.average} if own.averaging else {})
@@ -146,7 +173,9 @@ class _Run:
         constrain(self.network, self.layout.views(bounds))
         starts, targets = self.train.starts[batches], self.train.targets[batches]
         numbers = own.batch_size, own.learning_rate, bounds, own.averaging
-        losses: Tensor = self.network.compiled_descent(flat, moments, self.train.series, starts, targets, *numbers)  # type: ignore[operator]
+        losses: Tensor = self.network.compiled_descent(
+            flat, moments, self.train.series, starts, targets, *numbers
+        )  # type: ignore[operator]
         return losses
 
     def _average(self) -> None:
@@ -164,12 +193,23 @@ class _Run:
         """What plain networks draw from for one batch (dropout), one seed an active member; compiled ones draw nothing."""
         if not is_plain(self.network):
             return []
-        return [int(torch.randint(2**63 - 1, (), generator=self.generators[member])) for member in self.active.tolist()]
+        return [
+            int(torch.randint(2**63 - 1, (), generator=self.generators[member]))
+            for member in self.active.tolist()
+        ]
 
-    def _predict(self, parameters: dict[str, Tensor], data: _Prepared, starts: Tensor, seeds: Sequence[int] = ()) -> Tensor:
+    def _predict(
+        self,
+        parameters: dict[str, Tensor],
+        data: _Prepared,
+        starts: Tensor,
+        seeds: Sequence[int] = (),
+    ) -> Tensor:
         state = parameters | {name: values[self.active] for name, values in self.fixed.items()}
         compiled = self.settings.compiled
-        return predict_members(self.network, state, data.series, starts, data.n_window, compiled=compiled, seeds=seeds)
+        return predict_members(
+            self.network, state, data.series, starts, data.n_window, compiled=compiled, seeds=seeds
+        )
 
     def _judge(self, train_loss: Tensor) -> None:
         """Validate the weights, or their average where there is one; keep the best, and let members leave whose patience is over."""
@@ -179,7 +219,9 @@ class _Run:
             starts = self.validation.starts.expand(len(self.active), -1)
             prediction = self._predict(self.layout.views(judged), self.validation, starts)
             loss = (prediction.double() - self.validation.targets.double()).square().mean(dim=1)
-        for member, *losses in zip(self.active.tolist(), train_loss.tolist(), loss.tolist(), strict=True):
+        for member, *losses in zip(
+            self.active.tolist(), train_loss.tolist(), loss.tolist(), strict=True
+        ):
             for values, value in zip(self.history[member], losses, strict=True):
                 values.append(value)
             if not math.isfinite(losses[1]):
@@ -197,7 +239,13 @@ class _Run:
             self.active = self.active[going_on]
             self._go_on_with(self._rows(going_on))
         self.context.on_progress(
-            Progress(self.epoch, self.settings.max_epochs, len(self.active), len(self.networks), float(self.best_loss.min()))
+            Progress(
+                self.epoch,
+                self.settings.max_epochs,
+                len(self.active),
+                len(self.networks),
+                float(self.best_loss.min()),
+            )
         )
         if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
             self._save(self._checkpoints())
@@ -209,7 +257,10 @@ class _Run:
         for member, (train_loss, validation_loss) in enumerate(self.history):
             tensors = {"best": self.best[member].clone()}
             if member in row_of:
-                tensors |= {"generator": self.generators[member].get_state(), **self._rows(row_of[member])}
+                tensors |= {
+                    "generator": self.generators[member].get_state(),
+                    **self._rows(row_of[member]),
+                }
             values = {
                 "finished": member not in row_of,
                 "epoch": len(validation_loss),
@@ -230,18 +281,31 @@ class _Run:
         """Go on from the members' checkpoints, if all have one and those that are not finished agree in the epoch."""
         loaded = [load_checkpoint(folder) for folder in self.context.checkpoint_folders]
         checkpoints = [checkpoint for checkpoint in loaded if checkpoint is not None]
-        if len(checkpoints) < len(self.networks) or any(c.tensors["best"].shape != self.best[0].shape for c in checkpoints):
+        if len(checkpoints) < len(self.networks) or any(
+            c.tensors["best"].shape != self.best[0].shape for c in checkpoints
+        ):
             return
-        unfinished = [member for member, checkpoint in enumerate(checkpoints) if not checkpoint.values["finished"]]
+        unfinished = [
+            member
+            for member, checkpoint in enumerate(checkpoints)
+            if not checkpoint.values["finished"]
+        ]
         epochs = {checkpoints[member].values["epoch"] for member in unfinished}
         if len(epochs) > 1:
             return
         for member, (tensors, values) in enumerate(checkpoints):
             self.best[member] = tensors["best"]
-            self.best_loss[member], self.best_epoch[member] = values["best_loss"], values["best_epoch"]
+            self.best_loss[member], self.best_epoch[member] = (
+                values["best_loss"],
+                values["best_epoch"],
+            )
             self.history[member] = (values["train_loss"], values["validation_loss"])
         self.active = torch.tensor(unfinished, dtype=torch.int64)
-        self.epoch = epochs.pop() if epochs else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
+        self.epoch = (
+            epochs.pop()
+            if epochs
+            else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
+        )
         states = [dict(checkpoints[member].tensors) for member in unfinished]
         for member, state in zip(unfinished, states, strict=True):
             self.generators[member].set_state(state.pop("generator"))
@@ -256,19 +320,28 @@ class _Run:
         records = []
         for member, (network, losses) in enumerate(zip(self.networks, self.history, strict=True)):
             self.layout.unpack(self.best[member], network.eval())
-            figures = {"best_epoch": int(self.best_epoch[member]), "best_validation_loss": min(losses[1], default=math.nan)}
+            figures = {
+                "best_epoch": int(self.best_epoch[member]),
+                "best_validation_loss": min(losses[1], default=math.nan),
+            }
             unfinished = self.interrupted and member in self.active.tolist()
-            records.append(record_of_epochs(*losses, {**figures, "train_seconds": seconds}, unfinished))
+            records.append(
+                record_of_epochs(*losses, {**figures, "train_seconds": seconds}, unfinished)
+            )
         return records
 
 
 class _Prepared:
     """A window set as tensors, scaled once."""
 
-    def __init__(self, network: nn.Module, windows: WindowSet, settings: SupervisedSettings) -> None:
+    def __init__(
+        self, network: nn.Module, windows: WindowSet, settings: SupervisedSettings
+    ) -> None:
         dtype = getattr(torch, settings.dtype)
         with torch.no_grad():
-            self.series: Tensor = prepare(network, torch.as_tensor(windows.series, dtype=dtype)).contiguous()
+            self.series: Tensor = prepare(
+                network, torch.as_tensor(windows.series, dtype=dtype)
+            ).contiguous()
         self.targets = torch.as_tensor(windows.targets, dtype=dtype)
         self.starts = torch.as_tensor(windows.starts)
         self.n_window = windows.n_window

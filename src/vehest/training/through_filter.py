@@ -36,7 +36,8 @@ class ThroughFilterSettings(Group):
     group = "training"
     version: ClassVar[str] = "1"
     one_step: PhaseSettings = setting(
-        PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine"), "the model as a one-step predictor"
+        PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine"),
+        "the model as a one-step predictor",
     )
     one_step_batch: int = setting(2048, "pairs of samples in a batch", least=1)
     through: PhaseSettings = setting(
@@ -50,16 +51,29 @@ class ThroughFilterSettings(Group):
     steps: int = setting(500, "samples T of a training sequence", least=1)
     drop_steps: int = setting(0, "first samples of a sequence that do not count", least=0)
     batch_size: int = setting(6, "sequences in a batch", least=1)
-    placing: Literal["fixed", "random"] = setting("random", "fixed: the same sequences every epoch; random: starts are drawn")
-    curriculum: tuple[int, ...] = setting((), "lengths of shorter sequences to begin with, each for curriculum_epochs")
+    placing: Literal["fixed", "random"] = setting(
+        "random", "fixed: the same sequences every epoch; random: starts are drawn"
+    )
+    curriculum: tuple[int, ...] = setting(
+        (), "lengths of shorter sequences to begin with, each for curriculum_epochs"
+    )
     curriculum_epochs: int = setting(100, "see curriculum", least=1)
-    truncate_steps: int = setting(0, "samples that gradients reach back; 0: to the start of the sequence", least=0)
+    truncate_steps: int = setting(
+        0, "samples that gradients reach back; 0: to the start of the sequence", least=0
+    )
     validation_steps: int = setting(1000, "samples of a validation sequence", least=1)
     validation_drop_steps: int = setting(200, "first samples of it that do not count", least=0)
     start_spread: float = setting(
-        0.2, "by how much the last state (friction) is off at the start of a training sequence, at most, up or down", least=0.0
+        0.2,
+        "by how much the last state (friction) is off at the start of a training sequence, at most, up or down",
+        least=0.0,
     )
-    mirrored: float = setting(0.5, "share of sequences and pairs that are seen in a mirror, left for right", least=0.0, most=1.0)
+    mirrored: float = setting(
+        0.5,
+        "share of sequences and pairs that are seen in a mirror, left for right",
+        least=0.0,
+        most=1.0,
+    )
     likelihood: float = setting(
         0.0,
         "weight of the mean negative log-likelihood of the errors of those states that epochs are judged by, under the filter's own "
@@ -67,7 +81,8 @@ class ThroughFilterSettings(Group):
         least=0.0,
     )
     start_noise: Literal["residuals", "given"] = setting(
-        "residuals", "residuals: noise starts from those of the pre-trained model and learns in units of them; given: the authors' values"
+        "residuals",
+        "residuals: noise starts from those of the pre-trained model and learns in units of them; given: the authors' values",
     )
     dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
@@ -75,9 +90,13 @@ class ThroughFilterSettings(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
-            raise ConfigurationError("training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps")
+            raise ConfigurationError(
+                "training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps"
+            )
         if any(steps <= self.drop_steps for steps in self.curriculum):
-            raise ConfigurationError(f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}")
+            raise ConfigurationError(
+                f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}"
+            )
 
 
 class Weights(NamedTuple):
@@ -108,7 +127,10 @@ def one_step_phase(
     def loss(batch: tuple[Tensor, Tensor]) -> Tensor:
         rows, turned = batch
         states, own = torch.where(turned, signs[0], 1.0), torch.where(turned, signs[1], 1.0)
-        return _weighted(filtering.moved(states * before[rows], own * inputs[rows]) - states * after[rows], weights.one_step)
+        return _weighted(
+            filtering.moved(states * before[rows], own * inputs[rows]) - states * after[rows],
+            weights.one_step,
+        )
 
     def judge() -> float:
         return float(_weighted(filtering.moved(judged[0], judged[1]) - judged[2], weights.one_step))
@@ -150,7 +172,10 @@ def filter_phases(
             order = torch.randperm(len(drives.states), generator=generator)
             for rows in order.split(settings.batch_size):
                 turned = _chosen(len(rows), settings.mirrored, generator).unsqueeze(-1)
-                signs = [torch.where(turned, part.new_tensor(list(own)), 1.0) for part, own in zip(drives, filtering.mirror, strict=True)]
+                signs = [
+                    torch.where(turned, part.new_tensor(list(own)), 1.0)
+                    for part, own in zip(drives, filtering.mirror, strict=True)
+                ]
                 own = Drive(*(part[rows] * own for part, own in zip(drives, signs, strict=True)))
                 start = own.states[:, 0].clone()
                 if settings.start_spread:
@@ -167,12 +192,18 @@ def filter_phases(
             if not settings.likelihood:
                 return squares
             covariance = covariance[:, kept][..., judged_by, :][..., judged_by]
-            return squares + settings.likelihood * gaussian_surprise(error[..., judged_by], covariance)
+            return squares + settings.likelihood * gaussian_surprise(
+                error[..., judged_by], covariance
+            )
 
         own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
-        return Phase(label, own, filtering, batches, loss, judge, trainable, prepare if first else None)
+        return Phase(
+            label, own, filtering, batches, loss, judge, trainable, prepare if first else None
+        )
 
-    lengths = [(steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum]
+    lengths = [
+        (steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum
+    ]
     lengths.append((settings.steps, how.max_epochs, name))
     return [phase(*length, first=number == 0) for number, length in enumerate(lengths)]
 
@@ -182,7 +213,11 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
 
     Raises `DataError`: no drive is long enough.
     """
-    starts = [(drive, first) for drive in drives for first in range(0, len(drive.states) - steps + 1, steps)]
+    starts = [
+        (drive, first)
+        for drive in drives
+        for first in range(0, len(drive.states) - steps + 1, steps)
+    ]
     return _stacked(starts, steps)
 
 
@@ -197,8 +232,15 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
 
 def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
     if not starts:
-        raise DataError(f"no drive is {steps} samples long, as a sequence for training through a filter is; lower training.steps")
-    return Drive(*(torch.stack([drive[part][first : first + steps] for drive, first in starts]) for part in range(3)))
+        raise DataError(
+            f"no drive is {steps} samples long, as a sequence for training through a filter is; lower training.steps"
+        )
+    return Drive(
+        *(
+            torch.stack([drive[part][first : first + steps] for drive, first in starts])
+            for part in range(3)
+        )
+    )
 
 
 def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
@@ -220,7 +262,11 @@ def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
     factor = torch.linalg.cholesky_ex(covariance).L
     whitened = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
     logarithms = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return (0.5 * whitened.square().sum(-1) + logarithms + 0.5 * error.shape[-1] * math.log(2.0 * math.pi)).mean()
+    return (
+        0.5 * whitened.square().sum(-1)
+        + logarithms
+        + 0.5 * error.shape[-1] * math.log(2.0 * math.pi)
+    ).mean()
 
 
 def _weighted(error: Tensor, weights: Tensor) -> Tensor:

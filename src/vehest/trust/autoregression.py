@@ -43,7 +43,9 @@ class Autoregression:
         if len(samples) > self.order:
             found[self.order :] = samples[self.order :] - self.constant
             for lag, coefficient in enumerate(self.coefficients, start=1):
-                found[self.order :] -= samples[self.order - lag : len(samples) - lag] @ coefficient.T
+                found[self.order :] -= (
+                    samples[self.order - lag : len(samples) - lag] @ coefficient.T
+                )
         return found
 
 
@@ -56,24 +58,41 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
             f"{len(targets)} samples without gaps are too few for an autoregression of order {max_order} in {n_channels} channels"
         )
     centre, spread = targets.mean(0), np.maximum(targets.std(0), 1e-12)
-    regressors, targets = (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order), (targets - centre) / spread
+    regressors, targets = (
+        (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order),
+        (targets - centre) / spread,
+    )
     kept = np.ones(len(targets), dtype=bool)
     for _ in range(2):
         left = _least_squares(regressors[kept], targets[kept], max_order * n_channels)
         residual = targets - left[0] - regressors @ left[1:]
         robust = 1.4826 * np.median(np.abs(residual), axis=0) + LEAST_DEVIATION
-        robust = np.maximum(robust, 0.2 * np.sqrt(np.mean(np.square(np.clip(residual, *np.percentile(residual, [0.5, 99.5], axis=0))), 0)))
+        robust = np.maximum(
+            robust,
+            0.2
+            * np.sqrt(
+                np.mean(
+                    np.square(np.clip(residual, *np.percentile(residual, [0.5, 99.5], axis=0))), 0
+                )
+            ),
+        )
         odd = (np.abs(residual) > OUTLIER * robust).any(1)
         kept = ~odd if odd.mean() < 0.02 else kept
     chosen, lowest = left, math.inf
     for order in range(1, max_order + 1):
         fitted = _least_squares(regressors[kept], targets[kept], order * n_channels)
-        residual = targets[kept] - fitted[0] - regressors[kept][:, : order * n_channels] @ fitted[1:]
+        residual = (
+            targets[kept] - fitted[0] - regressors[kept][:, : order * n_channels] @ fitted[1:]
+        )
         covariance = residual.T @ residual / len(residual) + LEAST_DEVIATION**2 * np.eye(n_channels)
-        criterion = len(residual) * float(np.linalg.slogdet(covariance)[1]) + fitted.size * math.log(len(residual))
+        criterion = len(residual) * float(
+            np.linalg.slogdet(covariance)[1]
+        ) + fitted.size * math.log(len(residual))
         if criterion < lowest:
             lowest, chosen, best = criterion, fitted, covariance
-    coefficients = chosen[1:].reshape(-1, n_channels, n_channels).transpose(0, 2, 1) * spread[:, None] / spread
+    coefficients = (
+        chosen[1:].reshape(-1, n_channels, n_channels).transpose(0, 2, 1) * spread[:, None] / spread
+    )
     constant = centre + spread * chosen[0] - coefficients.sum(0) @ centre
     return Autoregression(constant, coefficients, best * np.outer(spread, spread))
 
@@ -81,7 +100,11 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
 def _rows(pieces: Sequence[FloatArray], order: int) -> tuple[FloatArray, FloatArray]:
     """Regressors (N, p·C), the latest sample first, and targets (N, C) of complete rows."""
     windows = [np.empty((0, order + 1, pieces[0].shape[1]))]
-    windows += [sliding_window_view(piece, order + 1, axis=0).transpose(0, 2, 1)[:, ::-1] for piece in pieces if len(piece) > order]
+    windows += [
+        sliding_window_view(piece, order + 1, axis=0).transpose(0, 2, 1)[:, ::-1]
+        for piece in pieces
+        if len(piece) > order
+    ]
     rows = np.concatenate(windows)
     rows = rows[np.isfinite(rows).all((1, 2))]
     return rows[:, 1:].reshape(len(rows), order * rows.shape[2]), rows[:, 0]
@@ -91,11 +114,15 @@ def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) ->
     """Constant and coefficients of the first ``columns`` regressors, (1 + columns, C)."""
     design = np.concatenate([np.ones((len(regressors), 1)), regressors[:, :columns]], axis=1)
     gram = design.T @ design
-    gram[np.diag_indices_from(gram)] += 1e-10 * len(design)  # where one channel is another's multiple
+    gram[np.diag_indices_from(gram)] += 1e-10 * len(
+        design
+    )  # where one channel is another's multiple
     return np.linalg.solve(gram, design.T @ targets)
 
 
-def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int) -> tuple[FloatArray, FloatArray]:
+def learn_noise_levels(
+    innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int
+) -> tuple[FloatArray, FloatArray]:
     """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
 
     Returns:
@@ -106,5 +133,10 @@ def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: F
     own, speed = innovations[known] / np.sqrt(np.diag(covariance)), np.abs(speed[known])
     bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)
     speeds = np.array([float(np.median(speed[rows])) for rows in bins])
-    factors = np.array([np.sqrt(np.mean(np.square(np.clip(own[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0)) for rows in bins])
+    factors = np.array(
+        [
+            np.sqrt(np.mean(np.square(np.clip(own[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0))
+            for rows in bins
+        ]
+    )
     return speeds, np.clip(factors, *LEVELS)

@@ -60,16 +60,22 @@ Blocks = Literal["range", "turn"]
 class Quantity:
     """The band of one quantity."""
 
-    weights: dict[str, float]  # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
+    weights: dict[
+        str, float
+    ]  # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
     floor: float  # s is never below [m/s, or rad]
     factors: tuple[float, ...]  # q of each level
-    beyond: tuple[bool, ...]  # of each level, whether there are too few blocks for it (`pooled_quantile`)
+    beyond: tuple[
+        bool, ...
+    ]  # of each level, whether there are too few blocks for it (`pooled_quantile`)
     effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
         _check_terms("weights", self.weights)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
-            raise DataError(f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})")
+            raise DataError(
+                f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})"
+            )
         if not self.floor > 0 or min(self.factors) < 0:
             raise DataError("factors must not be negative, and floor must be positive")
 
@@ -84,7 +90,9 @@ class Quantity:
 class Bands:
     """Half widths of v and β of one model."""
 
-    vehicles: tuple[str, ...]  # that were driven where it was calibrated; none: a new car for each drive, as any car is to the model
+    vehicles: tuple[
+        str, ...
+    ]  # that were driven where it was calibrated; none: a new car for each drive, as any car is to the model
     datasets: tuple[str, ...]  # whose recordings these are
     scaled_on: tuple[str, ...]  # ranges that gave scale and domain
     calibrated_on: tuple[str, ...]  # ranges that gave the factors
@@ -107,12 +115,21 @@ class Bands:
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
         which, wider = LEVELS.index(SHOWN_LEVEL), OTHER_VEHICLE if elsewhere else 1.0
-        head = [self.vy.factors[which] * wider, self.sideslip.factors[which] * wider, self.vy.floor**2, self.sideslip.floor**2]
+        head = [
+            self.vy.factors[which] * wider,
+            self.sideslip.factors[which] * wider,
+            self.vy.floor**2,
+            self.sideslip.floor**2,
+        ]
         weights = [own.weights.get(name, 0.0) for own in (self.vy, self.sideslip) for name in TERMS]
-        numbers = np.array([*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)])
+        numbers = np.array(
+            [*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)]
+        )
         return PackedBands(_columns(self.channels), numbers)
 
-    def half_widths(self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False) -> FloatArray:
+    def half_widths(
+        self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False
+    ) -> FloatArray:
         """Half widths at `SHOWN_LEVEL`, (T, 2): v [m/s] and β [rad]; NaN where there is no estimate. Arguments as of `band_rows`."""
         bands = np.empty((len(vy), 2))
         band_rows(rows, vy, variance, *self.packed(elsewhere=elsewhere), bands)
@@ -127,7 +144,9 @@ def _check_terms(what: str, numbers: Mapping[str, float]) -> None:
 class PackedBands(NamedTuple):
     """A level's band as `band_rows` takes it."""
 
-    columns: NDArray[np.int64]  # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
+    columns: NDArray[
+        np.int64
+    ]  # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
     numbers: FloatArray  # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their largest sizes, (29,)
 
 
@@ -165,14 +184,26 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
         bands[k, 1] = math.pi
         if math.isfinite(vx):
             speed = max(abs(vx), numbers[4])
-            bands[k, 1] = min(numbers[1] * wider * math.sqrt(max(squared_sideslip / (speed * speed), numbers[3])), math.pi)
+            bands[k, 1] = min(
+                numbers[1] * wider * math.sqrt(max(squared_sideslip / (speed * speed), numbers[3])),
+                math.pi,
+            )
 
 
-def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
+def with_bands(
+    estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False
+) -> Estimate:
     """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad]; raises `DataError`."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
-    return replace(estimate, channels={**estimate.channels, "band_vy": half[:, 0].copy(), "band_sideslip": half[:, 1].copy()})
+    return replace(
+        estimate,
+        channels={
+            **estimate.channels,
+            "band_vy": half[:, 0].copy(),
+            "band_sideslip": half[:, 1].copy(),
+        },
+    )
 
 
 def band_inputs(
@@ -183,7 +214,9 @@ def band_inputs(
     A row is the last sample that the estimate was made of, so that online they are the same.
     """
     if len(estimate) != len(measured):
-        raise DataError(f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the recording {len(measured)}")
+        raise DataError(
+            f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the recording {len(measured)}"
+        )
     rows = measured.stack(channels)
     rows = np.ascontiguousarray(rows[np.maximum(np.arange(len(rows)) - horizon_steps, 0)])
     variance = np.full(len(estimate), np.nan)
@@ -194,7 +227,9 @@ def band_inputs(
 
 
 def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
-    return np.array([channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64)
+    return np.array(
+        [channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64
+    )
 
 
 # Calibration
@@ -217,7 +252,9 @@ class Piece:
         return np.asarray(np.isfinite(self.errors).all(axis=1))
 
 
-def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels: tuple[str, ...], **origin: Any) -> Bands:
+def calibrated(
+    training: Sequence[Piece], validation: Sequence[Piece], channels: tuple[str, ...], **origin: Any
+) -> Bands:
     """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
 
     ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
@@ -225,10 +262,19 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels:
     """
     for pieces, what in ((training, "training"), (validation, "validation")):
         if not any(piece.known.any() for piece in pieces):
-            raise DataError(f"no sample of the {what} ranges has both an estimate and a reference to calibrate bands by")
+            raise DataError(
+                f"no sample of the {what} ranges has both an estimate and a reference to calibrate bands by"
+            )
     columns = _columns(channels)
-    terms = np.concatenate([terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.known] for piece in training])
-    largest = np.array([np.quantile(own[np.isfinite(own)], DOMAIN_QUANTILE) if np.isfinite(own).any() else 0.0 for own in np.abs(terms).T])
+    terms = np.concatenate(
+        [terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.known] for piece in training]
+    )
+    largest = np.array(
+        [
+            np.quantile(own[np.isfinite(own)], DOMAIN_QUANTILE) if np.isfinite(own).any() else 0.0
+            for own in np.abs(terms).T
+        ]
+    )
     vx = np.abs(terms[:, TERMS.index("vx")])
     speed = np.maximum(np.where(np.isfinite(vx), vx, LOWEST_SPEED), LOWEST_SPEED)
     usable = np.isfinite(terms).any(axis=0)
@@ -240,9 +286,15 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels:
     scales = []
     for own, error in zip((filled, filled / speed[:, None]), errors.T, strict=True):
         weights, floor = fitted_scale(own, error)
-        kept = {name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0}
+        kept = {
+            name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0
+        }
         scales.append(Quantity(kept, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0))
-    labels, kind = block_labels([piece.yaw_rate for piece in validation], [len(piece.vy) for piece in validation], validation[0].rate_hz)
+    labels, kind = block_labels(
+        [piece.yaw_rate for piece in validation],
+        [len(piece.vy) for piece in validation],
+        validation[0].rate_hz,
+    )
     blocks = np.concatenate(labels)[np.concatenate([piece.known for piece in validation])]
     bands = Bands(
         **origin,
@@ -250,26 +302,47 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels:
         blocks=kind,
         n_blocks=len(np.unique(blocks)),
         seconds=len(blocks) / validation[0].rate_hz,
-        largest={name: float(size) for name, size in zip(TERMS, largest, strict=True) if size > 0 and name != "one"},
+        largest={
+            name: float(size)
+            for name, size in zip(TERMS, largest, strict=True)
+            if size > 0 and name != "one"
+        },
         vy=scales[0],
         sideslip=scales[1],
     )
-    half = [bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known] for piece in validation]
-    scores = np.abs(np.concatenate([piece.errors[piece.known] for piece in validation])) / np.concatenate(half)
-    vy, sideslip = (_with_factors(own, score, blocks) for own, score in zip(scales, scores.T, strict=True))
+    half = [
+        bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known] for piece in validation
+    ]
+    scores = np.abs(
+        np.concatenate([piece.errors[piece.known] for piece in validation])
+    ) / np.concatenate(half)
+    vy, sideslip = (
+        _with_factors(own, score, blocks) for own, score in zip(scales, scores.T, strict=True)
+    )
     return replace(bands, vy=vy, sideslip=sideslip)
 
 
-def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
+def terms_of(
+    rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]
+) -> FloatArray:
     """`TERMS` of each sample without their squares, (T, 8); NaN where a channel is not read or was not measured."""
-    vx, ax, ay, yaw_rate, steer = (rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns)
+    vx, ax, ay, yaw_rate, steer = (
+        rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns
+    )
     deviation = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-    return np.stack([deviation, np.ones(len(rows)), vx, ax, ay, yaw_rate * vx, steer * vx, vy], axis=1)
+    return np.stack(
+        [deviation, np.ones(len(rows)), vx, ax, ay, yaw_rate * vx, steer * vx, vy], axis=1
+    )
 
 
 def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
-    factors, beyond = zip(*(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True)
-    squared = np.asarray(np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)), dtype=np.float64)
+    factors, beyond = zip(
+        *(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True
+    )
+    squared = np.asarray(
+        np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)),
+        dtype=np.float64,
+    )
     return replace(own, factors=factors, beyond=beyond, effective_blocks=effective_blocks(squared))
 
 
@@ -299,7 +372,9 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
     predicted, weights = np.full(len(targets), max(mean, floor**2)), np.zeros(terms.shape[1])
     for _ in range(FITS):
         whitened = squares / columns / predicted[:, None]
-        triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r"))  # few rows
+        triangle: FloatArray = np.asarray(
+            np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r")
+        )  # few rows
         weights = scipy.optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
         former, predicted = predicted, np.maximum(squares @ weights, floor**2)
         if np.allclose(predicted, former, rtol=1e-6):
@@ -307,7 +382,9 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
     return np.asarray(weights), floor
 
 
-def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float) -> tuple[float, bool]:
+def pooled_quantile(
+    scores: FloatArray, blocks: NDArray[np.int64], level: float
+) -> tuple[float, bool]:
     """The level's quantile of scores pooled over K blocks, each of the same weight, with 1/(n + 1) of the weight at infinity.
 
     n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in blocks of m on average, ρ the intraclass
@@ -356,7 +433,9 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
     return (between - within) / total if total > 0 else float("nan")
 
 
-def block_labels(yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float) -> tuple[list[NDArray[np.int64]], Blocks]:
+def block_labels(
+    yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float
+) -> tuple[list[NDArray[np.int64]], Blocks]:
     """Block that each sample of some ranges belongs to, counted through: a range each if there are 10, else from turn to turn.
 
     A range without yaw rate [rad/s] is one block.
@@ -365,7 +444,11 @@ def block_labels(yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int],
     kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"
     for yaw_rate, length in zip(yaw_rates, lengths, strict=True):
         whole = kind == "range" or yaw_rate is None
-        own = np.zeros(length, dtype=np.int64) if yaw_rate is None or whole else turns_of(yaw_rate, rate_hz)
+        own = (
+            np.zeros(length, dtype=np.int64)
+            if yaw_rate is None or whole
+            else turns_of(yaw_rate, rate_hz)
+        )
         found.append(own + count)
         count += int(own[-1]) + 1 if length else 0
     return found, kind

@@ -30,7 +30,16 @@ from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, Stepper
 from vehest.trust.front_end import FrontEnd
-from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
+from vehest.trust.guard import (
+    BRIDGED_SECONDS,
+    RESTART,
+    USE,
+    WAIT,
+    Cleaned,
+    Guard,
+    GuardLimits,
+    usual_limits,
+)
 from vehest.trust.health import Health
 from vehest.trust.record import Trust
 from vehest.trust.verdict import Monitor, starts_anew
@@ -63,18 +72,35 @@ class GuardedRun:
     """
 
     def __init__(
-        self, estimator: Estimator, trust: Trust | None = None, initial_state: Mapping[str, float] | None = None, *, elsewhere: bool = False
+        self,
+        estimator: Estimator,
+        trust: Trust | None = None,
+        initial_state: Mapping[str, float] | None = None,
+        *,
+        elsewhere: bool = False,
     ) -> None:
-        limits, rate, kind = limits_for(estimator, trust), estimator.settings.rate_hz, type(estimator)
+        limits, rate, kind = (
+            limits_for(estimator, trust),
+            estimator.settings.rate_hz,
+            type(estimator),
+        )
         self.estimator, self.initial_state = estimator, initial_state
-        self.guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
+        self.guard = Guard(
+            estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator)
+        )
         self.monitor = Monitor(estimator, trust, elsewhere=elsewhere)
         self.watch = Watch(limits, estimator.warm_up_steps, rate)
-        self._has_state = estimator.causal and kind._estimate_all is Estimator._estimate_all and kind.run is not Estimator.run
+        self._has_state = (
+            estimator.causal
+            and kind._estimate_all is Estimator._estimate_all
+            and kind.run is not Estimator.run
+        )
         self.takes_parts = self._has_state or estimator.warm_up_steps > 0
         self._begun, self._speed = False, np.full(1, np.nan)
         self._state: Any = None  # of the estimator after the last row
-        self._window = np.empty((0, len(estimator.channels)))  # rows that it still sees, where it has no state
+        self._window = np.empty(
+            (0, len(estimator.channels))
+        )  # rows that it still sees, where it has no state
         self._late: dict[str, FloatArray] = {}  # values of the last ``horizon_steps`` rows
         self.others: dict[str, FloatArray] = {}
         self.covariance: FloatArray | None = None
@@ -95,8 +121,12 @@ class GuardedRun:
         estimator = self.estimator
         missing = [name for name in estimator.channels if name not in samples]
         if missing:
-            raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
-        rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
+            raise DataError(
+                f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs"
+            )
+        rows = np.ascontiguousarray(
+            np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1)
+        )
         self.recording, self.cleaned, steps = recording, self.guard(rows), len(rows)
         verdict = self.monitor.before(rows, self.cleaned)
         self.motion = motion_of(estimator.channels, self.cleaned)
@@ -123,7 +153,9 @@ class GuardedRun:
             return self._watched(start, end, np.full(end - start, np.nan))[0]
         goes_on = self._begun and start == 0 and flow[0] == USE and not lost
         state, window = (self._state, self._window) if goes_on else (None, self._window[:0])
-        first_reach = self.estimator.warm_up_steps + math.ceil(2.0 * self.estimator.settings.rate_hz)
+        first_reach = self.estimator.warm_up_steps + math.ceil(
+            2.0 * self.estimator.settings.rate_hz
+        )
         reach = min(start + first_reach, end) if lost else end
         while True:
             before = self.watch.state.copy()
@@ -135,7 +167,11 @@ class GuardedRun:
 
     def _watched(self, start: int, end: int, raw: FloatArray) -> tuple[int, bool]:
         motion = self.motion[start:end]
-        motion = np.where(np.isnan(motion), np.stack([self.vx[start:end], motion[:, 1], motion[:, 2]], axis=1), motion)
+        motion = np.where(
+            np.isnan(motion),
+            np.stack([self.vx[start:end], motion[:, 1], motion[:, 2]], axis=1),
+            motion,
+        )
         watched = self.watch(raw, np.ascontiguousarray(motion), self.cleaned.flow[start:end])
         done = start + len(watched.vy)
         self.out[start:done], self.marks[start:done] = watched.vy, watched.marks
@@ -143,17 +179,37 @@ class GuardedRun:
 
     def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
         """The estimator's v after each row of a piece, (T,), which goes on from a state or from the rows before it, or begins anew."""
-        extra = self.estimator.horizon_steps  # rows after the last, whose values no estimate at their time depends on
+        extra = (
+            self.estimator.horizon_steps
+        )  # rows after the last, whose values no estimate at their time depends on
         seen = np.concatenate([window, self.cleaned.rows[start:end]])
         self._window = seen[max(len(seen) - self.estimator.warm_up_steps, 0) :]
-        channels = dict(zip(self.estimator.channels, np.concatenate([seen, np.repeat(seen[-1:], extra, axis=0)]).T, strict=True))
+        channels = dict(
+            zip(
+                self.estimator.channels,
+                np.concatenate([seen, np.repeat(seen[-1:], extra, axis=0)]).T,
+                strict=True,
+            )
+        )
         r, rate = self.recording, self.estimator.settings.rate_hz
-        piece = Recording(r.id, r.vehicle, rate, r.start_time, channels, r.kind, frozenset(self.estimator.skippable))
+        piece = Recording(
+            r.id,
+            r.vehicle,
+            rate,
+            r.start_time,
+            channels,
+            r.kind,
+            frozenset(self.estimator.skippable),
+        )
         try:
-            estimate = self._going_on(state).estimate([piece], None if self._begun or start else self.initial_state)[0]
+            estimate = self._going_on(state).estimate(
+                [piece], None if self._begun or start else self.initial_state
+            )[0]
         except FAILURES:
             self._state = None
-            return self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
+            return (
+                self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
+            )
         shift = slice(len(window) + extra, len(window) + extra + end - start)
         if "vx" in estimate.channels:
             self.vx[start:end] = estimate["vx"][shift]
@@ -166,7 +222,9 @@ class GuardedRun:
             self.covariance[start:end] = estimate.covariance[shift]
         for name, values in estimate.channels.items():
             if name not in ("vy", "sideslip"):
-                self.others.setdefault(name, np.full(len(self.out), np.nan))[start:end] = values[shift]
+                self.others.setdefault(name, np.full(len(self.out), np.nan))[start:end] = values[
+                    shift
+                ]
         return np.asarray(estimate["vy"][shift])
 
     def _stepped(self, start: int, end: int) -> FloatArray:
@@ -175,7 +233,9 @@ class GuardedRun:
         raw = np.full(end - start, np.nan)
         for k in range(start, end):
             try:
-                found = stepper.step(dict(zip(self.estimator.channels, self.cleaned.rows[k].tolist(), strict=True)))
+                found = stepper.step(
+                    dict(zip(self.estimator.channels, self.cleaned.rows[k].tolist(), strict=True))
+                )
             except FAILURES:
                 stepper = self.estimator.online()
                 continue
@@ -200,10 +260,14 @@ class GuardedRun:
     def _estimate(self, verdict: Health) -> Estimate:
         """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
         r, horizon, monitor = self.recording, self.estimator.horizon_steps, self.monitor
-        vx = np.concatenate([self._speed, np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])])
+        vx = np.concatenate(
+            [self._speed, np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])]
+        )
         vx = vx[np.maximum.accumulate(np.where(np.isnan(vx), 0, np.arange(len(vx))))][1:]
         self._speed = vx[-1:]
-        bands = monitor.after(verdict, Watched(self.out, self.marks, lost=False), self.cleaned, vx, self.variance)
+        bands = monitor.after(
+            verdict, Watched(self.out, self.marks, lost=False), self.cleaned, vx, self.variance
+        )
 
         def later(name: str, values: FloatArray) -> FloatArray:
             both = np.concatenate([self._late.get(name, np.full(horizon, np.nan)), values])
@@ -211,14 +275,32 @@ class GuardedRun:
             return both[: len(values)]
 
         vy = later("vy", self.out)
-        channels = {"vy": vy, "sideslip": np.where(np.hypot(vx, vy) < STANDSTILL_SPEED, 0.0, np.arctan2(vy, vx))}
+        channels = {
+            "vy": vy,
+            "sideslip": np.where(np.hypot(vx, vy) < STANDSTILL_SPEED, 0.0, np.arctan2(vy, vx)),
+        }
         channels |= {name: later(name, values) for name, values in self.others.items()}
         if monitor.has_bands:
-            channels |= {"band_vy": later("band_vy", bands[:, 0]), "band_sideslip": later("band_sideslip", bands[:, 1])}
+            channels |= {
+                "band_vy": later("band_vy", bands[:, 0]),
+                "band_sideslip": later("band_sideslip", bands[:, 1]),
+            }
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
         mode: Mode = "causal" if self.estimator.causal else "offline"
-        covariance = (self.covariance, self.covariance_of) if self.covariance is not None and horizon == 0 else (None, ())
-        return Estimate(r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode, *covariance)
+        covariance = (
+            (self.covariance, self.covariance_of)
+            if self.covariance is not None and horizon == 0
+            else (None, ())
+        )
+        return Estimate(
+            r.id,
+            self.estimator.name,
+            self.estimator.settings.rate_hz,
+            r.start_time,
+            channels,
+            mode,
+            *covariance,
+        )
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
@@ -227,7 +309,9 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
     for column, name in enumerate(MOTION):
         if name in channels:
             at = channels.index(name)
-            motion[:, column] = np.where(cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan)
+            motion[:, column] = np.where(
+                cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan
+            )
     return motion
 
 
@@ -244,21 +328,38 @@ class GuardedStepper(Stepper):
     """
 
     def __init__(
-        self, estimator: Estimator, trust: Trust | None = None, bus_rate_hz: float | None = None, *, elsewhere: bool = False
+        self,
+        estimator: Estimator,
+        trust: Trust | None = None,
+        bus_rate_hz: float | None = None,
+        *,
+        elsewhere: bool = False,
     ) -> None:
         self.estimator, self._channels = estimator, tuple(estimator.channels)
-        self._stepper, self._fresh, self.horizon_steps = estimator.online(), True, estimator.horizon_steps
+        self._stepper, self._fresh, self.horizon_steps = (
+            estimator.online(),
+            True,
+            estimator.horizon_steps,
+        )
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
-        self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz is not None else None
+        self._front = (
+            FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate)
+            if bus_rate_hz is not None
+            else None
+        )
         self._rate = rate if bus_rate_hz is None else bus_rate_hz
-        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
+        self._guard = Guard(
+            estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator)
+        )
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
         filtered = bus_rate_hz is not None and bus_rate_hz > rate * (1 + 1e-6)
         self._monitor = Monitor(estimator, trust, elsewhere=elsewhere, behind_front_end=filtered)
         self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)
         self._raw, self._vx, self._variance = np.empty(1), np.full(1, np.nan), np.full(1, np.nan)
-        self._places = [estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION]
+        self._places = [
+            estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
+        ]
         self._clock = _Clock(self._rate)
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
@@ -322,7 +423,11 @@ class GuardedStepper(Stepper):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
         vx = float(self._vx[0])
-        found = {**self._others, "vy": vy, "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx)}
+        found = {
+            **self._others,
+            "vy": vy,
+            "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx),
+        }
         if self._monitor.has_bands:
             found["band_vy"], found["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
         found["health"], found["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
@@ -338,10 +443,14 @@ class GuardedStepper(Stepper):
             self._stepper = self.estimator.online()
         self._fresh = False
         try:
-            found = self._stepper.step(dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True)))
+            found = self._stepper.step(
+                dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True))
+            )
         except FAILURES:
             return math.nan, math.nan, math.nan, True
-        self._others = {name: value for name, value in found.items() if name not in ("vy", "vy_variance")}
+        self._others = {
+            name: value for name, value in found.items() if name not in ("vy", "vy_variance")
+        }
         return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan), False
 
 
@@ -365,6 +474,13 @@ class _Clock:
     def _note(self, gap: float) -> None:
         self._gaps.append(gap)
         middle = float(np.median(self._gaps))
-        if len(self._gaps) == RATE_INTERVALS and middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
+        if (
+            len(self._gaps) == RATE_INTERVALS
+            and middle > 0
+            and abs(middle * self._rate - 1.0) > RATE_TOLERANCE
+        ):
             found = f"{1.0 / middle:.3g}"
-            warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
+            warnings.warn(
+                f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}",
+                stacklevel=4,
+            )

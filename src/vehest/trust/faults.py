@@ -36,18 +36,28 @@ STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {
     "vx": (0.5, 2.0, 5.0),
-    **dict.fromkeys(("yaw_rate", "roll_rate", "pitch_rate"), (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE)),
+    **dict.fromkeys(
+        ("yaw_rate", "roll_rate", "pitch_rate"), (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE)
+    ),
     "ax": (0.3, 1.0, 3.0),
     "ay": (0.3, 1.0, 3.0),
     **dict.fromkeys(("steer", "roll", "pitch"), (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE)),
-    "handwheel": (0.5 * DEGREE * STEERING_RATIO, 2.0 * DEGREE * STEERING_RATIO, 6.0 * DEGREE * STEERING_RATIO),
+    "handwheel": (
+        0.5 * DEGREE * STEERING_RATIO,
+        2.0 * DEGREE * STEERING_RATIO,
+        6.0 * DEGREE * STEERING_RATIO,
+    ),
 }
 """Channel -> mild, medium and severe offset [unit of the channel]."""
 
 OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
 """Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples: their radii differ by a factor of ten."""
 
-OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)  # offsets of all other channels, as shares of the largest size that `CHANNELS` allows
+OFFSETS_OF_RANGE: Sizes = (
+    0.01,
+    0.05,
+    0.2,
+)  # offsets of all other channels, as shares of the largest size that `CHANNELS` allows
 
 UNIT_FACTORS: dict[str, Sizes] = {
     "m/s": (2.236936, 1.0 / 3.6, 3.6),
@@ -73,7 +83,9 @@ class Fault:
     onset: float = 0.0  # time of its start after the first sample [s]
     duration: float = math.inf  # [s]; ``inf``: to the end
     seed: int = 0  # of everything that is drawn
-    size: float | None = None  # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
+    size: float | None = (
+        None  # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
+    )
 
     def __post_init__(self) -> None:
         for name, known in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
@@ -81,18 +93,29 @@ class Fault:
             if value not in known:
                 close = difflib.get_close_matches(value, known, n=1)
                 hint = f"did you mean {close[0]}? " if close else ""
-                raise ConfigurationError(f"fault.{name} '{value}' is not there; {hint}there are: {', '.join(known)}")
+                raise ConfigurationError(
+                    f"fault.{name} '{value}' is not there; {hint}there are: {', '.join(known)}"
+                )
         if CHANNELS[self.channel].is_reference:
-            raise ConfigurationError(f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel")
+            raise ConfigurationError(
+                f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel"
+            )
         if not applies(self.kind, self.channel):
             fitting = ", ".join(name for name in CHANNELS if applies(self.kind, name))
-            raise ConfigurationError(f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}")
+            raise ConfigurationError(
+                f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}"
+            )
         own = KINDS[self.kind].own_size
         for name, value, wanted, fits in (
             ("start", self.onset, "a time from 0 s on", 0 <= self.onset < math.inf),
             ("duration", self.duration, "positive", self.duration > 0),
             ("seed", self.seed, "a whole number from 0 to 2^63 - 1", 0 <= self.seed < 2**63),
-            (f"size of a fault '{self.kind}'", self.size, own, self.size is None or OWN_SIZES[own](self.size)),
+            (
+                f"size of a fault '{self.kind}'",
+                self.size,
+                own,
+                self.size is None or OWN_SIZES[own](self.size),
+            ),
         ):
             if not fits:
                 raise ConfigurationError(f"fault.{name} must be {wanted}, not {value:g}")
@@ -135,34 +158,48 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
     return sizes * (OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(own))
 
 
-def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
+def inject(
+    samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault
+) -> dict[str, FloatArray]:
     """Samples, channel -> (T,) [SI], with a fault in one channel (else `ConfigurationError`), which may then hold any value."""
     if fault.channel not in samples:
-        raise ConfigurationError(f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}")
+        raise ConfigurationError(
+            f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}"
+        )
     values = np.array(samples[fault.channel], dtype=np.float64)
     first, end = window(fault, len(values), rate_hz)
     if first < end:
-        values[first:end] = KINDS[fault.kind].effect(FaultedChannel(fault, values.copy(), first, end, rate_hz))
+        values[first:end] = KINDS[fault.kind].effect(
+            FaultedChannel(fault, values.copy(), first, end, rate_hz)
+        )
     return {**samples, fault.channel: values}
 
 
 def window(fault: Fault, n_samples: int, rate_hz: float) -> tuple[int, int]:
     """First index and end index of the samples while a fault lasts."""
     ends = (fault.onset * rate_hz, (fault.onset + fault.duration) * rate_hz)
-    first, end = (min(math.ceil(at - 1e-6) if math.isfinite(at) else n_samples, n_samples) for at in ends)
+    first, end = (
+        min(math.ceil(at - 1e-6) if math.isfinite(at) else n_samples, n_samples) for at in ends
+    )
     return first, end
 
 
 class FaultedChannel:
     """A channel while its fault lasts, with the random draws of the fault."""
 
-    def __init__(self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float) -> None:
+    def __init__(
+        self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float
+    ) -> None:
         self.values, self.first, self.end, self.rate_hz = values, first, end, rate_hz
         self.inside = values[first:end]
         self.seconds = np.arange(end - first) / rate_hz
         self.range = _range(CHANNELS[fault.channel])
-        self.random = np.random.default_rng([fault.seed, zlib.crc32(f"{fault.kind}:{fault.channel}".encode())])
-        self.size = size_of(fault.kind, fault.channel, fault.severity) if fault.size is None else fault.size
+        self.random = np.random.default_rng(
+            [fault.seed, zlib.crc32(f"{fault.kind}:{fault.channel}".encode())]
+        )
+        self.size = (
+            size_of(fault.kind, fault.channel, fault.severity) if fault.size is None else fault.size
+        )
         if fault.size is None and fault.kind in ("bias", "drift", "scale"):
             self.size *= float(self.random.choice([-1.0, 1.0]))
         if isinstance(KINDS[fault.kind].sizes, float) and _turns(fault.channel):
@@ -185,7 +222,9 @@ class FaultedChannel:
     def pieces(self) -> NDArray[np.bool_]:
         """Samples in pieces of `PIECE_SECONDS`."""
         length = max(round(PIECE_SECONDS * self.rate_hz), 1)
-        return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[: len(self.inside)]
+        return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[
+            : len(self.inside)
+        ]
 
     def earlier(self, samples: int) -> FloatArray:
         """The channel so many samples before; its first value before that."""
@@ -211,12 +250,19 @@ def _lost_wheel(at: FaultedChannel) -> FloatArray:
 class Kind(NamedTuple):
     """A kind of fault."""
 
-    sizes: Sizes | float | None  # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong unit
+    sizes: (
+        Sizes | float | None
+    )  # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong unit
     own_size: str  # what a size of one's own must be, a key of `OWN_SIZES`
     effect: Callable[[FaultedChannel], FloatArray]
 
 
-ANY, SHARE, POSITIVE, FACTOR = "a number other than 0", "a share above 0, up to 1", "a positive number", "a factor from 0 on"
+ANY, SHARE, POSITIVE, FACTOR = (
+    "a number other than 0",
+    "a share above 0, up to 1",
+    "a positive number",
+    "a factor from 0 on",
+)
 OWN_SIZES: dict[str, Callable[[float], bool]] = {
     ANY: lambda size: math.isfinite(size) and size != 0,
     SHARE: lambda size: 0 < size <= 1,
@@ -226,23 +272,47 @@ OWN_SIZES: dict[str, Callable[[float], bool]] = {
 
 KINDS: dict[str, Kind] = {
     "bias": Kind(1.0, ANY, lambda at: at.inside + at.size),
-    "drift": Kind(0.1, ANY, lambda at: at.inside + at.size * at.seconds),  # reaches the offset in 10 s
+    "drift": Kind(
+        0.1, ANY, lambda at: at.inside + at.size * at.seconds
+    ),  # reaches the offset in 10 s
     "scale": Kind((0.05, 0.2, 0.5), ANY, lambda at: at.inside * (1.0 + at.size)),  # factor less 1
-    "frozen": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)),  # of the duration
-    "dropout": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), 0.0, at.inside)),  # share of the samples
+    "frozen": Kind(
+        (0.1, 0.5, 1.0),
+        SHARE,
+        lambda at: np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside),
+    ),  # of the duration
+    "dropout": Kind(
+        (0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), 0.0, at.inside)
+    ),  # share of the samples
     "spikes": Kind(10.0, ANY, lambda at: at.inside + at.size * at.signs() * at.drawn(SPIKE_SHARE)),
-    "noise": Kind(1.0, POSITIVE, lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside))),
-    "delay": Kind((0.05, 0.2, 0.5), POSITIVE, lambda at: at.earlier(max(round(at.size * at.rate_hz), 1))),  # s, at least one sample
+    "noise": Kind(
+        1.0, POSITIVE, lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside))
+    ),
+    "delay": Kind(
+        (0.05, 0.2, 0.5), POSITIVE, lambda at: at.earlier(max(round(at.size * at.rate_hz), 1))
+    ),  # s, at least one sample
     "saturation": Kind((0.8, 0.5, 0.2), SHARE, _saturation),  # of the channel's largest size
-    "sign": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), -at.inside, at.inside)),  # of the duration
+    "sign": Kind(
+        (0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), -at.inside, at.inside)
+    ),  # of the duration
     "unit": Kind(None, ANY, lambda at: at.inside * at.size),
-    "nan": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), np.nan, at.inside)),  # share of the samples
-    "inf": Kind((0.01, 0.1, 1.0), SHARE, lambda at: np.where(at.drawn(at.size), at.signs() * np.inf, at.inside)),  # at least one
+    "nan": Kind(
+        (0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), np.nan, at.inside)
+    ),  # share of the samples
+    "inf": Kind(
+        (0.01, 0.1, 1.0),
+        SHARE,
+        lambda at: np.where(at.drawn(at.size), at.signs() * np.inf, at.inside),
+    ),  # at least one
     "huge": Kind(  # times the channel's physical range
-        (10.0, 1e4, 1e200), POSITIVE, lambda at: np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
+        (10.0, 1e4, 1e200),
+        POSITIVE,
+        lambda at: np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside),
     ),
     "held": Kind((0.1, 0.25, 0.5), POSITIVE, _held),  # s, at least two samples
-    "lost_wheel": Kind((math.nan, 1.5, 0.0), FACTOR, _lost_wheel),  # factor of the speed; NaN: drops out
+    "lost_wheel": Kind(
+        (math.nan, 1.5, 0.0), FACTOR, _lost_wheel
+    ),  # factor of the speed; NaN: drops out
 }
 """Kind -> sizes, limits of a size of one's own, effect on the channel while the fault lasts."""
 

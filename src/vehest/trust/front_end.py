@@ -31,13 +31,22 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     """
     at = np.arange(len(samples))
     known = [np.isfinite(column) for column in samples.T]
-    full = [np.interp(at, at[own], column[own]) if own.any() else np.zeros(len(at)) for own, column in zip(known, samples.T, strict=True)]
+    full = [
+        np.interp(at, at[own], column[own]) if own.any() else np.zeros(len(at))
+        for own, column in zip(known, samples.T, strict=True)
+    ]
     together = np.stack(full, axis=1)
     fast = scipy.signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
     band = scipy.signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
-    density = scipy.signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (NOISE_BAND[1] - NOISE_BAND[0])
-    noise = np.sqrt(0.5 * USUAL_RATIO * density) * np.random.default_rng(0).standard_normal(fast.shape)
-    fast += scipy.signal.sosfilt(scipy.signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0)
+    density = scipy.signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (
+        NOISE_BAND[1] - NOISE_BAND[0]
+    )
+    noise = np.sqrt(0.5 * USUAL_RATIO * density) * np.random.default_rng(0).standard_normal(
+        fast.shape
+    )
+    fast += scipy.signal.sosfilt(
+        scipy.signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0
+    )
     sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
     start = scipy.signal.sosfilt_zi(sections)[:, :, None] * fast[0]
     found = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
@@ -55,18 +64,36 @@ class FrontEnd:
     Raises `ConfigurationError`: the bus is slower than the estimator, or faster than any.
     """
 
-    def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
+    def __init__(
+        self,
+        channels: Sequence[str],
+        skippable: Sequence[str],
+        limits: GuardLimits,
+        bus_rate_hz: float,
+        rate_hz: float,
+    ) -> None:
         if not bus_rate_hz >= rate_hz * (1 - SLACK):
-            raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz")
+            raise ConfigurationError(
+                f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz"
+            )
         if not bus_rate_hz <= HIGHEST_RATE:
-            raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are beyond any bus; rates go up to {HIGHEST_RATE:g} Hz")
-        usual = usual_limits(channels, bus_rate_hz).channels  # jumps are those of another rate; ranges are the same
-        merged = {name: replace(own, jump=max(usual[name].jump, own.jump)) for name, own in (limits.channels or usual).items()}
+            raise ConfigurationError(
+                f"samples at {bus_rate_hz:g} Hz are beyond any bus; rates go up to {HIGHEST_RATE:g} Hz"
+            )
+        usual = usual_limits(
+            channels, bus_rate_hz
+        ).channels  # jumps are those of another rate; ranges are the same
+        merged = {
+            name: replace(own, jump=max(usual[name].jump, own.jump))
+            for name, own in (limits.channels or usual).items()
+        }
         self._guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)
         self._ratio = rate_hz / bus_rate_hz
         self._phase = 1.0 - self._ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):
-            self._sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos")
+            self._sections = scipy.signal.butter(
+                ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos"
+            )
         else:
             self._sections = np.zeros((0, 6))
         self._state = np.full((len(self._sections), len(channels), 2), math.nan)
@@ -78,7 +105,10 @@ class FrontEnd:
         if not len(self._sections):
             return 0.0
         numerator, denominator = scipy.signal.sos2tf(self._sections)
-        return float(scipy.signal.group_delay((numerator, denominator), w=[1e-6])[1][0]) / self._guard.rate_hz
+        return (
+            float(scipy.signal.group_delay((numerator, denominator), w=[1e-6])[1][0])
+            / self._guard.rate_hz
+        )
 
     def __call__(self, row: FloatArray) -> FloatArray | None:
         """Take one row, (1, C); returns a row for the estimator where one is due, NaN what was not measured."""

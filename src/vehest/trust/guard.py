@@ -31,7 +31,12 @@ LEAST_RUN = 0.3  # s
 STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
 NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
 
-REACHED = {"m/s²": (25.0, 200.0, 6.0), "rad/s": (4.0, 15.0, 0.5), "rad": (1.0, 15.0, 0.1), "m/s": (100.0, 25.0, 2.0)}
+REACHED = {
+    "m/s²": (25.0, 200.0, 6.0),
+    "rad/s": (4.0, 15.0, 0.5),
+    "rad": (1.0, 15.0, 0.1),
+    "m/s": (100.0, 25.0, 2.0),
+}
 """Unit -> size and change a second that some road car reaches, and change by the sensors' noise, where none was learnt."""
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
@@ -41,9 +46,16 @@ STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steerin
 
 ENDLESS = 1e300  # stops of channels that have none
 
-STANDSTILL_SPEED, STANDSTILL_YAW_RATE = 0.5, 0.05  # m/s, rad/s: below both, nothing is expected to move
+STANDSTILL_SPEED, STANDSTILL_YAW_RATE = (
+    0.5,
+    0.05,
+)  # m/s, rad/s: below both, nothing is expected to move
 
-USE, WAIT, RESTART = 0, 1, 2  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
+USE, WAIT, RESTART = (
+    0,
+    1,
+    2,
+)  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
 
 
 @dataclass(frozen=True)
@@ -54,7 +66,10 @@ class ChannelLimits:
     high: float  # largest value [unit]
     jump: Annotated[float, "a positive number"]  # largest change from one sample to the next [unit]
     run: float = 0.0  # longest time that it may stand still while the car moves [s]; 0 if any
-    stops: tuple[float, float] = (-ENDLESS, ENDLESS)  # between which alone it is expected to move [unit]
+    stops: tuple[float, float] = (
+        -ENDLESS,
+        ENDLESS,
+    )  # between which alone it is expected to move [unit]
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,9 @@ class GuardLimits:
 
     channels: Mapping[str, ChannelLimits] = field(default_factory=dict)  # name -> limits
     top_speed: float = 140.0  # that the car reaches [m/s]
-    largest_tan_sideslip: float = 1.0  # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
+    largest_tan_sideslip: float = (
+        1.0  # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
+    )
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
@@ -71,7 +88,9 @@ def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
     return GuardLimits({name: _usual(name, rate_hz) for name in channels})
 
 
-def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> GuardLimits:
+def learn_limits(
+    recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float
+) -> GuardLimits:
     """Limits from drives at the estimator's rate, with references where they have them.
 
     A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for twice
@@ -82,7 +101,11 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
         usual, table = _usual(name, rate_hz), CHANNELS[name]
         having = [recording for recording in recordings if name in recording]
         own = [recording[name] for recording in having]
-        stops, size, jump = stops_of(own, name), _largest(own), _largest([np.diff(part) for part in own])
+        stops, size, jump = (
+            stops_of(own, name),
+            _largest(own),
+            _largest([np.diff(part) for part in own]),
+        )
         found[name] = ChannelLimits(
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
@@ -90,9 +113,18 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
             run=_run_limit(having, name, stops),
             stops=stops,
         )
-    top = _largest([recording[name] for recording in recordings for name in ("vx", "vx_ref") if name in recording])
+    top = _largest(
+        [
+            recording[name]
+            for recording in recordings
+            for name in ("vx", "vx_ref")
+            if name in recording
+        ]
+    )
     tangents = _largest([_tan_sideslip(recording) for recording in recordings])
-    return GuardLimits(found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, 1.2 * tangents))
+    return GuardLimits(
+        found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, 1.2 * tangents)
+    )
 
 
 def _largest(parts: Sequence[FloatArray]) -> float:
@@ -105,7 +137,9 @@ def _usual(name: str, rate_hz: float) -> ChannelLimits:
     size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
     if name.startswith(FREE):
         size, noise = math.inf, 0.0
-    return ChannelLimits(max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + noise)
+    return ChannelLimits(
+        max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + noise
+    )
 
 
 def _fastest(name: str, rate_hz: float) -> float:
@@ -129,7 +163,12 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
     longest = 0.0
     for recording in recordings:
         samples = recording[name]
-        same = np.concatenate([[False], samples[1:] == samples[:-1]]) & _moves(recording) & (samples > stops[0]) & (samples < stops[1])
+        same = (
+            np.concatenate([[False], samples[1:] == samples[:-1]])
+            & _moves(recording)
+            & (samples > stops[0])
+            & (samples < stops[1])
+        )
         longest = max(longest, longest_run(same) / recording.rate_hz)
     return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
 
@@ -149,8 +188,12 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
             still = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
-            stayed = [sign * part[2:][own[1:] & own[:-1]] for part, own in zip(parts, still, strict=True)]  # equal the two before them
-            reached = [value for values in stayed for value in values if value >= NEAR_STOP * farthest]
+            stayed = [
+                sign * part[2:][own[1:] & own[:-1]] for part, own in zip(parts, still, strict=True)
+            ]  # equal the two before them
+            reached = [
+                value for values in stayed for value in values if value >= NEAR_STOP * farthest
+            ]
             if farthest > 0 and reached:
                 stops[side] = sign * (float(np.median(reached)) - STOP_TOLERANCE * farthest)
     return stops[0], stops[1]
@@ -182,24 +225,43 @@ class Guard:
     """
 
     def __init__(
-        self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float, *, remembers: bool = False
+        self,
+        channels: Sequence[str],
+        skippable: Sequence[str],
+        limits: GuardLimits,
+        rate_hz: float,
+        *,
+        remembers: bool = False,
     ) -> None:
         self.rate_hz = rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
-        self._limits = np.array([(row.low, row.high, row.jump, run, *row.stops) for row, run in zip(rows, runs, strict=True)])
+        self._limits = np.array(
+            [
+                (row.low, row.high, row.jump, run, *row.stops)
+                for row, run in zip(rows, runs, strict=True)
+            ]
+        )
         self._skippable = np.array([name in skippable for name in channels])
         places = [channels.index(name) if name in channels else -1 for name in ("vx", "yaw_rate")]
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
-        self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64)
+        self._settings = np.array(
+            [*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64
+        )
         self.state = np.zeros((len(channels) + 1, 6))
         self.state[:-1, [0, 3, 4]] = np.nan  # nothing accepted, no last value, no candidate
         self.state[-1, 0] = WAIT
 
     def __call__(self, rows: FloatArray) -> Cleaned:
         """Go on with further rows, (T, C)."""
-        clean, measured, flow = np.empty_like(rows), np.empty(rows.shape, np.bool_), np.empty(len(rows), np.int8)
-        guard_rows(rows, self.state, self._limits, self._skippable, self._settings, clean, measured, flow)
+        clean, measured, flow = (
+            np.empty_like(rows),
+            np.empty(rows.shape, np.bool_),
+            np.empty(len(rows), np.int8),
+        )
+        guard_rows(
+            rows, self.state, self._limits, self._skippable, self._settings, clean, measured, flow
+        )
         return Cleaned(clean, measured, flow)
 
 
@@ -220,7 +282,11 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
     n_channels = rows.shape[1]
     vx_at, yaw_at, bridged, persists, remembers = settings
     for k in range(rows.shape[0]):
-        still = vx_at >= 0 and abs(state[vx_at, 0]) < STANDSTILL_SPEED and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
+        still = (
+            vx_at >= 0
+            and abs(state[vx_at, 0]) < STANDSTILL_SPEED
+            and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
+        )
         most_needed, least_skippable, any_skippable, jumped = 0.0, math.inf, False, False
         for c in range(n_channels):
             x = rows[k, c]
@@ -231,7 +297,9 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
                 own[3] = x
                 if own[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not still:
                     accepted = False
-                elif own[1] <= bridged and abs(x - own[0]) > limits[c, 2]:  # a jump from what is not long gone
+                elif (
+                    own[1] <= bridged and abs(x - own[0]) > limits[c, 2]
+                ):  # a jump from what is not long gone
                     own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0
                     own[4] = x
                     accepted = own[5] >= persists

@@ -29,7 +29,16 @@ from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, longest_run, stops_of
 from vehest.trust.health_kernel import N_LEVELS, Layout, Model, State, health_kernel
 from vehest.trust.named_arrays import allocated, views
-from vehest.trust.relations import FEATURES, RATE, Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
+from vehest.trust.relations import (
+    FEATURES,
+    RATE,
+    Relation,
+    learn_relations,
+    least_speed_of,
+    residuals_of,
+    speed_channel,
+    without_glitches,
+)
 
 VALID, DEGRADED, INVALID = 0, 1, 2
 
@@ -50,8 +59,14 @@ BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: 
 LEAST_VALUES = 10.0  # independent ones that any time holds
 LEAST_RUN = 4.0  # equal samples in a row
 LEAST_SHARE = 0.3
-LEAST = {"normal": 4.5, "slip": 0.3, "largest": 0.0}  # limits of statistics that are N(0, 1) without a fault, and of slip
-APART = 2.0  # times the next largest block, from which on a block is a fault of the recording itself
+LEAST = {
+    "normal": 4.5,
+    "slip": 0.3,
+    "largest": 0.0,
+}  # limits of statistics that are N(0, 1) without a fault, and of slip
+APART = (
+    2.0  # times the next largest block, from which on a block is a fault of the recording itself
+)
 MOST_APART = 0.01  # share of blocks that may be
 SPIN_MARGIN = 1.3
 HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a likelihood ratio
@@ -63,7 +78,9 @@ MOST_COEFFICIENTS = 700  # of the autoregression: what a step can afford
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 """Channels that the autoregression holds, beside the wheels' speeds; of others only range, gaps and standing still are watched."""
 
-NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}  # number of a channel in a reason's code
+NUMBERS = {
+    name: number for number, name in enumerate(CHANNELS, start=1)
+}  # number of a channel in a reason's code
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
 NO_ESTIMATE, BEYOND_SPEED, TOO_WIDE = 30, 31, 32
@@ -105,7 +122,9 @@ def reason_in_words(code: float) -> str:
     """Text of a reason's code; empty for 0."""
     kind, rest = divmod(round(code), 10_000)
     channel, partner = divmod(rest, 100)
-    return REASONS[kind][0].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
+    return REASONS[kind][0].format(
+        channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels")
+    )
 
 
 class Health(NamedTuple):
@@ -134,37 +153,70 @@ class HealthModel:
     rate_hz: float  # of the rows [Hz]
     relations: tuple[Relation, ...]  # between channels
     constant: tuple[float, ...]  # of the autoregression, one a channel
-    coefficients: tuple[tuple[tuple[float, ...], ...], ...]  # of the autoregression: lag, channel, former channel
-    precision: tuple[tuple[float, ...], ...]  # inverse of the innovations' covariance; zero for channels that are not modelled
+    coefficients: tuple[
+        tuple[tuple[float, ...], ...], ...
+    ]  # of the autoregression: lag, channel, former channel
+    precision: tuple[
+        tuple[float, ...], ...
+    ]  # inverse of the innovations' covariance; zero for channels that are not modelled
     deviation: tuple[float, ...]  # of each channel's innovations
     usual: tuple[float, ...]  # median of each channel
     largest: tuple[float, ...]  # largest size of each channel in training
     longest_gap: tuple[float, ...]  # longest time without a sample of each channel in training [s]
-    standstill: tuple[float, float, float]  # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
-    spin: tuple[float, float]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
+    standstill: tuple[
+        float, float, float
+    ]  # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
+    spin: tuple[
+        float, float
+    ]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
     speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
-    levels: tuple[tuple[float, ...], ...]  # size of the innovations at these speeds, in their deviations, one row a speed
-    healthy: tuple[tuple[float, ...], ...] = ()  # offset that the likelihood ratio finds in each channel of healthy drives, one row
+    levels: tuple[
+        tuple[float, ...], ...
+    ]  # size of the innovations at these speeds, in their deviations, one row a speed
+    healthy: tuple[
+        tuple[float, ...], ...
+    ] = ()  # offset that the likelihood ratio finds in each channel of healthy drives, one row
     heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in it, one row
     limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
-    stops: tuple[tuple[float, float], ...] = ()  # of each channel, between which alone it is expected to move
-    limits_behind_front_end: tuple[float, ...] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
+    stops: tuple[
+        tuple[float, float], ...
+    ] = ()  # of each channel, between which alone it is expected to move
+    limits_behind_front_end: tuple[
+        float, ...
+    ] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
 
     def __post_init__(self) -> None:
         channels, relations = len(self.channels), len(self.relations)
         for name in ("healthy", "heaviest"):
             object.__setattr__(self, name, getattr(self, name)[:1])
         for name in ("limits", "limits_behind_front_end"):
-            object.__setattr__(self, name, _present_limits(getattr(self, name), channels, relations))
+            object.__setattr__(
+                self, name, _present_limits(getattr(self, name), channels, relations)
+            )
 
     @property
     def layout(self) -> Layout:
         """Sizes and columns for the kernel."""
         names = list(self.channels)
-        columns = [names.index(name) if name in names else -1 for name in ("yaw_rate", speed_channel(names) or "", "ay", "ax")]
-        rows = [max(round(seconds * self.rate_hz), 1) for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)]
+        columns = [
+            names.index(name) if name in names else -1
+            for name in ("yaw_rate", speed_channel(names) or "", "ay", "ax")
+        ]
+        rows = [
+            max(round(seconds * self.rate_hz), 1)
+            for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)
+        ]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
-        return Layout._make([len(names), len(self.coefficients), len(self.relations), *columns, *rows, len(self.statistics)])
+        return Layout._make(
+            [
+                len(names),
+                len(self.coefficients),
+                len(self.relations),
+                *columns,
+                *rows,
+                len(self.statistics),
+            ]
+        )
 
     @property
     def statistics(self) -> list[Statistic]:
@@ -177,9 +229,15 @@ class HealthModel:
             "slip": ((kernel.LOCKED, 0.0),),
         }
         own = [
-            Statistic(kind, name, "", seconds, rule) for rule, those in kinds.items() for kind, seconds in those for name in self.channels
+            Statistic(kind, name, "", seconds, rule)
+            for rule, those in kinds.items()
+            for kind, seconds in those
+            for name in self.channels
         ]
-        return own + [Statistic(kernel.CONTRADICTION, one.target, one.partner, RELATION_SECONDS, "largest") for one in self.relations]
+        return own + [
+            Statistic(kernel.CONTRADICTION, one.target, one.partner, RELATION_SECONDS, "largest")
+            for one in self.relations
+        ]
 
     def start(self) -> FloatArray:
         """State before the first row."""
@@ -196,15 +254,31 @@ class HealthModel:
         """
         limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
         layout, statistics, names = self.layout, self.statistics, list(self.channels)
-        tables, step, coefficients = allocated(Model, layout), 1.0 / self.rate_hz, np.array(self.coefficients)
+        tables, step, coefficients = (
+            allocated(Model, layout),
+            1.0 / self.rate_hz,
+            np.array(self.coefficients),
+        )
         model, _ = views(Model, tables, layout)
 
-        seconds = (SHARE_SECONDS, BRAKING_SECONDS, ENERGY_SECONDS, OFFSET_SECONDS if forgets else math.inf, SHORT_SECONDS, RELATION_SECONDS)
+        seconds = (
+            SHARE_SECONDS,
+            BRAKING_SECONDS,
+            ENERGY_SECONDS,
+            OFFSET_SECONDS if forgets else math.inf,
+            SHORT_SECONDS,
+            RELATION_SECONDS,
+        )
         settings = [*self.standstill, step, *self.spin, *(1.0 - np.exp(-step / np.array(seconds)))]
-        for place, value in zip((*model.layout, *model.settings), (*layout, *settings), strict=True):
+        for place, value in zip(
+            (*model.layout, *model.settings), (*layout, *settings), strict=True
+        ):
             place[...] = value
         for row, relation in enumerate(self.relations):
-            model.target[row], model.versus[row] = names.index(relation.target), names.index(relation.partner)
+            model.target[row], model.versus[row] = (
+                names.index(relation.target),
+                names.index(relation.partner),
+            )
             model.involved[row] = [relation.involves(name, speed_channel(names)) for name in names]
             for feature, value in relation.terms.items():
                 if feature == RATE:
@@ -217,7 +291,10 @@ class HealthModel:
         model.largest[:] = np.maximum(self.largest, 1e-12)
         model.settled_gain[:] = (np.eye(layout.channels) - coefficients.sum(0)).T
         model.steps[:], model.step_power[:] = self._step_filter()
-        model.healthy[:], model.heaviest[:] = self.healthy[0] if self.healthy else 0.0, self.heaviest[0] if self.heaviest else math.inf
+        model.healthy[:], model.heaviest[:] = (
+            self.healthy[0] if self.healthy else 0.0,
+            self.heaviest[0] if self.heaviest else math.inf,
+        )
         model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
         model.limits.every[:] = limits or math.inf
         model.inverse.every[:] = 1.0 / model.limits.every
@@ -237,23 +314,38 @@ class HealthModel:
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
         """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the latest first, and their power, (C, C)."""
         coefficients, precision = np.array(self.coefficients), np.array(self.precision)
-        left = np.eye(len(self.channels)) - np.concatenate([np.zeros((1, *coefficients.shape[1:])), coefficients[:-1]]).cumsum(0)
-        return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum("jqm,qr,jrn->mn", left, precision, left)
+        left = np.eye(len(self.channels)) - np.concatenate(
+            [np.zeros((1, *coefficients.shape[1:])), coefficients[:-1]]
+        ).cumsum(0)
+        return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum(
+            "jqm,qr,jrn->mn", left, precision, left
+        )
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
     """Limits without those of statistics that earlier versions had: 23 C + 4 R of them at first, then 17 C + 3 R, now 7 C + R."""
-    forms = {23 * channels + 4 * relations: 7 * channels, 17 * channels + 3 * relations: 5 * channels}.get(len(limits))
+    forms = {
+        23 * channels + 4 * relations: 7 * channels,
+        17 * channels + 3 * relations: 5 * channels,
+    }.get(len(limits))
     if forms is None:
         return tuple(limits)
     given, times = np.array(limits), 4 if forms == 7 * channels else 3
     values, means = np.split(given[len(given) - 4 * channels - times * relations :], [4 * channels])
     offsets = given[forms : forms + 4 * channels].reshape(channels, 4)[:, 2]
-    kept = [given[channels : 2 * channels], given[forms - channels : forms], offsets, values, means.reshape(relations, times)[:, 1]]
+    kept = [
+        given[channels : 2 * channels],
+        given[forms - channels : forms],
+        offsets,
+        values,
+        means.reshape(relations, times)[:, 1],
+    ]
     return tuple(np.concatenate(kept).tolist())
 
 
-def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
+def health_rows(
+    packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray
+) -> Health:
     """Judge rows (T, C), one at a time or all at once, to the same bits; they may hold anything where ``measured`` is false.
 
     ``packed`` is of `HealthModel.packed`; ``state`` of `HealthModel.start`, changed in place.
@@ -272,7 +364,12 @@ def compile_health(*_: object) -> None:
     health_kernel.compile(tuple(map(numba.typeof, (rows, rows > 0, flat, flat, rows, rows))))
 
 
-def learn_health(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> HealthModel:
+def learn_health(
+    train: Sequence[Recording],
+    validation: Sequence[Recording],
+    channels: Sequence[str],
+    rate_hz: float,
+) -> HealthModel:
     """Learn normal behaviour from drives at ``rate_hz``, without references: the training's limits count with those of validation.
 
     Single samples that stand apart from both neighbours are glitches of the recording and left out (`without_glitches`).
@@ -282,59 +379,103 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
     names = tuple(channels)
     for recording in (*train, *validation):
         if abs(recording.rate_hz / rate_hz - 1.0) > 1e-9:
-            raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health is learnt at {rate_hz:g} Hz")
+            raise DataError(
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health is learnt at {rate_hz:g} Hz"
+            )
     received = train
-    train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
+    train, validation = (
+        [without_glitches(recording, names) for recording in part] for part in (train, validation)
+    )
     joined = {name: np.concatenate([recording[name] for recording in train]) for name in names}
     speed, least_speed = speed_channel(names), least_speed_of(train, names)
     usable = [name for name in names if name in MODELLED or name.startswith("wheel_speed")]
     if not usable:
-        raise DataError(f"health cannot be judged from {', '.join(names)} alone; it needs at least one of {', '.join(MODELLED)}")
+        raise DataError(
+            f"health cannot be judged from {', '.join(names)} alone; it needs at least one of {', '.join(MODELLED)}"
+        )
     relations = learn_relations(train, usable, rate_hz, least_speed)
     order = max(1, min(MAX_ORDER, MOST_COEFFICIENTS // len(usable) ** 2))
-    pieces = [residuals_of({name: recording[name] for name in usable}, usable, relations, least_speed) for recording in train]
+    pieces = [
+        residuals_of({name: recording[name] for name in usable}, usable, relations, least_speed)
+        for recording in train
+    ]
     model = fit_autoregression(pieces, order)
     innovations = np.concatenate([model.innovations(piece) for piece in pieces])
     driven = joined[speed] if speed else np.zeros(len(innovations))
     speeds, factors = learn_noise_levels(innovations, model.covariance, driven, N_LEVELS)
     levels = np.ones((N_LEVELS, len(names)))
     levels[:, [names.index(name) for name in usable]] = factors
-    largest = {name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in joined.items()}
-    turning = joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
+    largest = {
+        name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in joined.items()
+    }
+    turning = (
+        joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
+    )
     still = [min(size, 0.1 * largest.get(name, np.inf)) for name, size in STILL.items()]
     found = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
         relations=tuple(relations),
         **_embedded(model, names, usable),
-        usual=tuple(float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0 for name in names),
+        usual=tuple(
+            float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0
+            for name in names
+        ),
         largest=tuple(largest.values()),
-        longest_gap=tuple(max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz for name in names),
+        longest_gap=tuple(
+            max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz
+            for name in names
+        ),
         standstill=(least_speed, still[0], still[1]),
-        spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
+        spin=(
+            SPIN_MARGIN * largest.get("yaw_rate", 1e9),
+            min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9),
+        ),
         speeds=tuple(speeds.tolist()),
         levels=_plain(levels),
         stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
     found = _with_healthy(_with_healthy(found, train), train)
     filtered = [
-        replace(recording, channels=dict(zip(names, behind_front_end(recording.stack(names), recording.rate_hz).T, strict=True)))
+        replace(
+            recording,
+            channels=dict(
+                zip(
+                    names,
+                    behind_front_end(recording.stack(names), recording.rate_hz).T,
+                    strict=True,
+                )
+            ),
+        )
         for recording in (*train, *validation)
     ]
     plain, behind = (block_maxima(found, drives) for drives in ([*train, *validation], filtered))
     statistics, step = found.statistics, 1.0 / rate_hz
-    limits, limits_behind = limits_from(plain, statistics, step), limits_from(np.maximum(plain, behind), statistics, step)
+    limits, limits_behind = (
+        limits_from(plain, statistics, step),
+        limits_from(np.maximum(plain, behind), statistics, step),
+    )
     return replace(found, limits=limits, limits_behind_front_end=limits_behind)
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:
     """The autoregression as one of all channels, those that it does not hold being zero in it."""
     places, n = [names.index(name) for name in usable], len(names)
-    constant, coefficients, precision, deviation = np.zeros(n), np.zeros((model.order, n, n)), np.zeros((n, n)), np.ones(n)
+    constant, coefficients, precision, deviation = (
+        np.zeros(n),
+        np.zeros((model.order, n, n)),
+        np.zeros((n, n)),
+        np.ones(n),
+    )
     constant[places], deviation[places] = model.constant, np.sqrt(np.diag(model.covariance))
     coefficients[np.ix_(range(model.order), places, places)] = model.coefficients
     precision[np.ix_(places, places)] = np.linalg.inv(model.covariance)
-    parts = {"constant": constant, "coefficients": coefficients, "precision": precision, "deviation": deviation}
+    parts = {
+        "constant": constant,
+        "coefficients": coefficients,
+        "precision": precision,
+        "deviation": deviation,
+    }
     return {name: _plain(values) for name, values in parts.items()}
 
 
@@ -366,7 +507,9 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
         for begin in range(0, len(samples), length):
             part = samples[begin : begin + length]
             statistics = np.empty((len(part), n_statistics))
-            health_kernel(part, np.isfinite(part), packed, state, np.empty((3, len(part))), statistics)
+            health_kernel(
+                part, np.isfinite(part), packed, state, np.empty((3, len(part))), statistics
+            )
             found.append(statistics.max(0))
     return np.array(found)
 
@@ -380,7 +523,9 @@ def margin(seconds: float, healthy_seconds: float) -> float:
     return BETWEEN_DRIVES * max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
 
 
-def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float) -> tuple[float, ...]:
+def limits_from(
+    maxima: FloatArray, statistics: Sequence[Statistic], step: float
+) -> tuple[float, ...]:
     """Limits of all K statistics from their largest values in blocks of healthy drives, (B, K), and the sampling interval ``step`` [s].
 
     The largest value times `margin`, where blocks that stand apart from all others by a factor of `APART`, at most `MOST_APART` of them
@@ -393,20 +538,33 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float
         apart = [k for k in range(set_aside) if column[k] > APART * column[k + 1]]
         top = float(column[apart[-1] + 1] if apart else column[0])
         limit = margin(max(statistic.seconds, step), BLOCK_SECONDS * len(maxima)) * top
-        if statistic.rule == "share":  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
+        if (
+            statistic.rule == "share"
+        ):  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
             limit = min(max(top + 0.15, LEAST_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
             limit = BETWEEN_DRIVES
         else:
-            limit = max(limit + 2.0, LEAST_RUN) if statistic.rule == "run" else max(limit, LEAST[statistic.rule])
-        found.append(limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300)
+            limit = (
+                max(limit + 2.0, LEAST_RUN)
+                if statistic.rule == "run"
+                else max(limit, LEAST[statistic.rule])
+            )
+        found.append(
+            limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300
+        )
     return tuple(found)
 
 
 def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDArray[np.int64]:
     """Samples of a drive, channel -> (T,), outside the training's range, (C + 2,): of each channel, of any, and number of all."""
-    sizes = [np.abs(np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)) for name in model.channels]
-    outside = [size > BETWEEN_DRIVES * largest for size, largest in zip(sizes, model.largest, strict=True)]
+    sizes = [
+        np.abs(np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0))
+        for name in model.channels
+    ]
+    outside = [
+        size > BETWEEN_DRIVES * largest for size, largest in zip(sizes, model.largest, strict=True)
+    ]
     return np.array([*(own.sum() for own in outside), np.any(outside, axis=0).sum(), len(sizes[0])])
 
 

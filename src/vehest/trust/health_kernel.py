@@ -24,9 +24,13 @@ from vehest.estimators.kernels import compiling
 from vehest.trust.named_arrays import open_views
 
 IntArray = NDArray[np.int64]
-part = partial(compiling.part, _nrt=False)  # arrays are views without references, so none are counted: two thirds of the time to compile
+part = partial(
+    compiling.part, _nrt=False
+)  # arrays are views without references, so none are counted: two thirds of the time to compile
 
-PLAUSIBLE = 1000.0  # times the largest size in training, beyond which a value counts as not measured
+PLAUSIBLE = (
+    1000.0  # times the largest size in training, beyond which a value counts as not measured
+)
 CLIP = 4.0  # standard deviations
 STEP_CLIP = 8.0  # the same for steps and for the energy
 CALM = 0.3  # of the mean energy: least energy of a calm stretch
@@ -36,7 +40,10 @@ CLEAR = 0.95  # times its limit, below which a statistic has to stay
 BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather than lost
 SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
-REVERSED, HOLDS = -0.5, 0.7  # correlations below which a relation is one of the wrong sign, above which it holds
+REVERSED, HOLDS = (
+    -0.5,
+    0.7,
+)  # correlations below which a relation is one of the wrong sign, above which it holds
 SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
@@ -45,7 +52,25 @@ FIRST_SMALL = 9  # of features: those of drag, which say nothing of signs and un
 N_FEATURES = 13  # this and the next two stand as digits in the shapes below
 N_LEVELS = 5  # speeds at which the noise is known
 
-FREE, MISSING, FROZEN, HELD, JUMP, NOISE, SMOOTH, OFFSET, SCALE, SIGN, UNIT, CONTRADICTION, OUTSIDE, SPIN, LOCKED, DROPOUT, LATE = range(17)
+(
+    FREE,
+    MISSING,
+    FROZEN,
+    HELD,
+    JUMP,
+    NOISE,
+    SMOOTH,
+    OFFSET,
+    SCALE,
+    SIGN,
+    UNIT,
+    CONTRADICTION,
+    OUTSIDE,
+    SPIN,
+    LOCKED,
+    DROPOUT,
+    LATE,
+) = range(17)
 """Kinds of reasons."""
 
 
@@ -114,11 +139,15 @@ class Model(NamedTuple):
     speeds: Annotated[FloatArray, "5"]
     levels: Annotated[FloatArray, "5 channels"]  # noise at these speeds
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
-    steps: Annotated[FloatArray, "order channels channels"]  # weight of a former innovation in q on a step in m [lag, m, q]
+    steps: Annotated[
+        FloatArray, "order channels channels"
+    ]  # weight of a former innovation in q on a step in m [lag, m, q]
     step_power: Annotated[FloatArray, "channels channels"]
     healthy: Annotated[FloatArray, "channels"]  # offsets of healthy drives
     heaviest: Annotated[FloatArray, "channels"]  # largest weight of one sample in an offset
-    stops: Annotated[FloatArray, "2 channels"]  # lower and upper, between which alone a channel is expected to move
+    stops: Annotated[
+        FloatArray, "2 channels"
+    ]  # lower and upper, between which alone a channel is expected to move
     priority: Annotated[FloatArray, "statistics"]  # of reasons
     limits: Statistics
     inverse: Statistics  # of the limits
@@ -129,7 +158,9 @@ class Model(NamedTuple):
     code: Annotated[IntArray, "channels"]  # number in a reason
     target: Annotated[IntArray, "relations"]  # column that a relation explains
     versus: Annotated[IntArray, "relations"]  # column that it is held against
-    involved: Annotated[IntArray, "relations channels"]  # 1 if a relation uses a channel, 2 if only in a small term
+    involved: Annotated[
+        IntArray, "relations channels"
+    ]  # 1 if a relation uses a channel, 2 if only in a small term
     kind: Annotated[IntArray, "statistics"]  # of reason
     accused: Annotated[IntArray, "statistics"]  # column
     partner: Annotated[IntArray, "statistics"]  # column; -1: none
@@ -145,9 +176,13 @@ class State(NamedTuple):
     spinning: Annotated[FloatArray, "1"]  # rows of spin
     since_jump: Annotated[FloatArray, "1"]  # rows since the yaw rate jumped
     mean_ax: Annotated[FloatArray, "1"]
-    drift: Annotated[FloatArray, "1"]  # lateral velocity, as far as it changed within `SLIDE_SECONDS`
+    drift: Annotated[
+        FloatArray, "1"
+    ]  # lateral velocity, as far as it changed within `SLIDE_SECONDS`
     last: Annotated[FloatArray, "channels"]  # measured value
-    gap: Annotated[FloatArray, "channels"]  # rows without a sample; below zero while predictions settle again
+    gap: Annotated[
+        FloatArray, "channels"
+    ]  # rows without a sample; below zero while predictions settle again
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
     past_y: Annotated[FloatArray, "order channels"]
@@ -159,7 +194,9 @@ class State(NamedTuple):
     mean_speed: Annotated[FloatArray, "2"]  # short and long
     left: Annotated[FloatArray, "relations"]  # short mean of the residual
     smooth: Annotated[FloatArray, "relations"]  # short mean of the target
-    product: Annotated[FloatArray, "relations"]  # means of shown times expected, and of both squares
+    product: Annotated[
+        FloatArray, "relations"
+    ]  # means of shown times expected, and of both squares
     expected_power: Annotated[FloatArray, "relations"]
     shown_power: Annotated[FloatArray, "relations"]
     x: Annotated[FloatArray, "channels"]
@@ -198,7 +235,9 @@ def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ign
         slow = _look_at_values(still, model, state)
         _look_at_relations(still, model, state)
         out[0, k], out[1, k], out[2, k] = _decide(absent, slow, model, state)
-        for j in range(statistics.shape[1] if statistics.shape[0] > 0 else 0):  # a slice would compile for seconds
+        for j in range(
+            statistics.shape[1] if statistics.shape[0] > 0 else 0
+        ):  # a slice would compile for seconds
             statistics[k, j] = state.statistics.every[j]
         _remember(model, state)
 
@@ -216,11 +255,19 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
         if first:
             state.last[i] = value if known else model.usual[i]
         if known:
-            same = model.stops[0, i] < value < model.stops[1, i] and value == state.last[i] and not first
+            same = (
+                model.stops[0, i] < value < model.stops[1, i]
+                and value == state.last[i]
+                and not first
+            )
             state.run[i] = state.run[i] + 1.0 if same else 0.0
-            state.share[i] += model.settings.forget_share * ((1.0 if same else 0.0) - state.share[i])
+            state.share[i] += model.settings.forget_share * (
+                (1.0 if same else 0.0) - state.share[i]
+            )
             state.last[i] = value
-            state.gap[i] = -float(model.layout.order) if state.gap[i] > 0.0 else min(state.gap[i] + 1.0, 0.0)
+            state.gap[i] = (
+                -float(model.layout.order) if state.gap[i] > 0.0 else min(state.gap[i] + 1.0, 0.0)
+            )
         else:
             state.gap[i] = max(state.gap[i], 0.0) + 1.0
             beyond = state.gap[i] - model.gap_limit[i]
@@ -243,11 +290,31 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
     ay, ax = _value(state, columns.ay), _value(state, columns.ax)
     speed, turning = abs(u), u * r
     w, bent = max(speed, settings.least_speed), 0.03 * turning * turning
-    values = (1.0, r, u, turning, 0.01 * turning * turning * turning, r / w, ay, ay / (w * w), 0.01 * ay * ay * ay, r * r, u * u, ax)
+    values = (
+        1.0,
+        r,
+        u,
+        turning,
+        0.01 * turning * turning * turning,
+        r / w,
+        ay,
+        ay / (w * w),
+        0.01 * ay * ay * ay,
+        r * r,
+        u * u,
+        ax,
+    )
     for f in range(N_FEATURES - 1):
         state.feature[f] = values[f]
     by_yaw_rate = (0.0, 1.0, 0.0, u, bent * u, 1.0 / w)
-    by_speed = (0.0, 0.0, 1.0, r, bent * r, -r / (u * speed) if speed > settings.least_speed else 0.0)
+    by_speed = (
+        0.0,
+        0.0,
+        1.0,
+        r,
+        bent * r,
+        -r / (u * speed) if speed > settings.least_speed else 0.0,
+    )
     for f in range(INSTANT_FEATURES):
         state.by_yaw_rate[f], state.by_speed[f] = by_yaw_rate[f], by_speed[f]
     at, share = 0, 0.0
@@ -262,10 +329,16 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
             total -= model.instant[i, f] * state.feature[f]
         state.y[i] = total
     if columns.ay >= 0:  # less u r it is the change of v
-        drift = state.drift[0] + settings.step * (state.y[columns.ay] - state.drift[0] / SLIDE_SECONDS)
+        drift = state.drift[0] + settings.step * (
+            state.y[columns.ay] - state.drift[0] / SLIDE_SECONDS
+        )
         state.drift[0] = min(max(drift, -speed), speed)
     state.feature[N_FEATURES - 1] = state.drift[0] * r
-    return speed < settings.least_speed and abs(r) < settings.still_yaw_rate and abs(ay) < settings.still_ay
+    return (
+        speed < settings.least_speed
+        and abs(r) < settings.still_yaw_rate
+        and abs(ay) < settings.still_ay
+    )
 
 
 @part()
@@ -323,10 +396,16 @@ def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
     """Jumps out of what has been usual for half a second."""
     found = state.statistics
     for i in range(model.layout.channels):
-        z = abs(state.score[i]) / math.sqrt(model.precision[i, i]) if model.modelled[i] == 1 else 0.0
+        z = (
+            abs(state.score[i]) / math.sqrt(model.precision[i, i])
+            if model.modelled[i] == 1
+            else 0.0
+        )
         state.ratio[i], found.jump[i] = z, z / math.sqrt(CALM + state.energy[i])
         if i == model.layout.yaw_rate:
-            state.since_jump[0] = 0.0 if found.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
+            state.since_jump[0] = (
+                0.0 if found.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
+            )
         normed = state.innovation[0, i] / model.deviation[i]
         state.energy[i] += model.settings.forget_energy * (normed * normed - state.energy[i])
 
@@ -339,7 +418,9 @@ def _slope(i, model, state):  # type: ignore[no-untyped-def]
         total = 1.0 if m == i else 0.0
         if i in (r, u):
             for f in range(1, INSTANT_FEATURES):
-                total -= model.instant[m, f] * (state.by_yaw_rate[f] if i == r else state.by_speed[f])
+                total -= model.instant[m, f] * (
+                    state.by_yaw_rate[f] if i == r else state.by_speed[f]
+                )
         state.slope[m] = total
 
 
@@ -386,7 +467,11 @@ def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
     C, found, highest = model.layout.channels, state.statistics.offset, 0.0
     for i in range(C):
         _slope(i, model, state)
-        counts = state.rows[0] >= model.layout.settling and model.modelled[i] == 1 and state.gap[i] == 0.0
+        counts = (
+            state.rows[0] >= model.layout.settling
+            and model.modelled[i] == 1
+            and state.gap[i] == 0.0
+        )
         _look_for_step(i, counts, model, state)
         _look_for_offset(i, counts, model, state)
         highest = max(highest, found[i] * model.inverse.offset[i])
@@ -424,7 +509,9 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         model.settings.forget_short,
         model.settings.forget_relation,
     )
-    state.mean_ax[0] += model.settings.forget_ax * (_value(state, model.layout.ax) - state.mean_ax[0])
+    state.mean_ax[0] += model.settings.forget_ax * (
+        _value(state, model.layout.ax) - state.mean_ax[0]
+    )
     complete = True
     for i in range(model.layout.channels):
         complete = complete and state.gap[i] <= 0.0
@@ -443,10 +530,16 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
             left, small = 0.0, 0.0
         gain = 0.0 if still else model.rate_gain[j]
         if complete:
-            state.left[j] += short * (left + small - state.left[j])  # a fault of r or ay is no sign or unit of ax
+            state.left[j] += short * (
+                left + small - state.left[j]
+            )  # a fault of r or ay is no sign or unit of ax
             state.smooth[j] += short * (target - state.smooth[j])
         shown = state.smooth[j]
-        expected = shown - state.left[j] + gain * (u - state.mean_speed[0]) * short / ((1.0 - short) * step)
+        expected = (
+            shown
+            - state.left[j]
+            + gain * (u - state.mean_speed[0]) * short / ((1.0 - short) * step)
+        )
         state.product[j] += longer * (shown * expected - state.product[j])
         state.expected_power[j] += longer * (expected * expected - state.expected_power[j])
         state.shown_power[j] += longer * (shown * shown - state.shown_power[j])
@@ -475,7 +568,10 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
     if best < 0:
         return FREE, 0, -1, highest
     kind, channel, partner = model.kind[best], model.accused[best], model.partner[best]
-    if kind in (JUMP, OFFSET):  # likelihood ratios of the same form compare with each other as they are
+    if kind in (
+        JUMP,
+        OFFSET,
+    ):  # likelihood ratios of the same form compare with each other as they are
         C, likeliest = model.layout.channels, -1.0
         for i in range(C):
             ratio = state.ratio[i] if best < C else every[best // C * C + i]
@@ -500,16 +596,27 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
         certain = kind in (FROZEN, HELD, SIGN, UNIT, DROPOUT)
         level = 2.0 if certain or (highest >= INVALID and kind != OUTSIDE) else 1.0
     r = _value(state, layout.yaw_rate)
-    spins = abs(r) > settings.spin_yaw_rate and abs(r * _value(state, layout.speed)) > settings.spin_turning
-    state.spinning[0] = state.spinning[0] + 1.0 if spins and state.since_jump[0] > 5.0 * layout.spinning else 0.0
+    spins = (
+        abs(r) > settings.spin_yaw_rate
+        and abs(r * _value(state, layout.speed)) > settings.spin_turning
+    )
+    state.spinning[0] = (
+        state.spinning[0] + 1.0 if spins and state.since_jump[0] > 5.0 * layout.spinning else 0.0
+    )
     if state.spinning[0] > layout.spinning:
         level, kind, channel, partner = 2.0, SPIN, layout.yaw_rate, -1
     if absent >= 0:
-        level = 2.0 if state.gap[absent] - model.gap_limit[absent] > layout.bridged else max(level, 1.0)
+        level = (
+            2.0 if state.gap[absent] - model.gap_limit[absent] > layout.bridged else max(level, 1.0)
+        )
         kind, channel, partner = MISSING, absent, -1
     reason = 0.0
     if level > 0.0:
-        reason = kind * 10000.0 + model.code[channel] * 100.0 + (model.code[partner] if partner >= 0 else 0)
+        reason = (
+            kind * 10000.0
+            + model.code[channel] * 100.0
+            + (model.code[partner] if partner >= 0 else 0)
+        )
         state.hold[0], state.reason[0], state.status[0] = float(layout.hold), reason, level
     elif state.hold[0] > 0.0:
         state.hold[0] = state.hold[0] - 1.0 if highest < CLEAR else float(layout.hold)

@@ -78,7 +78,11 @@ def _compiled_type(own: Any, sizes: Any) -> Any:
     """Type of a field, or of a named tuple, in compiled code; one of scalars is a tuple of numbers."""
     if hasattr(own, "_fields"):
         inner = [_compiled_type(field, sizes) for field in _fields(own).values()]
-        return types.BaseTuple.from_types(inner, own) if set(inner) <= {types.int64, types.float64} else Views(own, sizes)
+        return (
+            types.BaseTuple.from_types(inner, own)
+            if set(inner) <= {types.int64, types.float64}
+            else Views(own, sizes)
+        )
     scalar = types.int64 if own[0] is np.int64 else types.float64
     return scalar if own[1] is None else types.Array(scalar, len(own[1]), "C")
 
@@ -93,27 +97,50 @@ class _Attributes(AttributeTemplate):  # type: ignore[misc]
 
 @lower_getattr_generic(Views)  # type: ignore[untyped-decorator]
 def _opened_field(context: Any, builder: Any, own: Views, value: Any, name: str) -> Any:
-    proxy, whole = context.make_helper(builder, own, value), partial(context.get_constant, types.intp)
+    proxy, whole = (
+        context.make_helper(builder, own, value),
+        partial(context.get_constant, types.intp),
+    )
 
     def lengths(declared: Any) -> list[Any]:
         words = declared[1] or ()
-        return [whole(int(w)) if w.isdigit() else builder.extract_value(proxy.sizes, own.sizes.fields.index(w)) for w in words]
+        return [
+            whole(int(w))
+            if w.isdigit()
+            else builder.extract_value(proxy.sizes, own.sizes.fields.index(w))
+            for w in words
+        ]
 
     def numbers(declared: Any) -> Any:
         """How many a field has."""
         if not hasattr(declared, "_fields"):
             return reduce(builder.mul, lengths(declared), whole(1))
-        return reduce(builder.add, (numbers(inner) for field, inner in _fields(declared).items() if field != "every"), whole(0))
+        return reduce(
+            builder.add,
+            (numbers(inner) for field, inner in _fields(declared).items() if field != "every"),
+            whole(0),
+        )
 
     fields = _fields(own.kind)
-    before = [numbers(fields[field]) for field in list(fields)[: list(fields).index(name)] if field != "every"]
+    before = [
+        numbers(fields[field])
+        for field in list(fields)[: list(fields).index(name)]
+        if field != "every"
+    ]
     data = builder.gep(proxy.data, [builder.mul(reduce(builder.add, before, whole(0)), whole(8))])
     of = _compiled_type(fields[name], own.sizes)
     if not isinstance(of, types.Array):
         return _loaded(context, builder, of, data, proxy.sizes)
     array, shape = make_array(of)(context, builder), lengths(fields[name])
     strides = list(accumulate(reversed(shape[1:]), builder.mul, initial=whole(8)))[::-1]
-    populate_array(array, builder.bitcast(data, context.get_value_type(of.dtype).as_pointer()), shape, strides, whole(8), None)
+    populate_array(
+        array,
+        builder.bitcast(data, context.get_value_type(of.dtype).as_pointer()),
+        shape,
+        strides,
+        whole(8),
+        None,
+    )
     return array._getvalue()
 
 
@@ -122,7 +149,10 @@ def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-de
     """`views` from the first number on, compiled: without references, so that the flat array has to outlive them."""
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        data = builder.bitcast(make_array(flat)(context, builder, values[1]).data, context.get_value_type(types.voidptr))
+        data = builder.bitcast(
+            make_array(flat)(context, builder, values[1]).data,
+            context.get_value_type(types.voidptr),
+        )
         return _loaded(context, builder, signature.return_type, data, values[2])
 
     return _compiled_type(kind.instance_class, sizes)(kind, flat, sizes), code
@@ -135,8 +165,14 @@ def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
         own.data, own.sizes = data, sizes
         return own._getvalue()
     if isinstance(of, types.BaseTuple):
-        places = [builder.gep(data, [context.get_constant(types.intp, 8 * at)]) for at in range(len(of))]
-        return context.make_tuple(builder, of, [_loaded(context, builder, own, at, sizes) for own, at in zip(of, places, strict=True)])
+        places = [
+            builder.gep(data, [context.get_constant(types.intp, 8 * at)]) for at in range(len(of))
+        ]
+        return context.make_tuple(
+            builder,
+            of,
+            [_loaded(context, builder, own, at, sizes) for own, at in zip(of, places, strict=True)],
+        )
     return builder.load(builder.bitcast(data, context.get_value_type(of).as_pointer()))
 
 

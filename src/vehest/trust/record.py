@@ -41,13 +41,17 @@ class Trust:
 
 def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
-    return trust is not None and trust.bands is not None and not trust.bands.are_of(recording.vehicle)
+    return (
+        trust is not None and trust.bands is not None and not trust.bands.are_of(recording.vehicle)
+    )
 
 
 def write_trust(trust: Trust, folder: Path) -> None:
     """Write trust.yaml into an existing folder; raises `OSError` where it cannot be written."""
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
-    (folder / TRUST).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    (folder / TRUST).write_text(
+        yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8"
+    )
 
 
 def read_trust(folder: Path) -> Trust:

@@ -25,15 +25,54 @@ from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.trust.health_kernel import SLIDE_SECONDS
 
-SPEEDS = ("vx", "motor_speed", "wheel_speed_rl", "wheel_speed_rr", "wheel_speed_fl", "wheel_speed_fr")
+SPEEDS = (
+    "vx",
+    "motor_speed",
+    "wheel_speed_rl",
+    "wheel_speed_rr",
+    "wheel_speed_fl",
+    "wheel_speed_fr",
+)
 """Channels that serve as the speed u, the first that is there."""
 
-FEATURES = ("1", "r", "u", "u r", "(u r)³/100", "r/u", "ay", "ay/u²", "ay³/100", "r²", "u²", "ax", "v r")
+FEATURES = (
+    "1",
+    "r",
+    "u",
+    "u r",
+    "(u r)³/100",
+    "r/u",
+    "ay",
+    "ay/u²",
+    "ay³/100",
+    "r²",
+    "u²",
+    "ax",
+    "v r",
+)
 RATE = "du/dt"
 SLIDE = "v r"
 DRAG = ("r²", "u²", SLIDE)
 _SYMBOLS = dict(
-    zip(FEATURES, ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"), strict=True)
+    zip(
+        FEATURES,
+        (
+            "",
+            "r",
+            "u",
+            ("u", "r"),
+            ("u", "r"),
+            ("r", "u"),
+            ("ay",),
+            ("ay", "u"),
+            ("ay",),
+            "r",
+            "u",
+            ("ax",),
+            "r",
+        ),
+        strict=True,
+    )
 )
 _SYMBOLS[RATE] = "u"
 
@@ -49,7 +88,9 @@ class Relation:
 
     target: str  # channel that is explained
     partner: str  # channel that it is held against, for messages
-    terms: dict[str, float] = field(default_factory=dict)  # feature, or `RATE`, -> coefficient; the target's units over the feature's
+    terms: dict[str, float] = field(
+        default_factory=dict
+    )  # feature, or `RATE`, -> coefficient; the target's units over the feature's
     instant: bool = False  # whether it holds for each sample and not only on average
 
     def involves(self, channel: str, speed: str | None) -> int:
@@ -59,7 +100,10 @@ class Relation:
         symbol = {"yaw_rate": "r", "ay": "ay", "ax": "ax", speed: "u"}.get(channel)
         if symbol is None:
             return 0
-        large, small = ({part for name in self.terms if (name in DRAG) == drag for part in _SYMBOLS[name]} for drag in (False, True))
+        large, small = (
+            {part for name in self.terms if (name in DRAG) == drag for part in _SYMBOLS[name]}
+            for drag in (False, True)
+        )
         return 1 if symbol in large else 2 if symbol in small else 0
 
 
@@ -83,7 +127,9 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
             found.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
     if "ax" in has:
         slide = (SLIDE,) if {"ay", "yaw_rate"} <= has else ()
-        found.append(("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False))
+        found.append(
+            ("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False)
+        )
     for wheel in channels:
         if wheel.startswith(("wheel_speed", "motor_speed")) and wheel != speed:
             found.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
@@ -97,14 +143,29 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
     r, ay, ax = (samples.get(name, np.zeros_like(some)) for name in ("yaw_rate", "ay", "ax"))
     u = samples[speed] if speed else np.zeros_like(some)
     w = np.maximum(np.abs(u), least_speed)
-    values = (np.ones_like(some), r, u, u * r, 0.01 * (u * r) ** 3, r / w, ay, ay / w**2, 0.01 * ay**3, r * r, u * u, ax)
+    values = (
+        np.ones_like(some),
+        r,
+        u,
+        u * r,
+        0.01 * (u * r) ** 3,
+        r / w,
+        ay,
+        ay / w**2,
+        0.01 * ay**3,
+        r * r,
+        u * u,
+        ax,
+    )
     return dict(zip(FEATURES[:-1], values, strict=True))
 
 
 def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
     """v r, (T,): v is what the relation of ay leaves, integrated with the leakage of `SLIDE_SECONDS`, at most the speed."""
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
-    drift = scipy.signal.lfilter([1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left)
+    drift = scipy.signal.lfilter(
+        [1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left
+    )
     return np.asarray(np.clip(drift, -np.abs(features["u"]), np.abs(features["u"])) * features["r"])
 
 
@@ -127,7 +188,11 @@ def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording
     """These channels of a drive, NaN where a single sample is a glitch."""
     own = recording.select(channels)
     clean = {name: without_spikes(samples) for name, samples in own.channels.items()}
-    return replace(own, channels=clean, gappy=frozenset(name for name in channels if np.isnan(clean[name]).any()))
+    return replace(
+        own,
+        channels=clean,
+        gappy=frozenset(name for name in channels if np.isnan(clean[name]).any()),
+    )
 
 
 def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> float:
@@ -135,22 +200,35 @@ def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> 
     speed = speed_channel(channels)
     if speed is None:
         return 1.0
-    return max(LEAST_SPEED_SHARE * float(np.nanmedian(np.abs(np.concatenate([recording[speed] for recording in recordings])))), 1e-6)
+    return max(
+        LEAST_SPEED_SHARE
+        * float(
+            np.nanmedian(np.abs(np.concatenate([recording[speed] for recording in recordings])))
+        ),
+        1e-6,
+    )
 
 
 def residuals_of(
-    samples: Mapping[str, FloatArray], channels: Sequence[str], relations: Sequence[Relation], least_speed: float
+    samples: Mapping[str, FloatArray],
+    channels: Sequence[str],
+    relations: Sequence[Relation],
+    least_speed: float,
 ) -> FloatArray:
     """y = x - W φ(x): channels less what relations that hold at each instant explain of them, (T, C)."""
     features = features_of(samples, least_speed)
     left = {name: np.array(samples[name], dtype=np.float64) for name in channels}
     for relation in relations:
         if relation.instant:
-            left[relation.target] -= sum(value * features[feature] for feature, value in relation.terms.items())
+            left[relation.target] -= sum(
+                value * features[feature] for feature, value in relation.terms.items()
+            )
     return np.stack([left[name] for name in channels], axis=1)
 
 
-def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float) -> list[Relation]:
+def learn_relations(
+    recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float
+) -> list[Relation]:
     """Coefficients of every relation, from drives at one rate [Hz]; NaN and samples below ``least_speed`` are left out."""
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
@@ -158,7 +236,10 @@ def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], ra
     for recording in recordings:
         own = {name: _held(recording[name]) for name in channels}
         known = np.isfinite(recording.stack(channels)).all(1)
-        columns = {**features_of(own, least_speed), **{f"channel {name}": own[name] for name in channels}}
+        columns = {
+            **features_of(own, least_speed),
+            **{f"channel {name}": own[name] for name in channels},
+        }
         if speed:
             known &= np.abs(own[speed]) >= least_speed
             columns[RATE] = np.concatenate([[0.0], np.diff(own[speed])]) * rate_hz
@@ -168,20 +249,34 @@ def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], ra
     def smoothed(name: str) -> FloatArray:
         pairs = [(part[name], known) for part, known in zip(parts, used, strict=True)]
         low_pass = partial(scipy.signal.lfilter, [forget], [1.0, forget - 1.0])
-        return np.concatenate([low_pass(values, zi=[(1.0 - forget) * values[0]])[0][known] for values, known in pairs])
+        return np.concatenate(
+            [low_pass(values, zi=[(1.0 - forget) * values[0]])[0][known] for values, known in pairs]
+        )
 
     joined = {name: smoothed(name) for name in parts[0]}
     found: list[Relation] = []
     for target, partner, features, instant in relations_among(channels):
         if SLIDE in features:
             for part in parts:
-                part[SLIDE] = slide_of(part, found[0], rate_hz) if found else np.zeros_like(part["r"])
+                part[SLIDE] = (
+                    slide_of(part, found[0], rate_hz) if found else np.zeros_like(part["r"])
+                )
             joined[SLIDE] = smoothed(SLIDE)
         free = [name for name in features if name != SLIDE]
         wanted = joined[f"channel {target}"] + (joined[SLIDE] if SLIDE in features else 0.0)
         if len(wanted) >= LEAST_ROWS:
-            terms = dict(zip(free, _robust(np.stack([joined[name] for name in free], axis=1), wanted).tolist(), strict=True))
-            found.append(Relation(target, partner, terms | ({SLIDE: -1.0} if SLIDE in features else {}), instant))
+            terms = dict(
+                zip(
+                    free,
+                    _robust(np.stack([joined[name] for name in free], axis=1), wanted).tolist(),
+                    strict=True,
+                )
+            )
+            found.append(
+                Relation(
+                    target, partner, terms | ({SLIDE: -1.0} if SLIDE in features else {}), instant
+                )
+            )
     return found
 
 

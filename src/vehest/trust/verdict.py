@@ -20,7 +20,17 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
 from vehest.trust.bands import band_rows
 from vehest.trust.guard import RESTART, USE, WAIT, Cleaned
-from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, NUMBERS, TOO_WIDE, VALID, Health, health_rows
+from vehest.trust.health import (
+    BEYOND_SPEED,
+    DEGRADED,
+    INVALID,
+    NO_ESTIMATE,
+    NUMBERS,
+    TOO_WIDE,
+    VALID,
+    Health,
+    health_rows,
+)
 from vehest.trust.record import Trust
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, Watched
 
@@ -31,7 +41,9 @@ WIDEST = math.radians(6.0)
 
 ROLLED_BACK_SECONDS = 1.0
 
-NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])  # kinds of reasons that accuse no sensor
+NO_FAULTS = np.array(
+    [kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN]
+)  # kinds of reasons that accuse no sensor
 
 
 def starts_anew(estimator: Estimator) -> bool:
@@ -46,9 +58,18 @@ class Monitor:
     from a faster bus.
     """
 
-    def __init__(self, estimator: Estimator, trust: Trust | None, *, elsewhere: bool = False, behind_front_end: bool = False) -> None:
+    def __init__(
+        self,
+        estimator: Estimator,
+        trust: Trust | None,
+        *,
+        elsewhere: bool = False,
+        behind_front_end: bool = False,
+    ) -> None:
         bands, health = (trust.bands, trust.health) if trust is not None else (None, None)
-        self._health = health.packed(behind_front_end=behind_front_end) if health is not None else None
+        self._health = (
+            health.packed(behind_front_end=behind_front_end) if health is not None else None
+        )
         self._state = health.start() if health is not None else np.empty(0)
         self._bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
         self.has_bands = bands is not None
@@ -57,7 +78,11 @@ class Monitor:
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
         self._starts_anew = starts_anew(estimator)
-        self._rollback = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if getattr(estimator, "adapts", False) else 0
+        self._rollback = (
+            max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1)
+            if getattr(estimator, "adapts", False)
+            else 0
+        )
         self._fault = np.zeros(2)
 
     def before(self, received: FloatArray, cleaned: Cleaned) -> Health:
@@ -65,10 +90,26 @@ class Monitor:
         if self._health is None:
             return Health(*np.zeros((3, len(received))))
         found = health_rows(self._health, received, cleaned.measured, self._state)
-        isolate_rows(found.status, found.reason, self._numbers, self._skippable, self._starts_anew, self._rollback, *cleaned, self._fault)
+        isolate_rows(
+            found.status,
+            found.reason,
+            self._numbers,
+            self._skippable,
+            self._starts_anew,
+            self._rollback,
+            *cleaned,
+            self._fault,
+        )
         return found
 
-    def after(self, verdict: Health, watched: Watched, cleaned: Cleaned, vx: FloatArray, variance: FloatArray) -> FloatArray:
+    def after(
+        self,
+        verdict: Health,
+        watched: Watched,
+        cleaned: Cleaned,
+        vx: FloatArray,
+        variance: FloatArray,
+    ) -> FloatArray:
         """Complete the verdict of `before`, in place, and give half widths of v [m/s] and β [rad], (T, 2); NaN where none are known.
 
         Args:
@@ -76,16 +117,29 @@ class Monitor:
             vx: speed of the estimate, (T,) [m/s].
             variance: of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
         """
-        verdict_rows(watched.vy, watched.marks, cleaned.flow, cleaned.measured, self._needed, self._numbers, verdict.status, verdict.reason)
+        verdict_rows(
+            watched.vy,
+            watched.marks,
+            cleaned.flow,
+            cleaned.measured,
+            self._needed,
+            self._numbers,
+            verdict.status,
+            verdict.reason,
+        )
         bands = np.full((len(watched.vy), 2), np.nan)
         if self._bands is not None:
             band_rows(cleaned.rows, watched.vy, variance, *self._bands, bands)
-            widen_rows(verdict.status, verdict.reason, watched.marks, watched.vy, vx, self._farthest, bands)
+            widen_rows(
+                verdict.status, verdict.reason, watched.marks, watched.vy, vx, self._farthest, bands
+            )
         return bands
 
 
 @entry(nogil=True)
-def isolate_rows(status, reason, numbers, skippable, starts_anew, rollback, rows, measured, flow, state):  # type: ignore[no-untyped-def]
+def isolate_rows(  # type: ignore[no-untyped-def]
+    status, reason, numbers, skippable, starts_anew, rollback, rows, measured, flow, state
+):
     """Take accused channels out of rows, and have estimators start anew after faults; ``rows, measured, flow`` are changed in place.
 
     Args:

@@ -28,7 +28,9 @@ class Watched(NamedTuple):
 
     vy: FloatArray  # (T,) [m/s]; NaN before the first estimate only
     marks: NDArray[np.int8]  # sum of marks at each row, (T,)
-    lost: bool  # whether the estimator diverged at the last row, behind which the others are left out
+    lost: (
+        bool  # whether the estimator diverged at the last row, behind which the others are left out
+    )
 
 
 class Watch:
@@ -38,7 +40,9 @@ class Watch:
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
-        self._settings = np.array([limits.top_speed, limits.largest_tan_sideslip, float(warm_up), 1.0 / rate_hz])
+        self._settings = np.array(
+            [limits.top_speed, limits.largest_tan_sideslip, float(warm_up), 1.0 / rate_hz]
+        )
         self.state = np.zeros(6)
         self.state[0] = math.nan  # no estimate yet
 
@@ -74,7 +78,11 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         u, r, ay = motion[k, 0], motion[k, 1], motion[k, 2]
         spins = abs(ay - u * r) > SPIN_RATE  # false where one is not known
         state[2] = min(state[2] + step, 2.0 * SPIN_SECONDS) if spins else max(state[2] - step, 0.0)
-        remembered = state[1] * math.exp(-step / REMEMBERED_SECONDS) if state[1] > 0.0 else top_speed * math.isnan(u)
+        remembered = (
+            state[1] * math.exp(-step / REMEMBERED_SECONDS)
+            if state[1] > 0.0
+            else top_speed * math.isnan(u)
+        )
         speed = remembered if math.isnan(u) else min(abs(u), top_speed)
         state[1] = max(speed, remembered)
         bound = largest_tan * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)

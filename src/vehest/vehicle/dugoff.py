@@ -48,7 +48,9 @@ class LoadedCar:
     yaw_inertia: float = 3498.0  # about the vertical axis through the centre of gravity [kg m²]
     cg_to_front_axle: float = 1.47  # distance from the centre of gravity [m]
     cg_to_rear_axle: float = 1.41  # the same [m]
-    cg_height: float = 0.52  # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
+    cg_height: float = (
+        0.52  # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
+    )
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -60,8 +62,12 @@ class LoadedCar:
         """Vertical force on the front and on the rear axle under longitudinal accelerations (...) [m/s²], (...) [N] each."""
         wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
         transfer = ax * (self.cg_height / wheelbase)
-        front, rear = (GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle))
-        return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (rear + transfer).clamp(min=LEAST_LOAD * rear)
+        front, rear = (
+            GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle)
+        )
+        return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (
+            rear + transfer
+        ).clamp(min=LEAST_LOAD * rear)
 
 
 BMW_545I = LoadedCar()  # BMW 545i of Bertipaglia et al. 2024
@@ -81,7 +87,12 @@ class DugoffAxle(NamedTuple):
         left; ``load`` the vertical force [N], ``vx`` the forward speed [m/s]; ``tyres`` are ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
         """
         slide = tangent.abs()
-        half = self.friction * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE) * load / (2.0 * self.cornering_stiffness)
+        half = (
+            self.friction
+            * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE)
+            * load
+            / (2.0 * self.cornering_stiffness)
+        )
         ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
         used = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
         force: Tensor = self.cornering_stiffness * tangent * used
@@ -124,11 +135,17 @@ class DugoffTrack:
             ],
             -1,
         )
-        return torch.where((vx < self.minimum_speed).unsqueeze(-1), self.rolling(inputs), states + self.step * rates)
+        return torch.where(
+            (vx < self.minimum_speed).unsqueeze(-1),
+            self.rolling(inputs),
+            states + self.step * rates,
+        )
 
     def rolling(self, inputs: Tensor) -> Tensor:
         """The state of a car whose wheels do not slip, (..., 2) under inputs (..., 3)."""
-        turn = inputs[..., 0] * inputs[..., 1] / (self.car.cg_to_front_axle + self.car.cg_to_rear_axle)
+        turn = (
+            inputs[..., 0] * inputs[..., 1] / (self.car.cg_to_front_axle + self.car.cg_to_rear_axle)
+        )
         return torch.stack([self.car.cg_to_rear_axle * turn, turn], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
@@ -138,4 +155,13 @@ class DugoffTrack:
         """
         front, rear = self.forces(states, inputs)
         sideslip = torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed))
-        return torch.stack([(front + rear) / self.car.mass, states[..., 1] + torch.zeros_like(front), front, rear, sideslip], -1)
+        return torch.stack(
+            [
+                (front + rear) / self.car.mass,
+                states[..., 1] + torch.zeros_like(front),
+                front,
+                rear,
+                sideslip,
+            ],
+            -1,
+        )

@@ -20,7 +20,11 @@ STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
 PACEJKA: Mapping[str, float] = {
     "friction": 0.8916,
     **{"B_x": 2.8, "C_x": 1.2, "D_x": 0.8095},
-    **{f"{name}_{axle}": value for axle in ("front", "rear") for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))},
+    **{
+        f"{name}_{axle}": value
+        for axle in ("front", "rear")
+        for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))
+    },
 }
 """Where learning Pacejka's curves of the F1TENTH car starts; the same source."""
 
@@ -54,18 +58,25 @@ class Perceptron(nn.Sequential):
                 if isinstance(layer, nn.Linear):
                     bound = layer.in_features**-0.5
                     for parameter in (layer.weight, layer.bias):
-                        parameter.copy_(bound * (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0))
+                        parameter.copy_(
+                            bound * (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0)
+                        )
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weight and offset of each layer, scales included."""
         linear = [layer for layer in self if isinstance(layer, nn.Linear)]
         pairs: list[tuple[Tensor, Tensor]] = [(layer.weight, layer.bias) for layer in linear]
         pairs[0] = (pairs[0][0] / self.input_scale, pairs[0][1])
-        pairs[-1] = (pairs[-1][0] * self.output_scale.unsqueeze(-1), pairs[-1][1] * self.output_scale)
+        pairs[-1] = (
+            pairs[-1][0] * self.output_scale.unsqueeze(-1),
+            pairs[-1][1] * self.output_scale,
+        )
         return pairs
 
 
-def rk4(derivative: Callable[[Tensor, Tensor], Tensor], state: Tensor, inputs: Tensor, step: float) -> Tensor:
+def rk4(
+    derivative: Callable[[Tensor, Tensor], Tensor], state: Tensor, inputs: Tensor, step: float
+) -> Tensor:
     """The state, (..., n), one step [s] later by the classical Runge-Kutta method (Kutta 1901), inputs (..., p) held over it."""
     first = derivative(state, inputs)
     second = derivative(state + 0.5 * step * first, inputs)
@@ -119,19 +130,27 @@ class PacejkaCar(Dynamics):
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
-        return self.car.motion(state, inputs, self.tyres(self.car.slips(state, inputs), self.car.loads()))
+        return self.car.motion(
+            state, inputs, self.tyres(self.car.slips(state, inputs), self.car.loads())
+        )
 
 
 class ResidualCar(PacejkaCar):
     """PCR: the same, and a network that adds to its rates."""
 
-    def __init__(self, car: Mapping[str, float] = F1TENTH, *, hidden: Sequence[int] = (256, 256)) -> None:
+    def __init__(
+        self, car: Mapping[str, float] = F1TENTH, *, hidden: Sequence[int] = (256, 256)
+    ) -> None:
         super().__init__(car)
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
-        return _kinematic(state, super().motion(state, inputs).rates + self.network(torch.cat([state[..., :4], inputs], -1)))
+        return _kinematic(
+            state,
+            super().motion(state, inputs).rates
+            + self.network(torch.cat([state[..., :4], inputs], -1)),
+        )
 
 
 class NeuralCar(Dynamics):
@@ -156,7 +175,13 @@ class TyreNetworkCar(Dynamics):
         friction_scaled: whether forces are scaled by friction (NNTF).
     """
 
-    def __init__(self, car: Mapping[str, float] = F1TENTH, *, friction_scaled: bool = True, hidden: Sequence[int] = (64, 64)) -> None:
+    def __init__(
+        self,
+        car: Mapping[str, float] = F1TENTH,
+        *,
+        friction_scaled: bool = True,
+        hidden: Sequence[int] = (64, 64),
+    ) -> None:
         super().__init__()
         self.car = PlanarCar(car)
         self.friction_scaled = friction_scaled
@@ -167,7 +192,9 @@ class TyreNetworkCar(Dynamics):
         steer, current = inputs.unbind(-1)
         seen = [*state.unbind(-1), steer, slips.front, slips.rear, slips.ratio]
         if not self.friction_scaled:
-            rear_x, front_x, rear_y, front_y = (UNSCALED * self.network(torch.stack([*seen, current], -1))).unbind(-1)
+            rear_x, front_x, rear_y, front_y = (
+                UNSCALED * self.network(torch.stack([*seen, current], -1))
+            ).unbind(-1)
             return TyreForces(front_x, front_y, rear_x, rear_y)
         rear_x, front_x, rear_y, front_y = self.network(torch.stack(seen, -1)).unbind(-1)
         mu = state[..., 4]
@@ -180,7 +207,9 @@ class TyreNetworkCar(Dynamics):
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
-        return self.car.motion(state, inputs, self.forces(state, inputs, self.car.slips(state, inputs)))
+        return self.car.motion(
+            state, inputs, self.forces(state, inputs, self.car.slips(state, inputs))
+        )
 
 
 def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
@@ -190,7 +219,9 @@ def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
         return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(KNOWN)
     learnt = torch.stack([car.learnt[name] for name in LEARNT])
     curves = (
-        torch.stack([tyres.parameters_of[name] for name in PACEJKA]) if isinstance(tyres, PacejkaTyres) else learnt.new_zeros(len(PACEJKA))
+        torch.stack([tyres.parameters_of[name] for name in PACEJKA])
+        if isinstance(tyres, PacejkaTyres)
+        else learnt.new_zeros(len(PACEJKA))
     )
     return torch.cat([learnt, curves]), (car.mass, car.wheelbase, car.wheel_radius)
 

@@ -56,7 +56,9 @@ class PlanarCar(nn.Module):
     def __init__(self, car: Mapping[str, float] = F1TENTH) -> None:
         super().__init__()
         self.mass, self.wheelbase, self.wheel_radius = (car[name] for name in KNOWN)
-        self.learnt = PositiveParameters({name: value for name, value in car.items() if name not in KNOWN})
+        self.learnt = PositiveParameters(
+            {name: value for name, value in car.items() if name not in KNOWN}
+        )
 
     @property
     def to_front_axle(self) -> Tensor:
@@ -88,12 +90,24 @@ class PlanarCar(nn.Module):
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
         steer, current = inputs.unbind(-1)
         sine, cosine = torch.sin(steer), torch.cos(steer)
-        drag = p["drag_constant"] * torch.sign(vx) + p["drag_linear"] * vx + p["drag_quadratic"] * vx.square()
+        drag = (
+            p["drag_constant"] * torch.sign(vx)
+            + p["drag_linear"] * vx
+            + p["drag_quadratic"] * vx.square()
+        )
         sideways = forces.front_x * sine + forces.front_y * cosine
         ax = (forces.rear_x + forces.front_x * cosine - forces.front_y * sine - drag) / self.mass
         ay = (sideways + forces.rear_y) / self.mass
-        turning = (sideways * self.to_front_axle - forces.rear_y * p["cg_to_rear_axle"]) / p["yaw_inertia"]
+        turning = (sideways * self.to_front_axle - forces.rear_y * p["cg_to_rear_axle"]) / p[
+            "yaw_inertia"
+        ]
         lost = p["friction_viscous"] * rim_speed + p["friction_coulomb"] * torch.sign(rim_speed)
-        torque = p["torque_constant"] * current - self.wheel_radius * (forces.front_x + forces.rear_x) - lost
+        torque = (
+            p["torque_constant"] * current
+            - self.wheel_radius * (forces.front_x + forces.rear_x)
+            - lost
+        )
         spinning = self.wheel_radius / p["powertrain_inertia"] * torque
-        return Motion(torch.stack([ax + vy * yaw_rate, ay - vx * yaw_rate, turning, spinning], -1), ax, ay)
+        return Motion(
+            torch.stack([ax + vy * yaw_rate, ay - vx * yaw_rate, turning, spinning], -1), ax, ay
+        )

@@ -34,4 +34,10 @@ def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:
     share = 1.0 / (1.0 + bend)
     force = c2 * friction * slip * share
     bent = force * bend * share
-    return AxleForce(force, c2 * friction * (1.0 - bend) * share * share, bent, force, force + bent * friction / (friction + 1.0))
+    return AxleForce(
+        force,
+        c2 * friction * (1.0 - bend) * share * share,
+        bent,
+        force,
+        force + bent * friction / (friction + 1.0),
+    )

@@ -35,7 +35,12 @@ class LateralModel(NamedTuple):
 def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
     """The model at forward speeds u, positive (...) [m/s]; it is continuous."""
     u = np.asarray(vx, np.float64)
-    front, rear, lf, lr = car.cornering_stiffness_front, car.cornering_stiffness_rear, car.cg_to_front_axle, car.cg_to_rear_axle
+    front, rear, lf, lr = (
+        car.cornering_stiffness_front,
+        car.cornering_stiffness_rear,
+        car.cg_to_front_axle,
+        car.cg_to_rear_axle,
+    )
     moment, same = lf * front - lr * rear, np.ones_like(u)
     per_momentum = 1.0 / (car.mass * u)
     A = [
@@ -46,4 +51,9 @@ def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
     ]
     B = [front * per_momentum, lf * front / car.yaw_inertia * same]
     C = [-(front + rear) / car.mass * same, -moment * per_momentum]
-    return LateralModel(np.stack(A, -1).reshape(*u.shape, 2, 2), np.stack(B, -1), np.stack(C, -1), front / car.mass * same)
+    return LateralModel(
+        np.stack(A, -1).reshape(*u.shape, 2, 2),
+        np.stack(B, -1),
+        np.stack(C, -1),
+        front / car.mass * same,
+    )

@@ -49,7 +49,9 @@ class TyreTrack:
         sideslip, turn = states[..., 0], states[..., 1] / inputs[..., 0]
         front = inputs[..., 1] - sideslip - self.car.cg_to_front_axle * turn
         rear = -sideslip + self.car.cg_to_rear_axle * turn
-        return rational_axle(front, c1_front, c2_front, friction), rational_axle(rear, c1_rear, c2_rear, friction)
+        return rational_axle(front, c1_front, c2_front, friction), rational_axle(
+            rear, c1_rear, c2_rear, friction
+        )
 
     def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
         """States one step later, (..., n) under inputs (..., 2)."""
@@ -57,7 +59,8 @@ class TyreTrack:
         car = self.car
         rates = [
             (front.force + rear.force) / (car.mass * inputs[..., 0]) - states[..., 1],
-            (car.cg_to_front_axle * front.force - car.cg_to_rear_axle * rear.force) / car.yaw_inertia,
+            (car.cg_to_front_axle * front.force - car.cg_to_rear_axle * rear.force)
+            / car.yaw_inertia,
         ]
         moved = states[..., :2] + self.step * states[..., 2:4]
         return torch.cat([moved, torch.stack(rates, -1), states[..., 4:]], -1)
@@ -76,5 +79,9 @@ class TyreTrack:
         slope = torch.zeros_like(states)
         slope[..., 2] = steer * (front.per_slip / (self.car.mass * inputs[..., 0]))
         slope[..., 3] = steer * (self.car.cg_to_front_axle * front.per_slip / self.car.yaw_inertia)
-        wander = torch.tensor([0.0] * len(MOTION) + [tyres] * len(self.adapted), dtype=states.dtype).square().diag()
+        wander = (
+            torch.tensor([0.0] * len(MOTION) + [tyres] * len(self.adapted), dtype=states.dtype)
+            .square()
+            .diag()
+        )
         return self.step * (slope.unsqueeze(-1) * slope.unsqueeze(-2) + wander)

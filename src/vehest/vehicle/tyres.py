@@ -46,7 +46,9 @@ class PositiveParameters(nn.Module):
         return logarithm.exp()
 
 
-def magic_formula(slip: Tensor, stiffness: Tensor, shape: Tensor, curvature: Tensor | float = 0.0) -> Tensor:
+def magic_formula(
+    slip: Tensor, stiffness: Tensor, shape: Tensor, curvature: Tensor | float = 0.0
+) -> Tensor:
     """Pacejka's curve for a peak of 1: sin(C atan(B s - E (B s - atan(B s)))).
 
     The slip s is an angle [rad] or a ratio, the stiffness B [1/rad] or [1]; a curvature E of 0 is left out.

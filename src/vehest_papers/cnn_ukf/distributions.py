@@ -19,7 +19,12 @@ from vehest_papers.kit.reading import median_and_range
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
 
 
-def figure_4(parts: Mapping[str, PartArtefacts], prepared: Mapping[str, Prepared], titles: Mapping[str, str], data: str) -> Figure:
+def figure_4(
+    parts: Mapping[str, PartArtefacts],
+    prepared: Mapping[str, Prepared],
+    titles: Mapping[str, str],
+    data: str,
+) -> Figure:
     """How often which sideslip angle and lateral acceleration is driven: training, validation and test of each part together."""
     driven = {name: _driven(part, prepared[name]) for name, part in parts.items()}
     labels = ("sideslip angle [deg]", "lateral acceleration [m/s²]")
@@ -28,7 +33,11 @@ def figure_4(parts: Mapping[str, PartArtefacts], prepared: Mapping[str, Prepared
         for (name, columns), colour in zip(driven.items(), SETS_COLOURS, strict=False):
             for axes, values, label in zip(panels, columns, labels, strict=True):
                 edges = np.arange(np.floor(values.min()), np.ceil(values.max()) + 1.5)
-                filled = {"alpha": 0.55, "histtype": "stepfilled"} if name == next(iter(driven)) else {"histtype": "step", "linewidth": 1.3}
+                filled = (
+                    {"alpha": 0.55, "histtype": "stepfilled"}
+                    if name == next(iter(driven))
+                    else {"histtype": "step", "linewidth": 1.3}
+                )
                 axes.hist(values, edges, color=colour, label=titles[name], **filled)
                 axes.set_yscale("log")
                 axes.set_xlabel(label)
@@ -50,8 +59,15 @@ def figure_4(parts: Mapping[str, PartArtefacts], prepared: Mapping[str, Prepared
 
 def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatArray]:
     """Sideslip angle [deg] and lateral acceleration [m/s²] of all samples."""
-    spans = [*part.split.train, *part.split.validation, *(span for own in part.split.tests.values() for span in own)]
-    pieces = [prepared.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
+    spans = [
+        *part.split.train,
+        *part.split.validation,
+        *(span for own in part.split.tests.values() for span in own),
+    ]
+    pieces = [
+        prepared.recording(span.dataset, span.recording).cut(span.start, span.stop)
+        for span in spans
+    ]
     sideslip = [np.degrees(np.arctan2(piece["vy_ref"], piece["vx"])) for piece in pieces]
     return np.concatenate(sideslip), np.concatenate([piece["ay"] for piece in pieces])
 
@@ -59,13 +75,27 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
 def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
     """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation."""
     picked = {candidate: chosen(own) for candidate, own in runs.items()}
-    found = {name: error_distribution([part for parts in run.test.values() for part in parts]) for name, run in picked.items()}
+    found = {
+        name: error_distribution([part for parts in run.test.values() for part in parts])
+        for name, run in picked.items()
+    }
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
-        upper, axes = figure.subplots(2, 1, height_ratios=(1.2, 3.2))  # errors reach ten times as far as deviations
+        upper, axes = figure.subplots(
+            2, 1, height_ratios=(1.2, 3.2)
+        )  # errors reach ten times as far as deviations
         for place, (candidate, own) in enumerate(found.items()):
             line = line_of(candidate)
-            axes.stairs(np.maximum(own.counts, 0.5), own.edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=candidate)
-            upper.errorbar(own.mean, -place, xerr=own.deviation, color=line.colour, fmt="x", capsize=3)
+            axes.stairs(
+                np.maximum(own.counts, 0.5),
+                own.edges,
+                color=line.colour,
+                linestyle=line.dash,
+                linewidth=1.2,
+                label=candidate,
+            )
+            upper.errorbar(
+                own.mean, -place, xerr=own.deviation, color=line.colour, fmt="x", capsize=3
+            )
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.5)
         axes.set_ylabel("samples")
@@ -93,7 +123,9 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
 
 def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
-    of_run = {candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()}
+    of_run = {
+        candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()
+    }
     known = list(next(iter(of_run.values()))[0])
     values = {
         (candidate, group): np.array([seed[group].mse_nonlinear for seed in seeds])
@@ -106,20 +138,46 @@ def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
         width = 0.84 / len(of_run)
         for place, candidate in enumerate(of_run):
             middle = np.array([np.median(values[candidate, group]) for group in known])
-            low, high = (np.array([limit(values[candidate, group]) for group in known]) for limit in (np.min, np.max))
+            low, high = (
+                np.array([limit(values[candidate, group]) for group in known])
+                for limit in (np.min, np.max)
+            )
             at = np.arange(len(known)) + (place - 0.5 * (len(of_run) - 1)) * width
             axes.bar(at, middle, width, color=line_of(candidate).colour, alpha=0.8, label=candidate)
-            axes.errorbar(at, middle, yerr=[middle - low, high - middle], fmt="none", ecolor="#222222", elinewidth=0.8, capsize=1.5)
-        axes.set_xticks(range(len(known)), [f"{group.replace(' in the ', chr(10) + 'in the ')}\n({counted[group]})" for group in known])
+            axes.errorbar(
+                at,
+                middle,
+                yerr=[middle - low, high - middle],
+                fmt="none",
+                ecolor="#222222",
+                elinewidth=0.8,
+                capsize=1.5,
+            )
+        axes.set_xticks(
+            range(len(known)),
+            [
+                f"{group.replace(' in the ', chr(10) + 'in the ')}\n({counted[group]})"
+                for group in known
+            ],
+        )
         axes.set_ylabel("MSE$_{nl}$ [deg²]")
         axes.set_yscale("log")
         legend_above(figure, axes, columns=5)
     rows = [
         {"group": group, "n": counted[group]}
         | {candidate: median_and_range(values[candidate, group], 3) for candidate in of_run}
-        | {f"{candidate}_median": float(np.median(values[candidate, group])) for candidate in of_run}
+        | {
+            f"{candidate}_median": float(np.median(values[candidate, group]))
+            for candidate in of_run
+        }
         for group in known
     ]
-    columns = {"group": Column("manoeuvres"), "n": Column("of them", decimals=0), **{candidate: Column(candidate) for candidate in of_run}}
+    columns = {
+        "group": Column("manoeuvres"),
+        "n": Column("of them", decimals=0),
+        **{candidate: Column(candidate) for candidate in of_run},
+    }
     caption = f"MSE_nl [deg²] by group of manoeuvres (Figure 6 of the paper), {title}: median of seeds, lowest and highest. Data: {data}."
-    return Figure("figure_6", caption, figure), Table("figure_6", caption, pd.DataFrame(rows), columns)
+    return Figure("figure_6", caption, figure), Table(
+        "figure_6", caption, pd.DataFrame(rows), columns
+    )

@@ -13,7 +13,16 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
-from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, search, tables, traces
+from vehest_papers.cnn_ukf import (
+    claims,
+    distributions,
+    observability,
+    paper,
+    perturbed,
+    search,
+    tables,
+    traces,
+)
 from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
@@ -44,7 +53,11 @@ RENAMED = {
     STANDARD: {paper.DATA: paper.Z_SCORES},
 }
 """Part -> what its candidates are called beside those of the full set."""
-NETWORKS = (paper.DATA, paper.Z_SCORES, paper.RECURRENT)  # networks without a filter, in a table of their own
+NETWORKS = (
+    paper.DATA,
+    paper.Z_SCORES,
+    paper.RECURRENT,
+)  # networks without a filter, in a table of their own
 IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in tables.ORACLES)
 NOTE = (
     "Changes are CNN-UKF's to the other's unless stated. Seeds 3 and 4 of the hybrids and the limited set were added after the test "
@@ -62,12 +75,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         raise DataError(f"study '{artefacts.study}' needs part '{FULL}'")
     for name, part in artefacts.parts.items():
         if set(part.split.tests) != {TEST}:
-            raise DataError(f"study '{artefacts.study}': the test set of part '{name}' must be called {TEST}")
+            raise DataError(
+                f"study '{artefacts.study}': the test set of part '{name}' must be called {TEST}"
+            )
     prepared = {name: Prepared(part) for name, part in artefacts.parts.items()}
     parts = {name: runs_of(part, prepared[name]) for name, part in artefacts.parts.items()}
     missing = [candidate for candidate in paper.OF_FOUR if candidate not in parts[FULL]]
     if missing:
-        raise DataError(f"study '{artefacts.study}': no {' and no '.join(missing)} among the models of part '{FULL}'; it needs all four")
+        raise DataError(
+            f"study '{artefacts.study}': no {' and no '.join(missing)} among the models of part '{FULL}'; it needs all four"
+        )
     runs = _together(parts)
     runs |= oracles(runs, prepared[FULL])
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
@@ -75,7 +92,11 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def _place(candidate: str) -> int:
-    return paper.CANDIDATES.index(candidate) if candidate in paper.CANDIDATES else len(paper.CANDIDATES)
+    return (
+        paper.CANDIDATES.index(candidate)
+        if candidate in paper.CANDIDATES
+        else len(paper.CANDIDATES)
+    )
 
 
 def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
@@ -83,20 +104,35 @@ def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
     found: dict[str, Sequence[Run]] = {}
     for name, runs in parts.items():
         if name != LIMITED and not search.is_point(name):
-            found |= {RENAMED.get(name, {}).get(candidate, candidate): own for candidate, own in runs.items()}
+            found |= {
+                RENAMED.get(name, {}).get(candidate, candidate): own
+                for candidate, own in runs.items()
+            }
     return found
 
 
-def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, prepared: Mapping[str, Prepared]) -> Document:
+def _report(
+    artefacts: StudyArtefacts,
+    parts: Mapping[str, Runs],
+    runs: Runs,
+    prepared: Mapping[str, Prepared],
+) -> Document:
     kind = words_of_kinds(artefacts.parts[FULL])
     main, own = ManoeuvreErrors(runs, "test"), prepared[FULL]
     filters_with_networks = ("ensemble_ukf", "cnn_ukf")
-    hybrids = [name for name in runs if runs[name][0].model.estimator in filters_with_networks and name != paper.ORACLE_DISTRUST]
+    hybrids = [
+        name
+        for name in runs
+        if runs[name][0].model.estimator in filters_with_networks and name != paper.ORACLE_DISTRUST
+    ]
     outputs = {name: [outputs_of(run, own) for run in runs[name]] for name in hybrids}
     shifts = {name: [shift_of(run, own) for run in runs[name]] for name in hybrids}
     active = claims.activity(outputs, shifts)
     titles = {
-        name: f"{name}{OWN}" if name in paper.OWN_FILTER and claims.is_own_filter(main, name, float(np.median(shifts[name]))) else name
+        name: f"{name}{OWN}"
+        if name in paper.OWN_FILTER
+        and claims.is_own_filter(main, name, float(np.median(shifts[name])))
+        else name
         for name in runs
     }
     off = perturbed.perturbed(runs, own)
@@ -113,9 +149,17 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
         *claims.on_limited(learnt, kind),
     ]
     verdicts = [*decided(statements), *observability.claims(local), *claims.not_testable()]
-    picked = {name: chosen(seeds) for name, seeds in runs.items() if name in paper.TABLE_II or name in (paper.SMOOTH, paper.FREE)}
+    picked = {
+        name: chosen(seeds)
+        for name, seeds in runs.items()
+        if name in paper.TABLE_II or name in (paper.SMOOTH, paper.FREE)
+    }
     drawn = {titles[name]: run for name, run in picked.items()}
-    data = {f"kpis_{name}": kpi_table(seeds) for name, seeds in parts.items() if not search.is_point(name)}
+    data = {
+        f"kpis_{name}": kpi_table(seeds)
+        for name, seeds in parts.items()
+        if not search.is_point(name)
+    }
     data["stiffness"] = perturbed.values(off)
     blocks: list[Block] = [
         *_asked(artefacts, main, driven, titles, active, learnt),
@@ -126,7 +170,10 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
         overview(artefacts, parts, main, titles),
         "## Appendix: networks and process noise",
         tables.networks_alone(
-            main, outputs, "networks_full", f"Outputs of the hybrids' networks, and of their filters. Data: {kind.upper()}."
+            main,
+            outputs,
+            "networks_full",
+            f"Outputs of the hybrids' networks, and of their filters. Data: {kind.upper()}.",
         ),
     ]
     if learnt is not None:
@@ -163,11 +210,16 @@ def _asked(
     four = sorted(paper.OF_FOUR, key=lambda name: main.get(name, MSE_NL).value)
     order = ", ".join(f"{titles[name]} {main.in_words(name, MSE_NL)}" for name in four)
     published = {name: paper.TABLE_II[name].mse_nonlinear for name in paper.OF_FOUR}
-    paper_order = ", ".join(f"{name} {fixed(published[name], 3)}" for name in sorted(published, key=published.__getitem__))
+    paper_order = ", ".join(
+        f"{name} {fixed(published[name], 3)}"
+        for name in sorted(published, key=published.__getitem__)
+    )
     sentences = [f"**Order by MSE_nl [deg²], best first:** {order} (paper: {paper_order})."]
     if paper.BEFORE in main:
         change = main.change(paper.CNN, paper.BEFORE, MSE_NL)
-        sentences.append(f"**Training through the filter** changes CNN-UKF's MSE_nl by {change.in_percent()}.")
+        sentences.append(
+            f"**Training through the filter** changes CNN-UKF's MSE_nl by {change.in_percent()}."
+        )
     if paper.FREE in main:
         change, name = main.change(paper.CNN, paper.FREE, MSE_NL), titles[paper.CNN]
         sentences.append(
@@ -177,11 +229,18 @@ def _asked(
     if learnt is not None:
         own = learnt.comparison
         order = ", ".join(
-            f"{name} {own.in_words(name, MSE_NL)}" for name in sorted(paper.OF_FOUR, key=lambda name: own.get(name, MSE_NL).value)
+            f"{name} {own.in_words(name, MSE_NL)}"
+            for name in sorted(paper.OF_FOUR, key=lambda name: own.get(name, MSE_NL).value)
         )
         sentences.append(f"**Learnt without the limit of handling** (|ay| ≤ 7 m/s²): {order}.")
-    shown = ", ".join(f"{name} {driven.in_words(name, MSE_NL)}" for name in (paper.CNN, paper.SMOOTH, paper.FREE) if name in driven)
-    sentences.append(f"**Mind:** {_cut_in_words(driven)} cut at 12°; scored whole, beyond what networks learnt from: {shown} deg².")
+    shown = ", ".join(
+        f"{name} {driven.in_words(name, MSE_NL)}"
+        for name in (paper.CNN, paper.SMOOTH, paper.FREE)
+        if name in driven
+    )
+    sentences.append(
+        f"**Mind:** {_cut_in_words(driven)} cut at 12°; scored whole, beyond what networks learnt from: {shown} deg²."
+    )
     row = active[active["candidate"] == paper.CNN].iloc[0]
     sentences.append(
         f"**Influence of the network on the filter:** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°."
@@ -201,8 +260,17 @@ def _results(
     part, own = artefacts.parts[FULL], prepared[FULL]
     kind = words_of_kinds(part).upper()
     slalom = traces.manoeuvre_of(part, own, "slalom")
-    four = {name: run for name, run in drawn.items() if run.candidate in paper.OF_FOUR and not name.startswith(paper.FREE)}
-    learnt = {run.candidate if name == titles.get(run.candidate) else name: tables.training_error(run, own) for name, run in drawn.items()}
+    four = {
+        name: run
+        for name, run in drawn.items()
+        if run.candidate in paper.OF_FOUR and not name.startswith(paper.FREE)
+    }
+    learnt = {
+        run.candidate if name == titles.get(run.candidate) else name: tables.training_error(
+            run, own
+        )
+        for name, run in drawn.items()
+    }
     in_table = {titles[name]: seeds for name, seeds in main.runs.items() if name in IN_TABLE_II}
     caption = (
         "Table II: ours with 95 % intervals, means over seeds (paper's in brackets). RMSE of validation and training: means over "
@@ -212,7 +280,9 @@ def _results(
     shown = {titles.get(name, name): value for name, value in learnt.items()}
     variants = ManoeuvreErrors({name: main.runs[name] for name in active["candidate"]}, "test")
     return [
-        traces.compared(four, slalom, 7, "Slalom with the largest sideslip angle of those without a spin", kind),
+        traces.compared(
+            four, slalom, 7, "Slalom with the largest sideslip angle of those without a spin", kind
+        ),
         "## Full set",
         tables.accuracy(ManoeuvreErrors(in_table, "test"), published, shown, "table_2", caption),
         "## Why: what each part of CNN-UKF does",
@@ -225,25 +295,42 @@ def _results(
     ]
 
 
-def overview(artefacts: StudyArtefacts, parts: Mapping[str, Runs], main: ManoeuvreErrors, titles: Mapping[str, str]) -> Table:
+def overview(
+    artefacts: StudyArtefacts,
+    parts: Mapping[str, Runs],
+    main: ManoeuvreErrors,
+    titles: Mapping[str, str],
+) -> Table:
     """What the terminal shows: both errors of both sets, beside the paper's."""
     rows = []
     for name in (FULL, LIMITED):
         if name not in parts:
             continue
-        shown = (*paper.TABLE_II, *((paper.SMOOTH, paper.FREE, paper.STATIC_MAP, paper.ZERO) if name == FULL else ()))
+        shown = (
+            *paper.TABLE_II,
+            *((paper.SMOOTH, paper.FREE, paper.STATIC_MAP, paper.ZERO) if name == FULL else ()),
+        )
         for candidate, own in (main.runs if name == FULL else parts[name]).items():
             if candidate not in shown:
                 continue
             known = paper.TABLES[name].get(candidate)
-            row: dict[str, object] = {"part": artefacts.titles[name], "candidate": titles[candidate] if name == FULL else candidate}
+            row: dict[str, object] = {
+                "part": artefacts.titles[name],
+                "candidate": titles[candidate] if name == FULL else candidate,
+            }
             for kpi in (MSE, MSE_NL):
                 values = [getattr(run.kpis, kpi) for run in own]
-                row |= {f"paper_{kpi}": getattr(known, kpi) if known else np.nan, f"ours_{kpi}": float(np.median(values))}
+                row |= {
+                    f"paper_{kpi}": getattr(known, kpi) if known else np.nan,
+                    f"ours_{kpi}": float(np.median(values)),
+                }
             rows.append(row | {"n_seeds": len(own)})
     columns = {"part": Column("learnt on"), "candidate": Column("method")}
     for kpi, header in ((MSE, "MSE"), (MSE_NL, "MSE_nl")):
-        columns |= {f"paper_{kpi}": Column(f"{header}, paper [deg²]", decimals=3), f"ours_{kpi}": Column(f"{header}, ours", decimals=3)}
+        columns |= {
+            f"paper_{kpi}": Column(f"{header}, paper [deg²]", decimals=3),
+            f"ours_{kpi}": Column(f"{header}, ours", decimals=3),
+        }
     columns["n_seeds"] = Column("seeds", decimals=0)
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     caption = f"Summary: squared errors of the sideslip angle, ours as medians of seeds. Data: {kind}; the paper's are real."
@@ -261,12 +348,18 @@ def _appendices(
 ) -> list[Block]:
     part, own = artefacts.parts[FULL], prepared[FULL]
     kind, title = words_of_kinds(part).upper(), artefacts.titles[FULL].lower()
-    shown = {titles[name]: runs[name] for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE) if name in runs}
+    shown = {
+        titles[name]: runs[name]
+        for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
+        if name in runs
+    }
     both = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
     figure, values = distributions.errors_figure(shown, 5, title, kind)
     data["errors_full"] = values
     warm_up = part.protocol.warm_up_seconds
-    slalom, spiral, lap = (traces.manoeuvre_of(part, own, group) for group in ("slalom", "spiral", "lap"))
+    slalom, spiral, lap = (
+        traces.manoeuvre_of(part, own, group) for group in ("slalom", "spiral", "lap")
+    )
     constant = tables.process_levels(chosen(runs[paper.DEEP]))
     return [
         "## Appendix: the paper's figures, full set",
@@ -274,81 +367,132 @@ def _appendices(
         figure,
         *distributions.groups(shown, title, kind),
         traces.inner_life(drawn, own, warm_up, slalom, constant, kind),
-        traces.compared(drawn, spiral, 9, "Spiral with the largest sideslip angle of those without a spin", kind),
+        traces.compared(
+            drawn, spiral, 9, "Spiral with the largest sideslip angle of those without a spin", kind
+        ),
         traces.lap(drawn, own, warm_up, lap, kind),
-        tables.consistency(part, {name: own for name, own in runs.items() if name in (*paper.TABLE_II, paper.SMOOTH)}, kind),
+        tables.consistency(
+            part,
+            {name: own for name, own in runs.items() if name in (*paper.TABLE_II, paper.SMOOTH)},
+            kind,
+        ),
     ]
 
 
-def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str) -> list[Block]:
+def _limited(
+    artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str
+) -> list[Block]:
     part, words, runs = artefacts.parts[LIMITED], kind.upper(), learnt.comparison.runs
-    drawn = {name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH}
+    drawn = {
+        name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH
+    }
     picked = {name: chosen(own) for name, own in drawn.items()}
     hybrids = {name: chosen(learnt.runs[name]) for name in paper.HYBRIDS}
     turn = traces.manoeuvre_of(part, prepared, "J-turn")
     figure, _ = distributions.errors_figure(drawn, 11, "limited set", words)
-    what = "J-turn with the largest sideslip angle of those without a spin, learnt on the limited set"
+    what = (
+        "J-turn with the largest sideslip angle of those without a spin, learnt on the limited set"
+    )
     caption = (
         "Table III: ours with 95 % intervals, means over seeds (paper's in brackets), learnt up to 7 m/s². What does not learn, "
         f"and its errors of validation, are those of the full set. Data: {words}."
     )
-    training = {name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()}
-    of_networks = "Outputs of the hybrids' networks, and of their filters, learnt on the limited set"
+    training = {
+        name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()
+    }
+    of_networks = (
+        "Outputs of the hybrids' networks, and of their filters, learnt on the limited set"
+    )
     return [
         "## Appendix: limited set",
         tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
-        tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", f"{of_networks}. Data: {words}."),
+        tables.networks_alone(
+            learnt.comparison, learnt.outputs, "networks_limited", f"{of_networks}. Data: {words}."
+        ),
         figure,
         traces.compared(picked, turn, 12, what, words),
         traces.angles_of_networks(hybrids, prepared, part.protocol.warm_up_seconds, turn, words),
     ]
 
 
-def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str) -> list[Block]:
+def _networks_and_oracles(
+    parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str
+) -> list[Block]:
     words, blocks = kind.upper(), list[Block]()
-    if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(map(search.is_point, parts)):
+    if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(
+        map(search.is_point, parts)
+    ):
         blocks.append("## Appendix: networks without a filter")
     if len(known) > 1:
         own = prepared[FULL]
-        training = {name: tables.training_error(chosen(seeds), own) for name, seeds in known.items()}
+        training = {
+            name: tables.training_error(chosen(seeds), own) for name, seeds in known.items()
+        }
         also = {name: main.runs[name] for name in (paper.STATIC_MAP, paper.ZERO) if name in main}
         caption = f"Networks without a filter on the full set: inputs in [0, 1], as z-scores, and a recurrent network. Data: {words}."
-        blocks.append(tables.accuracy(ManoeuvreErrors(known | also, "test"), {}, training, "networks_alone", caption))
+        blocks.append(
+            tables.accuracy(
+                ManoeuvreErrors(known | also, "test"), {}, training, "networks_alone", caption
+            )
+        )
     if any(map(search.is_point, parts)):
         blocks.append(search.search_table(parts, parts[FULL], words))
-    oracles_alone = ManoeuvreErrors({name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}, "test")
+    oracles_alone = ManoeuvreErrors(
+        {name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}, "test"
+    )
     caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
-    return [*blocks, "## Appendix: oracles", tables.accuracy(oracles_alone, {}, {}, "oracles", caption)]
+    return [
+        *blocks,
+        "## Appendix: oracles",
+        tables.accuracy(oracles_alone, {}, {}, "oracles", caption),
+    ]
 
 
 def _whole_drives(artefacts: StudyArtefacts) -> ManoeuvreErrors:
     """Candidates on all that was driven, without the limit of 12° of the amendment."""
     parts = {name: part for name, part in artefacts.parts.items() if name in (FULL, FREE)}
-    runs = _together({name: runs_of(part, Prepared(part, whole=True)) for name, part in parts.items()})
+    runs = _together(
+        {name: runs_of(part, Prepared(part, whole=True)) for name, part in parts.items()}
+    )
     return ManoeuvreErrors(runs, "whole")
 
 
 def _cut_in_words(driven: ManoeuvreErrors) -> str:
     """Which of the drives slide beyond the limit of the amendment, by their largest sideslip angles."""
     run = next(iter(driven.runs.values()))[0]
-    largest = [max(float(np.abs(part.sideslip_ref).max()) for part in parts) for parts in run.test.values()]
+    largest = [
+        max(float(np.abs(part.sideslip_ref).max()) for part in parts) for parts in run.test.values()
+    ]
     cut = sorted((np.degrees(angle) for angle in largest if angle > LARGEST_SIDESLIP), reverse=True)
     angles = listed([f"{angle:.0f}°" for angle in cut])
-    return f"{len(cut)} of {len(largest)} drives, with up to {angles}, {'is' if len(cut) == 1 else 'are'}" if cut else "no drive is"
+    return (
+        f"{len(cut)} of {len(largest)} drives, with up to {angles}, {'is' if len(cut) == 1 else 'are'}"
+        if cut
+        else "no drive is"
+    )
 
 
 def _all_that_was_driven(own: ManoeuvreErrors, kind: str) -> list[Block]:
     """Indicators without the limit of 12°."""
-    rows = [{"candidate": name, **{kpi: own.in_words(name, kpi) for kpi in KPIS}} for name in own.runs]
-    columns = {"candidate": Column("method")} | {kpi: Column(header) for kpi, header in KPIS.items()}
+    rows = [
+        {"candidate": name, **{kpi: own.in_words(name, kpi) for kpi in KPIS}} for name in own.runs
+    ]
+    columns = {"candidate": Column("method")} | {
+        kpi: Column(header) for kpi, header in KPIS.items()
+    }
     caption = (
         f"All that was driven on the test: {_cut_in_words(own)} cut at 12° in the tables above (amendment in docs/cnn_ukf.md). Means over "
         f"seeds with 95 % intervals. Data: {kind.upper()}."
     )
-    return ["## Appendix: all that was driven", Table("whole_drives", caption, pd.DataFrame(rows), columns)]
+    return [
+        "## Appendix: all that was driven",
+        Table("whole_drives", caption, pd.DataFrame(rows), columns),
+    ]
 
 
-def _filters_and_budget(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs) -> list[Block]:
+def _filters_and_budget(
+    artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs
+) -> list[Block]:
     titled = {name: (artefacts.titles[name], own) for name, own in parts.items()}
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     return [
@@ -356,7 +500,10 @@ def _filters_and_budget(artefacts: StudyArtefacts, parts: Mapping[str, Runs], ru
         tables.given_as_found(runs),
         tables.filters([own for name, own in titled.items() if name in (FULL, FREE)], kind),
         tables.scaling(titled, kind),
-        tables.budget([(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()], kind),
+        tables.budget(
+            [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()],
+            kind,
+        ),
     ]
 
 
@@ -417,10 +564,20 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
             if not search.is_point(name)
         ]
     )
-    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
+    columns = {
+        "part": Column("part"),
+        "kind": Column("data"),
+        "train": Column("training"),
+        "validation": Column("validation"),
+    }
     trainings = {candidate_of(model): model.training for model in part.models}
     return [
         methods.how_it_was_made(lines),
-        Table("data", "What was used for what; points of a search as the full set.", rows, columns | {"test": Column("test")}),
+        Table(
+            "data",
+            "What was used for what; points of a search as the full set.",
+            rows,
+            columns | {"test": Column("test")},
+        ),
         methods.bullets("### What departs from the paper", departures(trainings)),
     ]

@@ -39,7 +39,9 @@ class Kpis:
     mse: float  # mean squared error over all samples [deg²]
     mse_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s² [deg²]
     max_error: float  # mean over manoeuvres of the largest absolute error [deg]
-    max_error_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
+    max_error_nonlinear: (
+        float  # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
+    )
     manoeuvres: int  # how many there are
 
 
@@ -56,7 +58,9 @@ class ErrorDistribution:
 def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, list[Scored]]:
     """What was scored of each recording, which is one manoeuvre, in the order of a test set's ranges; raises `DataError`."""
     if len(spans) != len(parts):
-        raise DataError(f"{len(parts)} scored parts do not belong to {len(spans)} ranges; leave evaluation.sequence_seconds empty")
+        raise DataError(
+            f"{len(parts)} scored parts do not belong to {len(spans)} ranges; leave evaluation.sequence_seconds empty"
+        )
     found: dict[str, list[Scored]] = {}
     for span, part in zip(spans, parts, strict=True):
         found.setdefault(span.recording, []).append(part)
@@ -72,14 +76,24 @@ def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:
     """Indicators of a set of manoeuvres; raises `DataError` where the set is empty."""
     if not manoeuvres:
         raise DataError("there are no manoeuvres to take errors of")
-    errors = [np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()]
-    beyond = [np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()]
-    nonlinear = [error[chosen] for error, chosen in zip(errors, beyond, strict=True) if chosen.any()]
+    errors = [
+        np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()
+    ]
+    beyond = [
+        np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()
+    ]
+    nonlinear = [
+        error[chosen] for error, chosen in zip(errors, beyond, strict=True) if chosen.any()
+    ]
     return Kpis(
         mse=float(np.mean(np.square(np.concatenate(errors)))),
-        mse_nonlinear=float(np.mean(np.square(np.concatenate(nonlinear)))) if nonlinear else float("nan"),
+        mse_nonlinear=float(np.mean(np.square(np.concatenate(nonlinear))))
+        if nonlinear
+        else float("nan"),
         max_error=float(np.mean([np.abs(error).max() for error in errors])),
-        max_error_nonlinear=float(np.mean([np.abs(error).max() for error in nonlinear])) if nonlinear else float("nan"),
+        max_error_nonlinear=float(np.mean([np.abs(error).max() for error in nonlinear]))
+        if nonlinear
+        else float("nan"),
         manoeuvres=len(errors),
     )
 
@@ -94,12 +108,21 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
 
 def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
     """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only; raises `DataError` where none is."""
-    errors = np.concatenate([sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part) for part in parts])
+    errors = np.concatenate(
+        [
+            sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part)
+            for part in parts
+        ]
+    )
     if not len(errors):
-        raise DataError(f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False")
+        raise DataError(
+            f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False"
+        )
     first, last = np.floor(errors.min() / BIN), np.floor(errors.max() / BIN) + 1
     edges = BIN * np.arange(first, last + 1)
-    counts = np.bincount((np.floor(errors / BIN) - first).astype(np.int64), minlength=len(edges) - 1)
+    counts = np.bincount(
+        (np.floor(errors / BIN) - first).astype(np.int64), minlength=len(edges) - 1
+    )
     return ErrorDistribution(edges, counts, float(errors.mean()), float(errors.std()))
 
 

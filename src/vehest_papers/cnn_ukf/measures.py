@@ -25,16 +25,24 @@ Sums = tuple[FloatArray, FloatArray]  # of each manoeuvre a sum and what it is d
 
 def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:
     """What an indicator is made of, manoeuvre by manoeuvre."""
-    errors = [np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()]
-    beyond = [np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()]
+    errors = [
+        np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()
+    ]
+    beyond = [
+        np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()
+    ]
     if indicator in (MSE_NL, ME_NL):
         errors = [error[kept] for error, kept in zip(errors, beyond, strict=True)]
     if indicator == BALANCED:
-        return np.array([float(np.sqrt(np.mean(np.square(error)))) for error in errors]), np.ones(len(errors))
+        return np.array([float(np.sqrt(np.mean(np.square(error)))) for error in errors]), np.ones(
+            len(errors)
+        )
     if indicator in (ME, ME_NL):
         found = [float(np.abs(error).max()) if len(error) else 0.0 for error in errors]
         return np.array(found), np.array([float(len(error) > 0) for error in errors])
-    return np.array([float(np.square(error).sum()) for error in errors]), np.array([float(len(error)) for error in errors])
+    return np.array([float(np.square(error).sum()) for error in errors]), np.array(
+        [float(len(error)) for error in errors]
+    )
 
 
 class ManoeuvreErrors(SampledErrors):
@@ -83,12 +91,18 @@ class ManoeuvreErrors(SampledErrors):
         low, high = own.interval
         return f"{short(own.value)} [{short(low)}, {short(high)}]"
 
-    def of_statistic(self, candidate: str, statistic: Callable[[Sequence[Run], FloatArray], float]) -> tuple[float, float, float]:
+    def of_statistic(
+        self, candidate: str, statistic: Callable[[Sequence[Run], FloatArray], float]
+    ) -> tuple[float, float, float]:
         """Any figure of a candidate's seeds and how often each manoeuvre counts, with the 2.5 and 97.5 % of 500 resamples."""
         runs, generator = self.runs[candidate], np.random.default_rng(self._seed)
         found = []
         for number, counts in enumerate(self._counts[:501]):
-            picked = runs if number == 0 else [runs[at] for at in generator.integers(len(runs), size=len(runs))]
+            picked = (
+                runs
+                if number == 0
+                else [runs[at] for at in generator.integers(len(runs), size=len(runs))]
+            )
             found.append(statistic(picked, counts))
         low, high = np.nanquantile(found[1:], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
         return found[0], float(low), float(high)

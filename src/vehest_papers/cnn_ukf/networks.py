@@ -24,7 +24,9 @@ from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
 from vehest_papers.kit.reading import sideslip_error
 
-IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")  # of the oracle filter
+IDENTIFICATION = IdentificationSettings(
+    trials=20, restarts=1, error="recordings"
+)  # of the oracle filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,9 @@ class Outputs:
 
     error: FloatArray  # β_DD - β [deg], (K,)
     distrust: FloatArray  # σ_DD as the filter takes it [deg], (K,)
-    process: FloatArray | None  # σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's
+    process: (
+        FloatArray | None
+    )  # σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's
     sideslip: FloatArray  # β [deg], (K,)
     nonlinear: NDArray[np.bool_]  # which samples have |ay| ≥ 4 m/s², (K,)
 
@@ -42,7 +46,9 @@ def hybrid_of(run: Run) -> NetworkUkf:
     """The fitted hybrid of a run; raises `DataError` where it is another estimator's."""
     fitted = load_model(run.model.model_folder)
     if not isinstance(fitted, NetworkUkf):
-        raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")
+        raise DataError(
+            f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter"
+        )
     return fitted
 
 
@@ -75,7 +81,9 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     return found
 
 
-def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]) -> list[FloatArray]:
+def filtered_with(
+    fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]
+) -> list[FloatArray]:
     """β of a hybrid's filter given other outputs of its network, drive by drive [rad]."""
     found: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
@@ -92,7 +100,13 @@ def shift_of(run: Run, prepared: Prepared) -> float:
     pseudo = fitted.pseudo_measurements(drives)
     moved = [own._replace(sideslip=own.sideslip + math.radians(1.0)) for own in pseudo]
     shifts = []
-    both = zip(drives, spans, filtered_with(fitted, drives, pseudo), filtered_with(fitted, drives, moved), strict=True)
+    both = zip(
+        drives,
+        spans,
+        filtered_with(fitted, drives, pseudo),
+        filtered_with(fitted, drives, moved),
+        strict=True,
+    )
     for drive, span, before, after in both:
         at = rows_of(run.test[span.recording][0], drive)
         shifts.append(float(np.degrees(np.mean((after - before)[at]))))
@@ -104,11 +118,15 @@ def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
     fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
     pseudo = []
     for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):
-        whole = prepared.recording(span.dataset, span.recording).cut(drive.start_time, drive.start_time + len(drive) / drive.rate_hz)
+        whole = prepared.recording(span.dataset, span.recording).cut(
+            drive.start_time, drive.start_time + len(drive) / drive.rate_hz
+        )
         error = own.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
         pseudo.append(own._replace(variance=LEAST_VARIANCE + np.square(error)))
     test = {}
-    for drive, span, sideslip in zip(drives, spans, filtered_with(fitted, drives, pseudo), strict=True):
+    for drive, span, sideslip in zip(
+        drives, spans, filtered_with(fitted, drives, pseudo), strict=True
+    ):
         (part,) = run.test[span.recording]
         test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
     return Run(candidate, run.model, run.validation, test)
@@ -119,7 +137,9 @@ def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
     found: dict[str, list[Run]] = {}
     if paper.FREE in runs:
         found[paper.ORACLE_FILTER] = [_fitted_to_the_test(runs[paper.FREE][0], prepared)]
-    found[paper.ORACLE_DISTRUST] = [with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]]
+    found[paper.ORACLE_DISTRUST] = [
+        with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]
+    ]
     return found
 
 

@@ -35,14 +35,24 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
                 state = track.transition(state, inputs)
             if not 0.0 <= abs(float(state[0])) < 0.2 * speed:
                 continue  # no steady turn: beyond what the tyres can do
-            states, driven = (np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs))
+            states, driven = (
+                np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs)
+            )
             for words, n in (("ay, yaw rate, both forces", 4), ("ay, yaw rate", 2)):
 
                 def observed(states: Tensor, inputs: Tensor, n: int = n) -> Tensor:
                     return track.observation(states, inputs)[..., :n]
 
                 found = {
-                    steps: observability_along(track.transition, observed, states, driven, sizes=SIZES, noise=levels[:n], steps=steps)
+                    steps: observability_along(
+                        track.transition,
+                        observed,
+                        states,
+                        driven,
+                        sizes=SIZES,
+                        noise=levels[:n],
+                        steps=steps,
+                    )
                     for steps in (2, WINDOW)
                 }
                 rows.append(
@@ -77,12 +87,31 @@ def claims(found: pd.DataFrame) -> list[Claim]:
     """Rank two wherever the car steers, and less at zero steering."""
     steered, straight = found[found["steer"] > 0], found[found["steer"] == 0]
     full, lost = int((steered["rank"] == 2).sum()), int((straight["rank"] < 2).sum())
-    worst = float(straight["deviation"].max() / found[found["steer"] == min(steered["steer"])]["deviation"].max())
+    worst = float(
+        straight["deviation"].max()
+        / found[found["steer"] == min(steered["steer"])]["deviation"].max()
+    )
     ours = f"rank 2 in {full} of {len(steered)} steady turns"
     beside = f"deviation of V_y there {fixed(worst, 2)} times that at {min(steered['steer']):g}°"
-    verdict: Verdict = "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided"
+    verdict: Verdict = (
+        "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided"
+    )
     steers: Verdict = "reproduced" if full == len(steered) else "not reproduced"
     return [
-        Claim("III-B: observable where the car steers (rank 2)", "yes", ours, "computed", steers, "exact"),
-        Claim("III-B: unobservable at δ = 0", "yes", f"rank below 2 in {lost} of {len(straight)}; {beside}", "computed", verdict, "exact"),
+        Claim(
+            "III-B: observable where the car steers (rank 2)",
+            "yes",
+            ours,
+            "computed",
+            steers,
+            "exact",
+        ),
+        Claim(
+            "III-B: unobservable at δ = 0",
+            "yes",
+            f"rank below 2 in {lost} of {len(straight)}; {beside}",
+            "computed",
+            verdict,
+            "exact",
+        ),
     ]

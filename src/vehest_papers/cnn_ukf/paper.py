@@ -14,14 +14,34 @@ BEFORE = "not trained through the filter"
 Z_SCORES = "Data-driven, z-scores"
 RECURRENT = "Recurrent network"
 PLAIN = "plain tyres"
-ORACLE_FILTER, ORACLE_DISTRUST = "Oracle: filter fitted to the test", "Oracle: CNN-UKF, perfect distrust"
+ORACLE_FILTER, ORACLE_DISTRUST = (
+    "Oracle: filter fitted to the test",
+    "Oracle: CNN-UKF, perfect distrust",
+)
 ZERO, STATIC_MAP, DATA_SHEET = "v = 0", "Static map", "Data sheet"
 
-CANDIDATES = (MODEL, SMOOTH, FREE, DATA, DEEP, CNN, CNN_FREE, DATA_SHEET, STATIC_MAP, ZERO, ORACLE_FILTER, ORACLE_DISTRUST)
+CANDIDATES = (
+    MODEL,
+    SMOOTH,
+    FREE,
+    DATA,
+    DEEP,
+    CNN,
+    CNN_FREE,
+    DATA_SHEET,
+    STATIC_MAP,
+    ZERO,
+    ORACLE_FILTER,
+    ORACLE_DISTRUST,
+)
 """In the order of Table II, then those that are not in it and those that have to be beaten."""
 OF_FOUR = (MODEL, DATA, DEEP, CNN)
 HYBRIDS = (DEEP, CNN)
-OWN_FILTER = {DEEP: MODEL, CNN: SMOOTH, CNN_FREE: FREE}  # hybrid -> what is left of it without its network
+OWN_FILTER = {
+    DEEP: MODEL,
+    CNN: SMOOTH,
+    CNN_FREE: FREE,
+}  # hybrid -> what is left of it without its network
 
 
 @dataclass(frozen=True)
@@ -50,9 +70,15 @@ TABLE_III: Mapping[str, Published] = {
 }
 """Limited set."""
 
-TABLES: Mapping[str, Mapping[str, Published]] = {"full": TABLE_II, "limited": TABLE_III}  # part -> its table
+TABLES: Mapping[str, Mapping[str, Published]] = {
+    "full": TABLE_II,
+    "limited": TABLE_III,
+}  # part -> its table
 
-SCALING: Mapping[str, tuple[float, float]] = {"full": (-4.2690, 0.7901), "limited": (-1.4353, 1.465)}  # part -> p₁ and p₂ of Eq. 11
+SCALING: Mapping[str, tuple[float, float]] = {
+    "full": (-4.2690, 0.7901),
+    "limited": (-1.4353, 1.465),
+}  # part -> p₁ and p₂ of Eq. 11
 
 LEVELS: Mapping[str, float] = {
     "process_vy": 7e-4,

@@ -30,11 +30,18 @@ from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_o
 from vehest_papers.kit.legends import legend_above
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
-COMBINATIONS = tuple(itertools.product(STEPS, STEPS))  # shares by which the front and the rear axle's cornering stiffness are off
+COMBINATIONS = tuple(
+    itertools.product(STEPS, STEPS)
+)  # shares by which the front and the rear axle's cornering stiffness are off
 NOMINAL = COMBINATIONS.index((0.0, 0.0))
 LABELS = [f"{100 * front:+.0f} / {100 * rear:+.0f} %" for front, rear in COMBINATIONS]
 SOFTEST = COMBINATIONS.index((-paper.STIFFNESS_STEP, -paper.STIFFNESS_STEP))
-BODIES = {"mass −10 %": (0.9, 1.0), "mass +10 %": (1.1, 1.0), "inertia −10 %": (1.0, 0.9), "inertia +10 %": (1.0, 1.1)}
+BODIES = {
+    "mass −10 %": (0.9, 1.0),
+    "mass +10 %": (1.1, 1.0),
+    "inertia −10 %": (1.0, 0.9),
+    "inertia +10 %": (1.0, 1.1),
+}
 """What of the car is taken for another than it is -> factors of mass and of yaw inertia."""
 WITH_FILTER = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
 TRIALS, STAGES, SHRINK = 30, 2, 0.3  # of the search for p₁ and p₂, as in the training
@@ -46,7 +53,9 @@ class Perturbed:
 
     stiffness: Sequence[Runs]  # of each of `COMBINATIONS` the runs of each candidate
     bodies: Mapping[str, Runs]  # of each of `BODIES` likewise
-    tuned: Sequence[Run]  # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none
+    tuned: Sequence[
+        Run
+    ]  # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
@@ -66,7 +75,10 @@ def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
     if of_filter is None:
         raise DataError(f"estimator '{fitted.name}' knows no mass")
     car = of_filter.settings.car
-    of_filter.settings = replace(of_filter.settings, car=replace(car, mass=mass * car.mass, yaw_inertia=inertia * car.yaw_inertia))
+    of_filter.settings = replace(
+        of_filter.settings,
+        car=replace(car, mass=mass * car.mass, yaw_inertia=inertia * car.yaw_inertia),
+    )
     return changed
 
 
@@ -77,24 +89,40 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
     pseudo = changed.pseudo_measurements(recordings)
 
     def cost(powers: FloatArray) -> float:
-        scaled = [own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers)) for own in pseudo]
+        scaled = [
+            own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers))
+            for own in pseudo
+        ]
         return finite(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
 
-    changed.scaling = optuna_search(cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK).best
+    changed.scaling = optuna_search(
+        cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK
+    ).best
     return changed
 
 
 def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
     """The filters of the study, of each the seed that validation chooses, under all perturbations; only p₁ and p₂ are ever tuned anew."""
     own = {candidate: [chosen(runs[candidate])] for candidate in WITH_FILTER if candidate in runs}
-    fitted = {candidate: [load_model(run.model.model_folder) for run in seeds] for candidate, seeds in own.items()}
+    fitted = {
+        candidate: [load_model(run.model.model_folder) for run in seeds]
+        for candidate, seeds in own.items()
+    }
 
     def changed(change: Callable[[Estimator], Estimator]) -> dict[str, list[Run]]:
-        pairs = {candidate: zip(seeds, fitted[candidate], strict=True) for candidate, seeds in own.items()}
-        return {candidate: [prepared.estimated_by(change(model), run) for run, model in both] for candidate, both in pairs.items()}
+        pairs = {
+            candidate: zip(seeds, fitted[candidate], strict=True)
+            for candidate, seeds in own.items()
+        }
+        return {
+            candidate: [prepared.estimated_by(change(model), run) for run, model in both]
+            for candidate, both in pairs.items()
+        }
 
     stiffness = [
-        dict(own) if axles == (0.0, 0.0) else changed(lambda model, axles=axles: with_stiffness(model, *axles))  # type: ignore[misc]
+        dict(own)
+        if axles == (0.0, 0.0)
+        else changed(lambda model, axles=axles: with_stiffness(model, *axles))  # type: ignore[misc]
         for axles in COMBINATIONS
     ]
     bodies = {
@@ -116,7 +144,9 @@ def figure_14(found: Perturbed, data: str) -> Figure:
     comparisons = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
     with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         panels = figure.subplots(1, 2)
-        for axes, indicator, label in zip(panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True):
+        for axes, indicator, label in zip(
+            panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True
+        ):
             for candidate in found.stiffness[NOMINAL]:
                 line = line_of(candidate)
                 measured = [own.get(candidate, indicator) for own in comparisons]
@@ -124,8 +154,18 @@ def figure_14(found: Perturbed, data: str) -> Figure:
                 low, high = np.array([own.interval for own in measured]).T
                 axes.fill_between(at, low, high, color=line.colour, alpha=0.1, linewidth=0)
                 values = [own.value for own in measured]
-                axes.plot(at, values, color=line.colour, linestyle=line.dash, marker=line.marker, label=candidate)
-            axes.set_xticks(range(len(COMBINATIONS)), [f"{100 * front:+.0f}\n{100 * rear:+.0f}" for front, rear in COMBINATIONS])
+                axes.plot(
+                    at,
+                    values,
+                    color=line.colour,
+                    linestyle=line.dash,
+                    marker=line.marker,
+                    label=candidate,
+                )
+            axes.set_xticks(
+                range(len(COMBINATIONS)),
+                [f"{100 * front:+.0f}\n{100 * rear:+.0f}" for front, rear in COMBINATIONS],
+            )
             axes.set_xlabel("front (above) and rear stiffness off by [%]")
             axes.set_ylabel(label)
             axes.set_yscale("log")
@@ -141,7 +181,9 @@ def perturbed_table(found: Perturbed, data: str) -> Table:
     """MSE_nl of every filter as it is and under every perturbation, with intervals."""
     conditions: dict[str, Runs] = {"as identified": found.stiffness[NOMINAL]}
     conditions |= {
-        f"stiffness {words}": own for words, own in zip(LABELS, found.stiffness, strict=True) if own is not found.stiffness[NOMINAL]
+        f"stiffness {words}": own
+        for words, own in zip(LABELS, found.stiffness, strict=True)
+        if own is not found.stiffness[NOMINAL]
     }
     conditions |= found.bodies
     if found.tuned:
@@ -149,8 +191,15 @@ def perturbed_table(found: Perturbed, data: str) -> Table:
     rows: list[dict[str, object]] = []
     for words, runs in conditions.items():
         own = ManoeuvreErrors(runs, "test")
-        rows.append({"condition": words, **{candidate: own.in_words(candidate, MSE_NL) for candidate in runs}})
-    columns = {"condition": Column("the filter takes")} | {candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]}
+        rows.append(
+            {
+                "condition": words,
+                **{candidate: own.in_words(candidate, MSE_NL) for candidate in runs},
+            }
+        )
+    columns = {"condition": Column("the filter takes")} | {
+        candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]
+    }
     caption = (
         "MSE_nl [deg²] where filters take tyres or body for others than they are, front / rear, of the chosen seed, with 95 % "
         f"intervals over manoeuvres. The plant's mass and inertia are known exactly otherwise. Data: {data}."

@@ -25,7 +25,9 @@ def is_point(part: str) -> bool:
 
 def points_of(parts: Mapping[str, Runs], full: Runs) -> dict[tuple[int, int], Run]:
     """Widths of both layers -> its run, in order; among them the paper's widths with their lowest seed, of the full set."""
-    runs = [own[paper.DATA][0] for name, own in parts.items() if is_point(name) and paper.DATA in own]
+    runs = [
+        own[paper.DATA][0] for name, own in parts.items() if is_point(name) and paper.DATA in own
+    ]
     found = {_network(run).settings.hidden: run for run in [*runs, full[paper.DATA][0]]}
     return {widths: found[widths] for widths in sorted(found)}
 
@@ -45,7 +47,9 @@ def search_table(parts: Mapping[str, Runs], full: Runs, data: str) -> Table:
                 "second": widths[1],
                 "weights": _network(run).n_parameters,
                 "validation": own.in_words(_words(widths), BALANCED),
-                "change": MISSING if widths == given else own.change(_words(widths), _words(given), BALANCED).in_percent(),
+                "change": MISSING
+                if widths == given
+                else own.change(_words(widths), _words(given), BALANCED).in_percent(),
                 "best_epoch": fit.get("best_epoch", float("nan")),
             }
         )

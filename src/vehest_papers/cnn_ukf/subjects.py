@@ -26,7 +26,11 @@ from vehest_papers.kit.reading import models_by_candidate, sideslip_error
 TEST = "test"
 CUTOFF_HZ = 5.0
 LARGEST_SIDESLIP = 0.21  # rad, 12°: that of training and validation in the split, beyond which no drive of the paper goes
-OFFLINE = (RemoveOutliers(), LowPass(CUTOFF_HZ, design="fir"), LowPass(CUTOFF_HZ, channels=("vy_ref",), design="fir"))
+OFFLINE = (
+    RemoveOutliers(),
+    LowPass(CUTOFF_HZ, design="fir"),
+    LowPass(CUTOFF_HZ, channels=("vy_ref",), design="fir"),
+)
 """Preprocessing of the paper (Section IV-A), of measurements and of the reference."""
 
 LINES = {
@@ -56,7 +60,12 @@ def line_of(candidate: str) -> Line:
     return LINES[plain_name(candidate)]
 
 
-KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
+KPIS = {
+    "mse": "MSE [deg²]",
+    "mse_nonlinear": "MSE_nl [deg²]",
+    "max_error": "ME [deg]",
+    "max_error_nonlinear": "ME_nl [deg]",
+}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
 
 Manoeuvres = Mapping[str, Sequence[Scored]]  # recording -> what was scored of it: one range
@@ -107,7 +116,9 @@ def candidate_of(model: EvaluatedModel) -> str:
             return ", ".join(away)
     name = model.estimator, model.variant.endswith("_smooth")
     if name not in _NAMES:
-        raise DataError(f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study")
+        raise DataError(
+            f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study"
+        )
     return _NAMES[name]
 
 
@@ -120,11 +131,20 @@ def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     """Candidate -> its seeds, in the order of Table II; raises `DataError` for two of one seed, other models, or several test ranges."""
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
-        raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")
+        raise DataError(
+            f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split"
+        )
     groups = models_by_candidate(part, candidate_of, paper.CANDIDATES)
     return {
         name: [
-            Run(name, own, *(manoeuvres_of(prepared.spans(test), prepared.scored(own, test)) for test in (VALIDATION, TEST)))
+            Run(
+                name,
+                own,
+                *(
+                    manoeuvres_of(prepared.spans(test), prepared.scored(own, test))
+                    for test in (VALIDATION, TEST)
+                ),
+            )
             for own in models
         ]
         for name, models in groups.items()
@@ -138,7 +158,10 @@ def chosen(runs: Sequence[Run]) -> Run:
 
 def balanced(manoeuvres: Manoeuvres) -> float:
     """Mean over manoeuvres of their RMSE(β) [deg]."""
-    roots = [np.sqrt(np.mean(np.square(np.concatenate([sideslip_error(part) for part in parts])))) for parts in manoeuvres.values()]
+    roots = [
+        np.sqrt(np.mean(np.square(np.concatenate([sideslip_error(part) for part in parts]))))
+        for parts in manoeuvres.values()
+    ]
     return float(np.mean(roots))
 
 
@@ -147,7 +170,10 @@ def kpi_table(runs: Runs) -> pd.DataFrame:
     rows = [
         {"candidate": candidate, "seed": run.model.seed}
         | {name: getattr(run.kpis, name) for name in KPIS}
-        | {"validation_mse": kpis(run.validation).mse, "validation_balanced": balanced(run.validation)}
+        | {
+            "validation_mse": kpis(run.validation).mse,
+            "validation_balanced": balanced(run.validation),
+        }
         for candidate, own in runs.items()
         for run in own
     ]
@@ -158,7 +184,12 @@ def until(part: Scored, sideslip: float) -> Scored:
     """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least."""
     beyond = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
     last = max(int(beyond[0]), 1) if len(beyond) else len(part.time)
-    return Scored(*(getattr(part, name)[:last] for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")))
+    return Scored(
+        *(
+            getattr(part, name)[:last]
+            for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")
+        )
+    )
 
 
 class Prepared:
@@ -201,19 +232,34 @@ class Prepared:
     def ranges(self, test: str) -> list[Recording]:
         """The ranges of training, validation or a test set, references included."""
         spans = self._part.split.train if test == "train" else self.spans(test)
-        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
+        return [
+            self.recording(span.dataset, span.recording).cut(span.start, span.stop)
+            for span in spans
+        ]
 
     def estimated_by(self, estimator: Estimator, run: Run, candidate: str = "") -> Run:
         """A run whose test is estimated anew by a changed estimator."""
         parts = self.score(estimator.estimate(self.seen(TEST)), TEST)
-        return Run(candidate or run.candidate, run.model, run.validation, manoeuvres_of(self.spans(TEST), parts))
+        return Run(
+            candidate or run.candidate,
+            run.model,
+            run.validation,
+            manoeuvres_of(self.spans(TEST), parts),
+        )
 
     def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
         """Estimates of a model and prepared references, range by range."""
-        return self.score([model.estimate(test, position) for position in range(len(self.spans(test)))], test)
+        return self.score(
+            [model.estimate(test, position) for position in range(len(self.spans(test)))], test
+        )
 
     def score(self, estimates: Sequence[Estimate], test: str) -> list[Scored]:
         """Estimates, one a range, and prepared references."""
         spans = self.spans(test)
-        parts = score_all(estimates.__getitem__, spans, lambda span: self.recording(span.dataset, span.recording), self._part.protocol)
+        parts = score_all(
+            estimates.__getitem__,
+            spans,
+            lambda span: self.recording(span.dataset, span.recording),
+            self._part.protocol,
+        )
         return list(parts) if self._whole else [until(part, LARGEST_SIDESLIP) for part in parts]

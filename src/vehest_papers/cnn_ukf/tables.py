@@ -19,7 +19,16 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.claims import OutputsOf, squares
 from vehest_papers.cnn_ukf.measures import ManoeuvreErrors
-from vehest_papers.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, balanced, chosen, filter_of
+from vehest_papers.cnn_ukf.subjects import (
+    KPIS,
+    TEST,
+    Prepared,
+    Run,
+    Runs,
+    balanced,
+    chosen,
+    filter_of,
+)
 from vehest_papers.kit.reading import median_and_range, metric_values, with_interval
 
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
@@ -37,7 +46,11 @@ LEVEL_HEADERS = {
 
 
 def accuracy(
-    comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
+    comparison: ManoeuvreErrors,
+    published: Mapping[str, paper.Published],
+    training: Mapping[str, float],
+    name: str,
+    caption: str,
 ) -> Table:
     """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training [deg]."""
     rows = []
@@ -46,13 +59,24 @@ def accuracy(
         for kpi in KPIS:
             known = getattr(published[candidate], kpi) if candidate in published else math.nan
             row[f"paper_{kpi}"], row[f"ours_{kpi}"] = known, comparison.in_words(candidate, kpi)
-            row[kpi] = row[f"ours_{kpi}"] if math.isnan(known) else f"{row[f'ours_{kpi}']} ({fixed(known, 3)})"
+            row[kpi] = (
+                row[f"ours_{kpi}"]
+                if math.isnan(known)
+                else f"{row[f'ours_{kpi}']} ({fixed(known, 3)})"
+            )
         judged = [balanced(run.validation) for run in own]
-        row["validation"] = fixed(float(np.median(judged)), 3) if candidate not in ORACLES else MISSING
+        row["validation"] = (
+            fixed(float(np.median(judged)), 3) if candidate not in ORACLES else MISSING
+        )
         row["training"] = fixed(training[candidate], 3) if candidate in training else MISSING
         rows.append(row)
-    columns = {"candidate": Column("method")} | {kpi: Column(header) for kpi, header in KPIS.items()}
-    columns |= {"validation": Column("RMSE, validation [deg]"), "training": Column("training [deg]")}
+    columns = {"candidate": Column("method")} | {
+        kpi: Column(header) for kpi, header in KPIS.items()
+    }
+    columns |= {
+        "validation": Column("RMSE, validation [deg]"),
+        "training": Column("training [deg]"),
+    }
     columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
@@ -60,7 +84,9 @@ def accuracy(
 def training_error(run: Run, prepared: Prepared) -> float:
     """Mean over training manoeuvres of their RMSE(β) [deg]."""
     drives = prepared.ranges("train")
-    estimates = load_model(run.model.model_folder).estimate([drive.without_references() for drive in drives])
+    estimates = load_model(run.model.model_folder).estimate(
+        [drive.without_references() for drive in drives]
+    )
     errors = [
         np.degrees(estimate["sideslip"] - np.arctan2(drive["vy_ref"], drive["vx"]))
         for estimate, drive in zip(estimates, drives, strict=True)
@@ -73,10 +99,17 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) ->
     rows = []
     for row in active.to_dict("records"):
         candidate = row["candidate"]
-        own: dict[str, object] = {"candidate": candidate, "n_seeds": len(comparison.runs[candidate])}
+        own: dict[str, object] = {
+            "candidate": candidate,
+            "n_seeds": len(comparison.runs[candidate]),
+        }
         for kpi in ("mse", "mse_nonlinear"):
             own[kpi] = comparison.in_words(candidate, kpi)
-            own[f"change_{kpi}"] = comparison.change(paper.CNN, candidate, kpi).in_percent() if candidate != paper.CNN else MISSING
+            own[f"change_{kpi}"] = (
+                comparison.change(paper.CNN, candidate, kpi).in_percent()
+                if candidate != paper.CNN
+                else MISSING
+            )
         rows.append({**own, **{str(key): value for key, value in row.items()}})
     columns = {
         "candidate": Column("method"),
@@ -95,18 +128,32 @@ def consistency(part: PartArtefacts, runs: Runs, data: str) -> Table:
     """Against the reference as measured: MSE, coverage of the bands of vy and NIS, from the evaluation's own metrics."""
     known = metric_values(part)
     rows: list[dict[str, object]] = [
-        {"candidate": "consistent", "mse": MISSING, "nis": fixed(1.0, 2), **{f"cover_{n}": fixed(COVERAGE[n], 3) for n in (1, 2)}}
+        {
+            "candidate": "consistent",
+            "mse": MISSING,
+            "nis": fixed(1.0, 2),
+            **{f"cover_{n}": fixed(COVERAGE[n], 3) for n in (1, 2)},
+        }
     ]
     for candidate, own in runs.items():
 
         def values(metric: str, own: Sequence[Run] = own) -> FloatArray:
-            keys = [(run.model.estimator, run.model.variant, run.model.seed, TEST, metric) for run in own]
+            keys = [
+                (run.model.estimator, run.model.variant, run.model.seed, TEST, metric)
+                for run in own
+            ]
             return np.array([known.get(key, math.nan) for key in keys])
 
-        row: dict[str, object] = {"candidate": candidate, "mse": median_and_range(values("mse_sideslip"), 3)}
+        row: dict[str, object] = {
+            "candidate": candidate,
+            "mse": median_and_range(values("mse_sideslip"), 3),
+        }
         row |= {f"cover_{n}": median_and_range(values(f"coverage_{n}sigma"), 3) for n in (1, 2)}
         rows.append(row | {"nis": median_and_range(values("nis"), 2)})
-    columns = {"candidate": Column("method"), "mse": Column("MSE against the unfiltered reference [deg²]")}
+    columns = {
+        "candidate": Column("method"),
+        "mse": Column("MSE against the unfiltered reference [deg²]"),
+    }
     columns |= {f"cover_{n}": Column(f"within {n}σ") for n in (1, 2)} | {"nis": Column("NIS")}
     caption = (
         "What the paper does not report: MSE against the reference as it was measured, over all that was driven, share of vy's errors "
@@ -115,14 +162,19 @@ def consistency(part: PartArtefacts, runs: Runs, data: str) -> Table:
     return Table("consistency_full", caption, pd.DataFrame(rows), columns)
 
 
-def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str) -> Table:
+def networks_alone(
+    comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str
+) -> Table:
     """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
     rows = []
     for candidate, seeds in outputs.items():
         measured = comparison.measured(*squares(seeds))
         every = [own for seed in seeds for own in seed]
         beyond = np.concatenate([own.nonlinear for own in every])
-        error, distrust = np.concatenate([own.error for own in every]), np.concatenate([own.distrust for own in every])
+        error, distrust = (
+            np.concatenate([own.error for own in every]),
+            np.concatenate([own.distrust for own in every]),
+        )
         rows.append(
             {
                 "candidate": candidate,
@@ -145,19 +197,34 @@ def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, c
 def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
     """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: title and runs."""
     rows: list[dict[str, object]] = [
-        {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}
+        {
+            "part": "paper (real)",
+            "candidate": paper.MODEL,
+            **dict.fromkeys((*TYRES, *LEVELS), math.nan),
+            **paper.LEVELS,
+        }
     ]
     for title, runs in parts:
         for candidate, own in runs.items():
             for run in own:
                 of_filter = filter_of(load_model(run.model.model_folder))
                 if of_filter is not None:
-                    row: dict[str, object] = {"part": title, "candidate": candidate, "seed": run.model.seed}
+                    row: dict[str, object] = {
+                        "part": title,
+                        "candidate": candidate,
+                        "seed": run.model.seed,
+                    }
                     row |= dict(zip(TYRES, of_filter.axle_tyres.tolist(), strict=True))
-                    rows.append(row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS})
+                    rows.append(
+                        row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS}
+                    )
     for row in rows:
         row |= {f"shown_{level}": significant(float(row[level])) for level in LEVELS}  # type: ignore[arg-type]
-    columns = {"part": Column("part"), "candidate": Column("method"), "seed": Column("seed", decimals=0)}
+    columns = {
+        "part": Column("part"),
+        "candidate": Column("method"),
+        "seed": Column("seed", decimals=0),
+    }
     for axle in ("front", "rear"):
         columns |= {
             f"cornering_stiffness_{axle}": Column(f"C, {axle} [N/rad]", decimals=0),
@@ -181,7 +248,16 @@ def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
             assert isinstance(fitted, EnsembleUkf)
             p1, p2 = fitted.scaling.tolist()
             known = paper.SCALING.get(part, (math.nan, math.nan))
-            rows.append({"part": title, "seed": run.model.seed, "paper_p1": known[0], "p1": p1, "paper_p2": known[1], "p2": p2})
+            rows.append(
+                {
+                    "part": title,
+                    "seed": run.model.seed,
+                    "paper_p1": known[0],
+                    "p1": p1,
+                    "paper_p2": known[1],
+                    "p2": p2,
+                }
+            )
     columns = {"part": Column("part"), "seed": Column("seed")}
     columns |= {"paper_p1": Column("p₁, paper", decimals=3), "p1": Column("p₁, ours", decimals=3)}
     columns |= {"paper_p2": Column("p₂, paper", decimals=3), "p2": Column("p₂, ours", decimals=3)}
@@ -206,7 +282,10 @@ def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table
                     "candidate": candidate,
                     "n_seeds": len(own),
                     "epochs": _epochs(own),
-                    "lost": sum(fit.get("lost_sequences", 0.0) + fit.get("skipped_steps", 0.0) for fit in fits),
+                    "lost": sum(
+                        fit.get("lost_sequences", 0.0) + fit.get("skipped_steps", 0.0)
+                        for fit in fits
+                    ),
                     "n_parameters": known.get((*keys[0], "n_parameters"), math.nan),
                 }
             )
@@ -218,7 +297,9 @@ def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table
         "lost": Column("lost sequences and skipped steps", decimals=0),
         "n_parameters": Column("parameters", decimals=0),
     }
-    return Table("budget", f"What was spent: seeds and epochs. Data: {data}.", pd.DataFrame(rows), columns)
+    return Table(
+        "budget", f"What was spent: seeds and epochs. Data: {data}.", pd.DataFrame(rows), columns
+    )
 
 
 def _epochs(runs: Sequence[Run]) -> str:
@@ -228,7 +309,11 @@ def _epochs(runs: Sequence[Run]) -> str:
         history = run.model.history()
         if history is None or "epoch" not in history:
             continue
-        counts = [str(int(count)) for count in history.groupby("phase", sort=False).size()] if "phase" in history else [str(len(history))]
+        counts = (
+            [str(int(count)) for count in history.groupby("phase", sort=False).size()]
+            if "phase" in history
+            else [str(len(history))]
+        )
         best = run.model.fit_metrics().get("best_epoch", math.nan)
         shown.append(f"{' + '.join(counts)} ({fixed(best, 0)})")
     return "; ".join(shown) or MISSING
@@ -247,10 +332,17 @@ def given_as_found(full: Runs) -> str:
         for run in full[candidate]:
             given = filter_of(load_model(run.model.model_folder))
             assert found is not None and given is not None  # noqa: PT018 - both are filters by their names
-            pairs = {name: (found.axle_tyres[place], given.axle_tyres[place]) for place, name in enumerate(TYRES)}
-            pairs |= {level: (found.levels[level], given.levels[level]) for level in SENSORS["full"]}
+            pairs = {
+                name: (found.axle_tyres[place], given.axle_tyres[place])
+                for place, name in enumerate(TYRES)
+            }
+            pairs |= {
+                level: (found.levels[level], given.levels[level]) for level in SENSORS["full"]
+            }
             for name, (there, here) in pairs.items():
-                difference = abs(here - there) if name.startswith("reduction") else abs(here / there - 1.0)
+                difference = (
+                    abs(here - there) if name.startswith("reduction") else abs(here / there - 1.0)
+                )
                 if difference > worst:
                     worst, where = difference, f"{name} of {candidate}"
     shown = f"the largest difference is {significant(100.0 * worst, 2)} %{f' ({where})' if where else ''}"

@@ -32,7 +32,9 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     peaks = {}
     for span in part.split.tests[TEST]:
         drive = prepared.recording(span.dataset, span.recording)
-        if group_of(span.recording) == group and not dict(drive.provenance.get("flags") or {}).get("spun"):
+        if group_of(span.recording) == group and not dict(drive.provenance.get("flags") or {}).get(
+            "spun"
+        ):
             piece = drive.cut(span.start, span.stop)
             peaks[span] = float(np.abs(np.arctan2(piece["vy_ref"], piece["vx"])).max())
     if not peaks:
@@ -48,7 +50,13 @@ def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: 
         _angles(upper, parts)
         for candidate, part in parts.items():
             line = line_of(candidate)
-            lower.plot(_from_start(part), sideslip_error(part), color=line.colour, linestyle=line.dash, linewidth=0.9)
+            lower.plot(
+                _from_start(part),
+                sideslip_error(part),
+                color=line.colour,
+                linestyle=line.dash,
+                linewidth=0.9,
+            )
         lower.set_ylabel("error [deg]")
         lower.set_xlabel("time [s]")
         for axes in (upper, lower):
@@ -58,12 +66,21 @@ def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: 
     return Figure(f"figure_{number}", caption, figure)
 
 
-def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, constant: FloatArray, data: str) -> Figure:
+def inner_life(
+    runs: Mapping[str, Run],
+    prepared: Prepared,
+    warm_up: float,
+    span: Span,
+    constant: FloatArray,
+    data: str,
+) -> Figure:
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
     ``constant``, (2,), are deviations of the filter's process noise where no network gives them; ``warm_up`` [s] is of the estimates.
     """
-    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
+    hybrids = {
+        candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS
+    }
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with new_figure(DOUBLE_COLUMN, 4.4) as figure:
@@ -72,14 +89,39 @@ def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span
         for candidate, (time, output) in outputs.items():
             line = line_of(candidate)
             label = f"{candidate}, its network's"
-            grid[0, 0].plot(time, np.degrees(output.sideslip), color=line.colour, linewidth=0.7, alpha=0.55, label=label)
-            grid[1, 0].plot(time, np.degrees(np.sqrt(output.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+            grid[0, 0].plot(
+                time,
+                np.degrees(output.sideslip),
+                color=line.colour,
+                linewidth=0.7,
+                alpha=0.55,
+                label=label,
+            )
+            grid[1, 0].plot(
+                time,
+                np.degrees(np.sqrt(output.variance)),
+                color=line.colour,
+                linestyle=line.dash,
+                linewidth=1.0,
+            )
             if output.process is not None:
                 for axes, deviation in zip(grid[:, 1], np.sqrt(output.process).T, strict=True):
-                    axes.plot(time, deviation, color=line.colour, linestyle=line.dash, linewidth=1.0)
+                    axes.plot(
+                        time, deviation, color=line.colour, linestyle=line.dash, linewidth=1.0
+                    )
         for axes, level in zip(grid[:, 1], constant.tolist(), strict=True):
-            axes.axhline(level, color=line_of(paper.DEEP).colour, linestyle=line_of(paper.DEEP).dash, linewidth=1.0)
-        labels = ("β [deg]", r"$\sigma_{V_y}$ [m/s]", r"$\sigma_{DD}$ [deg]", r"$\sigma_{\dot\psi}$ [rad/s]")
+            axes.axhline(
+                level,
+                color=line_of(paper.DEEP).colour,
+                linestyle=line_of(paper.DEEP).dash,
+                linewidth=1.0,
+            )
+        labels = (
+            "β [deg]",
+            r"$\sigma_{V_y}$ [m/s]",
+            r"$\sigma_{DD}$ [deg]",
+            r"$\sigma_{\dot\psi}$ [rad/s]",
+        )
         for axes, label, letter in zip(grid.flat, labels, "abcd", strict=True):
             axes.set_ylabel(label)
             axes.set_title(f"({letter})", loc="left")
@@ -97,29 +139,48 @@ def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span
     return Figure("figure_8", caption, figure)
 
 
-def angles_of_networks(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
+def angles_of_networks(
+    runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str
+) -> Figure:
     """β of both hybrids and β_DD of their networks (Figure 13)."""
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         axes = figure.subplots()
         _angles(axes, {candidate: run.test[span.recording][0] for candidate, run in runs.items()})
         for candidate, (time, output) in _network_outputs(runs, prepared, warm_up, span).items():
             label = f"{candidate}, its network's"
-            axes.plot(time, np.degrees(output.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
+            axes.plot(
+                time,
+                np.degrees(output.sideslip),
+                color=line_of(candidate).colour,
+                linewidth=0.8,
+                alpha=0.6,
+                label=label,
+            )
         axes.set_xlabel("time [s]")
         axes.margins(x=0.0)
         legend_above(figure, axes, columns=5)
-    return Figure("figure_13", f"The same J-turn (Figure 13 of the paper), {as_code(span.recording)}. Data: {data}.", figure)
+    return Figure(
+        "figure_13",
+        f"The same J-turn (Figure 13 of the paper), {as_code(span.recording)}. Data: {data}.",
+        figure,
+    )
 
 
-def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
+def lap(
+    runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str
+) -> Figure:
     """Figure 10: the stretch of a lap with the largest mean |ay|: angles, accelerations, distrust."""
     whole = next(iter(runs.values())).test[span.recording][0]
     length = min(round(LAP_SECONDS / float(whole.time[1] - whole.time[0])), len(whole.time))
     first = int(np.convolve(np.abs(whole.ay), np.ones(length), "valid").argmax())
     window = (float(whole.time[first]), float(whole.time[first + length - 1]))
-    parts = {candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()}
+    parts = {
+        candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()
+    }
     drive = prepared.recording(span.dataset, span.recording).cut(*window)
-    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
+    hybrids = {
+        candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS
+    }
     with new_figure(DOUBLE_COLUMN, 4.9) as figure:
         grid = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
         _angles(grid[0], parts)
@@ -127,9 +188,17 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
         grid[1].plot(time, drive["ay"], color="#444444", label="$a_y$")
         grid[1].plot(time, drive["ax"], color="#999999", linestyle="dashed", label="$a_x$")
         grid[1].set_ylabel("acceleration [m/s²]")
-        for candidate, (at, output) in _network_outputs(hybrids, prepared, warm_up, span, window).items():
+        for candidate, (at, output) in _network_outputs(
+            hybrids, prepared, warm_up, span, window
+        ).items():
             line = line_of(candidate)
-            grid[2].plot(at, np.degrees(np.sqrt(output.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+            grid[2].plot(
+                at,
+                np.degrees(np.sqrt(output.variance)),
+                color=line.colour,
+                linestyle=line.dash,
+                linewidth=1.0,
+            )
         _deviations(grid[2])
         grid[2].set_ylabel(r"$\sigma_{DD}$ [deg]")
         grid[2].set_xlabel("time [s]")
@@ -145,17 +214,28 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
 
 
 def _network_outputs(
-    hybrids: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, window: tuple[float, float] | None = None
+    hybrids: Mapping[str, Run],
+    prepared: Prepared,
+    warm_up: float,
+    span: Span,
+    window: tuple[float, float] | None = None,
 ) -> dict[str, tuple[FloatArray, PseudoMeasurement]]:
     """Candidate -> times from the start of what is scored [s], and its network's outputs there."""
-    drive = prepared.recording(span.dataset, span.recording).cut(span.start - warm_up, span.stop).without_references()
+    drive = (
+        prepared.recording(span.dataset, span.recording)
+        .cut(span.start - warm_up, span.stop)
+        .without_references()
+    )
     found = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
         (output,) = pseudo_measurements_of(run, [drive])
         kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
         process = None if output.process is None else output.process[kept]
-        found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(output.sideslip[kept], output.variance[kept], process)
+        found[candidate] = (
+            drive.time[kept] - scored.time[0],
+            PseudoMeasurement(output.sideslip[kept], output.variance[kept], process),
+        )
     return found
 
 
@@ -163,7 +243,14 @@ def _within(part: Scored, window: tuple[float, float] | None) -> Scored:
     if window is None:
         return part
     kept = (part.time >= window[0]) & (part.time <= window[1])
-    return Scored(part.time[kept], part.vy[kept], part.vy_ref[kept], part.sideslip[kept], part.sideslip_ref[kept], part.ay[kept])
+    return Scored(
+        part.time[kept],
+        part.vy[kept],
+        part.vy_ref[kept],
+        part.sideslip[kept],
+        part.sideslip_ref[kept],
+        part.ay[kept],
+    )
 
 
 def _from_start(part: Scored) -> FloatArray:
@@ -172,10 +259,23 @@ def _from_start(part: Scored) -> FloatArray:
 
 def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
     first = next(iter(parts.values()))
-    axes.plot(_from_start(first), np.degrees(first.sideslip_ref), color=REFERENCE.colour, linewidth=1.5, label="reference")
+    axes.plot(
+        _from_start(first),
+        np.degrees(first.sideslip_ref),
+        color=REFERENCE.colour,
+        linewidth=1.5,
+        label="reference",
+    )
     for candidate, part in parts.items():
         line = line_of(candidate)
-        axes.plot(_from_start(part), np.degrees(part.sideslip), color=line.colour, linestyle=line.dash, linewidth=1.0, label=candidate)
+        axes.plot(
+            _from_start(part),
+            np.degrees(part.sideslip),
+            color=line.colour,
+            linestyle=line.dash,
+            linewidth=1.0,
+            label=candidate,
+        )
     axes.set_ylabel("sideslip angle [deg]")
 
 

@@ -13,7 +13,12 @@ from vehest_papers.kit.claims import Claim, bound_claim, claims_table, order_cla
 from vehest_papers.kit.reading import metric_values, words_of_kinds
 
 FAMILY = "rational_ekf"
-BASELINE_TITLES = {"zero": "zero", "static_map": "static map", "kinematic": "kinematic", "data_sheet": "data sheet"}
+BASELINE_TITLES = {
+    "zero": "zero",
+    "static_map": "static map",
+    "kinematic": "kinematic",
+    "data_sheet": "data sheet",
+}
 """Estimators that the filters have to beat -> what they are called in tables."""
 LAPS, FAST, REAL = "nominal_laps", "nominal_fast", "test"
 ASKED = [(better, worse) for better, worse in paper.GAINS]
@@ -22,7 +27,12 @@ ASKED = [(better, worse) for better, worse in paper.GAINS]
 def titles_of(part: PartArtefacts) -> dict[Name, str]:
     """Estimator and variant -> what it is called in this report, for all models of a part."""
     names = {(model.estimator, model.variant) for model in part.models}
-    return {name: paper.VARIANTS[name[1]] if name[0] == FAMILY else BASELINE_TITLES.get(name[0], ": ".join(name)) for name in names}
+    return {
+        name: paper.VARIANTS[name[1]]
+        if name[0] == FAMILY
+        else BASELINE_TITLES.get(name[0], ": ".join(name))
+        for name in names
+    }
 
 
 def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
@@ -32,25 +42,45 @@ def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
     return {test: ranking_of(part, test, asked=asked) for test in part.split.tests}
 
 
-def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> tuple[Table, str]:
+def claims_blocks(
+    truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]
+) -> tuple[Table, str]:
     """The table of claims, those of the tests before ``others``, and a sentence a test on the best filter."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
     data = words_of_kinds(truck)
     claims: list[Claim] = [
-        bound_claim(found[LAPS], variant_of[paper.RATTE], paper.RATTE, 0.5, f"{paper.LAPS[paper.RATTE]}°", f"{data}, three laps"),
-        bound_claim(found[FAST], variant_of[paper.RATTE], paper.RATTE, 0.62, f"{paper.FAST[paper.RATTE]}°", f"{data}, fast lap"),
+        bound_claim(
+            found[LAPS],
+            variant_of[paper.RATTE],
+            paper.RATTE,
+            0.5,
+            f"{paper.LAPS[paper.RATTE]}°",
+            f"{data}, three laps",
+        ),
+        bound_claim(
+            found[FAST],
+            variant_of[paper.RATTE],
+            paper.RATTE,
+            0.62,
+            f"{paper.FAST[paper.RATTE]}°",
+            f"{data}, fast lap",
+        ),
     ]
     tests = [(test, f"{data}, {test.replace('_', ' ')}", titles, found[test]) for test in found]
     if ferrari is not None:
         real = rankings_of(ferrari)
-        tests.append((REAL, f"{words_of_kinds(ferrari)}, the Ferrari", titles_of(ferrari), real[REAL]))
+        tests.append(
+            (REAL, f"{words_of_kinds(ferrari)}, the Ferrari", titles_of(ferrari), real[REAL])
+        )
     for test, words, own, ranking in tests:
         for better, worse in ASKED:
             known = f"{paper.GAINS[better, worse]:.0f} % below on its three laps"
             if test == FAST:
                 known = f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
-            claims.append(order_claim(ranking, variant_of[better], variant_of[worse], own, known, words))
+            claims.append(
+                order_claim(ranking, variant_of[better], variant_of[worse], own, known, words)
+            )
     sentences = [verdict_sentences(ranking, own, words) for _, words, own, ranking in tests]
     note = (
         "The paper's recordings are real, of another vehicle. Twin: the paper's own single track as the plant, below; its intervals are "

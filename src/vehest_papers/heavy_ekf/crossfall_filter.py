@@ -12,7 +12,12 @@ DEVIATION = 0.2  # m/s², standard deviation of b at the start: 1.2° of crossfa
 WANDER = 0.002  # m/s² √s⁻¹, by which it drifts: 0.1° in a minute
 
 
-def filtered(estimator: RationalFilter, samples: FloatArray, deviation: float = DEVIATION, wander: float = WANDER) -> FloatArray:
+def filtered(
+    estimator: RationalFilter,
+    samples: FloatArray,
+    deviation: float = DEVIATION,
+    wander: float = WANDER,
+) -> FloatArray:
     """States (β, r, β', r', θ…, b) after each sample, (T, n).
 
     Args:
@@ -24,4 +29,6 @@ def filtered(estimator: RationalFilter, samples: FloatArray, deviation: float = 
     mean, covariance = estimator.first_gaussian(samples[0], {})
     wider = np.pad(covariance, (0, 1))
     wider[-1, -1] = deviation**2
-    return estimator.filter_samples(samples, Gaussian(np.append(mean, 0.0), wider), crossfall=wander).mean
+    return estimator.filter_samples(
+        samples, Gaussian(np.append(mean, 0.0), wider), crossfall=wander
+    ).mean

@@ -12,15 +12,36 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code, as_text
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest_papers.heavy_ekf import accuracy, claims, draws, laps, paper, tables, twin_report, tyres, vehicle, watching
+from vehest_papers.heavy_ekf import (
+    accuracy,
+    claims,
+    draws,
+    laps,
+    paper,
+    tables,
+    twin_report,
+    tyres,
+    vehicle,
+    watching,
+)
 from vehest_papers.heavy_ekf.factorial import every_cell, factorial
-from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
+from vehest_papers.heavy_ekf.subjects import (
+    TYRES,
+    Filter,
+    curves_of,
+    filters_of,
+    rmse_of,
+    validation_drives,
+    whole_drive,
+)
 from vehest_papers.kit import methods
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"
-WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.08, track_rear=2.08)  # as in conf/vehicle/heavy_truck.yaml
+WHEELS = SpeedFromWheels(
+    wheel_radius=0.48, track_front=2.08, track_rear=2.08
+)  # as in conf/vehicle/heavy_truck.yaml
 NOMINAL = "nominal_laps"
 
 
@@ -35,7 +56,9 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     truck = artefacts.parts[TRUCK]
     tests = [f"{kind}_{drive}" for kind in TYRES for drive in tables.DRIVES]
     if set(truck.split.tests) != set(tests):
-        raise DataError(f"study '{artefacts.study}': the test sets of part '{TRUCK}' must be called {', '.join(tests)}")
+        raise DataError(
+            f"study '{artefacts.study}': the test sets of part '{TRUCK}' must be called {', '.join(tests)}"
+        )
     filters = filters_of(truck)
     rmse = rmse_of(truck, filters)
     real = artefacts.parts.get(FERRARI)
@@ -43,26 +66,43 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     real_rmse = rmse_of(real, real_filters) if real else {}
     drives = {test: whole_drive(truck, test) for test in tests}
     shown = {name: own for name, own in filters.items() if name in (*paper.ORDER, paper.HELD)}
-    estimates = {test: {name: own.of(drive) for name, own in shown.items()} for test, drive in drives.items()}
+    estimates = {
+        test: {name: own.of(drive) for name, own in shown.items()} for test, drive in drives.items()
+    }
     traces, of_ferrari = _ferrari(real, real_filters, real_rmse) if real else ([], [])
     errors = {**rmse, **claims.baseline_errors(truck)}
     real_errors = {**real_rmse, **claims.baseline_errors(real)} if real else {}
     twin = factorial()
     twin_front, twin_claims, twin_data, twin_appendix = twin_report.twin_blocks(twin)
-    wheels, wheel_claims = vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else ([], [])
+    wheels, wheel_claims = (
+        vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else ([], [])
+    )
     lap_blocks, lap_claims = _lap_by_lap(filters, drives, estimates)
     rear = float(filters[paper.RATTE].fitted.settings.car.cg_to_rear_axle)
-    drawn, drawn_claims = draws.draws_blocks(artefacts.parts[DRAWS], rear) if DRAWS in artefacts.parts else ([], [])
+    drawn, drawn_claims = (
+        draws.draws_blocks(artefacts.parts[DRAWS], rear) if DRAWS in artefacts.parts else ([], [])
+    )
     others = [*drawn_claims, *twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
     warned = methods.warnings_in_words(
-        {as_text(artefacts.titles[name]): part for name, part in artefacts.parts.items() if name not in (WHEELED, DRAWS)}
+        {
+            as_text(artefacts.titles[name]): part
+            for name, part in artefacts.parts.items()
+            if name not in (WHEELED, DRAWS)
+        }
     )
     claimed, best = claims.claims_blocks(truck, real, others)
     blocks: list[Block] = [
         *_asked(artefacts),
         claimed,
         *traces,
-        tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
+        tables.overview(
+            errors,
+            real_errors,
+            [
+                *filters,
+                *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL),
+            ],
+        ),
         *twin_front,
         f"## Appendix: the best filter\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
@@ -77,11 +117,15 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *of_ferrari,
         *_how_it_was_made(artefacts),
     ]
-    return {REPORT: Document(artefacts.title, blocks, {**twin_data, "twin_cells": every_cell(twin)})}
+    return {
+        REPORT: Document(artefacts.title, blocks, {**twin_data, "twin_cells": every_cell(twin)})
+    }
 
 
 def _lap_by_lap(
-    filters: Mapping[str, Filter], drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]]
+    filters: Mapping[str, Filter],
+    drives: Mapping[str, Recording],
+    estimates: Mapping[str, Mapping[str, Estimate]],
 ) -> tuple[list[Block], list[Claim]]:
     """Errors a lap, underestimation and the stop, with the claims that go with them."""
     slowest = filters[paper.RATTE].fitted.settings.minimum_speed
@@ -95,12 +139,22 @@ def _lap_by_lap(
     ]
     ratte, three = estimates[NOMINAL][paper.RATTE], drives[NOMINAL]
     faster = accuracy.faster_is_better_claim(three, ratte, slowest)
-    return blocks, [faster, *accuracy.underestimation_claims(gains), accuracy.stop_claim(three, ratte)]
+    return blocks, [
+        faster,
+        *accuracy.underestimation_claims(gains),
+        accuracy.stop_claim(three, ratte),
+    ]
 
 
 def _asked(artefacts: StudyArtefacts) -> list[Block]:
-    kinds, absent = methods.kinds_of_parts(artefacts, artefacts.parts), methods.absent_parts(artefacts)
-    return [f"{kinds}. The paper's recordings are real, of another vehicle, and not public.{absent}", artefacts.about]
+    kinds, absent = (
+        methods.kinds_of_parts(artefacts, artefacts.parts),
+        methods.absent_parts(artefacts),
+    )
+    return [
+        f"{kinds}. The paper's recordings are real, of another vehicle, and not public.{absent}",
+        artefacts.about,
+    ]
 
 
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
@@ -149,12 +203,21 @@ def _truck(
     settings = filters[paper.RATTE].fitted.settings
     car, slowest = settings.car, settings.minimum_speed
     sound = validation_drives(part)
-    own = {kind: tyres.OwnCurves.of([drives[f"{kind}_{drive}"] for drive in tables.DRIVES], car, slowest) for kind in TYRES}
+    own = {
+        kind: tyres.OwnCurves.of(
+            [drives[f"{kind}_{drive}"] for drive in tables.DRIVES], car, slowest
+        )
+        for kind in TYRES
+    }
     three, fast = drives[NOMINAL], drives["nominal_fast"]
-    fit = curves_of(filters[paper.RATTE].fitted, [drive for drive in sound if drive.vehicle == three.vehicle])
+    fit = curves_of(
+        filters[paper.RATTE].fitted, [drive for drive in sound if drive.vehicle == three.vehicle]
+    )
     by_tyres = {kind: drives[f"{kind}_laps"] for kind in TYRES}
     adaptive = [name for name in (paper.LINT, paper.RATTE, paper.HELD) if name in filters]
-    errors = tables.errors_table(drives, estimates, [name for name in (*paper.ORDER, paper.HELD) if name in filters], slowest)
+    errors = tables.errors_table(
+        drives, estimates, [name for name in (*paper.ORDER, paper.HELD) if name in filters], slowest
+    )
     blocks: list[Block] = [
         "## Appendix: tyres",
         tyres.figure_3(fit, own["nominal"], "figure_3", data),
@@ -167,11 +230,15 @@ def _truck(
         tables.table_3(rmse, list(filters), data),
         tables.gains_table(rmse),
         errors,
-        tables.order_in_words(rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.values["tyres"]),
+        tables.order_in_words(
+            rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.values["tyres"]
+        ),
         "## Appendix: tyre parameters over time",
     ]
     for name, number in ((paper.LINT, 8), (paper.RATTE, 9)):
-        what = "Cornering stiffness values" if name == paper.LINT else "Rational tyre model parameters"
+        what = (
+            "Cornering stiffness values" if name == paper.LINT else "Rational tyre model parameters"
+        )
         caption = (
             f"{what}, {name} filter (Figure {number} of the paper), three laps, {data}. Dashed: what fits the plant's own tyre forces on "
             "these tyres; left out where it lies far off the axis."
@@ -182,28 +249,45 @@ def _truck(
         above = filters[paper.HELD].fitted.settings.adapt_above
         caption = f"The same of {paper.HELD}: parameters are held while |u r| is below {above:g} m/s², three laps, {data}. Dashed as above."
         of = {kind: estimates[f"{kind}_laps"][paper.HELD] for kind in TYRES}
-        blocks.append(tyres.parameters_figure(by_tyres, of, own, paper.HELD, "figure_9_held", caption))
+        blocks.append(
+            tyres.parameters_figure(by_tyres, of, own, paper.HELD, "figure_9_held", caption)
+        )
     caption = f"Measured and estimated sideslip angle during a high-speed lap (Figure 10 of the paper), {data}, '{fast.id}'."
     blocks += [
         tyres.convergence_table(drives, estimates, own, adaptive),
         "## Appendix: the fast lap",
-        laps.sideslip_figure(fast, laps.drawn(estimates["nominal_fast"]), slowest, "figure_10", caption),
+        laps.sideslip_figure(
+            fast, laps.drawn(estimates["nominal_fast"]), slowest, "figure_10", caption
+        ),
         laps.speed_and_acceleration(fast, 11, "the high-speed lap", data),
     ]
     watched = {name: filters[name] for name in reversed(paper.ORDER)}
-    blocks += ["## Appendix: where the parameters can move", *watching.observability_blocks(watched, three, slowest, data)]
-    blocks += ["## Appendix: bad input", *watching.bad_input_table(watched, three, sound, WHEELS, slowest, data)]
+    blocks += [
+        "## Appendix: where the parameters can move",
+        *watching.observability_blocks(watched, three, slowest, data),
+    ]
+    blocks += [
+        "## Appendix: bad input",
+        *watching.bad_input_table(watched, three, sound, WHEELS, slowest, data),
+    ]
     return blocks
 
 
-def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse) -> tuple[list[Block], list[Block]]:
+def _ferrari(
+    part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse
+) -> tuple[list[Block], list[Block]]:
     """The sideslip angle, which stands on the first page, and an appendix."""
     data = words_of_kinds(part).upper()
     span = part.split.tests["test"][0]
     drive = whole_drive(part, "test").cut(span.start - part.protocol.warm_up_seconds, span.stop)
     estimates = {name: own.of(drive) for name, own in filters.items()}
     fit = curves_of(filters[paper.RATTE].fitted, validation_drives(part))
-    rows = pd.DataFrame([{"filter": name, "rmse": rmse[name, "test"], "validation": rmse[name, "validation"]} for name in filters])
+    rows = pd.DataFrame(
+        [
+            {"filter": name, "rmse": rmse[name, "test"], "validation": rmse[name, "validation"]}
+            for name in filters
+        ]
+    )
     columns = {"filter": Column("filter"), "rmse": Column("RMSE(β), test [deg]", decimals=3)}
     columns["validation"] = Column("RMSE(β), validation [deg]", decimals=3)
     learnt, tested = spans_in_words(part.split.train), spans_in_words(part.split.tests["test"])
@@ -211,12 +295,21 @@ def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rm
     trace = f"Measured and estimated sideslip angle on the test range and the seconds before it, {data}, '{drive.id}'."
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
     slowest = filters[paper.RATTE].fitted.settings.minimum_speed
-    return [laps.sideslip_figure(drive, laps.drawn(estimates), slowest, "sideslip_ferrari", trace)], [
+    return [
+        laps.sideslip_figure(drive, laps.drawn(estimates), slowest, "sideslip_ferrari", trace)
+    ], [
         "## Appendix: the same filters on a real car",
         "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; the first page "
         "compares them and shows the sideslip angle.",
         Table("ferrari", caption, rows, columns),
         tyres.figure_3(fit, None, "figure_3_ferrari", data),
         tyres.table_1(fit, None, "table_1_ferrari", data),
-        tyres.parameters_figure({"as it is": drive}, {"as it is": estimates[paper.RATTE]}, {}, paper.RATTE, "parameters_ferrari", wander),
+        tyres.parameters_figure(
+            {"as it is": drive},
+            {"as it is": estimates[paper.RATTE]},
+            {},
+            paper.RATTE,
+            "parameters_ferrari",
+            wander,
+        ),
     ]

@@ -28,11 +28,17 @@ def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Bloc
     """Table ``draws`` and the claims of order, both over the draws of each test set; ``cg_to_rear_axle`` [m] is of the truck."""
     titles = titles_of(part)
     models = {titles[model.estimator, model.variant]: model for model in part.models}
-    sums = {test: {title: by_drive(part, model, test) for title, model in models.items()} for test in part.split.tests}
+    sums = {
+        test: {title: by_drive(part, model, test) for title, model in models.items()}
+        for test in part.split.tests
+    }
     found = compared(sums)
     rows = []
     for test, own in sums.items():
-        row: dict[str, object] = {"test": _named(test), "slip": rear_slip(part, test, cg_to_rear_axle)}
+        row: dict[str, object] = {
+            "test": _named(test),
+            "slip": rear_slip(part, test, cg_to_rear_axle),
+        }
         for title, (squared, samples) in own.items():
             interval = root_interval(squared[None], samples)
             row[title] = with_interval(interval.value, interval.low, interval.high, 3)
@@ -45,11 +51,19 @@ def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Bloc
         f"RMSE(β) on the fast lap over {n} draws of sensors and driver, {data.upper()}, with 95 % intervals over draws. Models are "
         "those of the truck."
     )
-    claims = [_claim(pair, test, sums[test], own, lower, n, data) for (test, pair), (own, lower) in found.items()]
-    return [f"## Appendix: the fast lap over {n} draws", Table("draws", caption, pd.DataFrame(rows), columns)], claims
+    claims = [
+        _claim(pair, test, sums[test], own, lower, n, data)
+        for (test, pair), (own, lower) in found.items()
+    ]
+    return [
+        f"## Appendix: the fast lap over {n} draws",
+        Table("draws", caption, pd.DataFrame(rows), columns),
+    ], claims
 
 
-def by_drive(part: PartArtefacts, model: EvaluatedModel, test: str) -> tuple[FloatArray, FloatArray]:
+def by_drive(
+    part: PartArtefacts, model: EvaluatedModel, test: str
+) -> tuple[FloatArray, FloatArray]:
     """Sums of squared errors of β [deg²] and samples of each drive of a test set, each of shape (drives,)."""
     own = model.segments(test)
     spans = part.split.tests[test]
@@ -77,19 +91,48 @@ def rear_slip(part: PartArtefacts, test: str, cg_to_rear_axle: float) -> float:
     """99 % of the size of the rear axle's slip angle over the drives of a test set [deg]."""
     found = []
     for span in part.split.tests[test]:
-        drive = read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop)
-        found.append(np.degrees(np.arctan2(drive["vy_ref"] - cg_to_rear_axle * drive["yaw_rate"], drive["vx"])))
+        drive = read_recording(part.references[span.dataset, span.recording]).cut(
+            span.start, span.stop
+        )
+        found.append(
+            np.degrees(
+                np.arctan2(drive["vy_ref"] - cg_to_rear_axle * drive["yaw_rate"], drive["vx"])
+            )
+        )
     return float(np.quantile(np.abs(np.concatenate(found)), 0.99))
 
 
-def _claim(pair: tuple[str, str], test: str, sums: Sums, own: Interval, excludes_zero: bool, n: int, data: str) -> Claim:
+def _claim(
+    pair: tuple[str, str],
+    test: str,
+    sums: Sums,
+    own: Interval,
+    excludes_zero: bool,
+    n: int,
+    data: str,
+) -> Claim:
     lower, higher = pair
-    means = [np.sqrt(squared.sum() / samples.sum()) for squared, samples in (sums[lower], sums[higher])]
-    verdict: Verdict = "undecided" if not excludes_zero else "reproduced" if own.value < 0.0 else "not reproduced"
+    means = [
+        np.sqrt(squared.sum() / samples.sum()) for squared, samples in (sums[lower], sums[higher])
+    ]
+    verdict: Verdict = (
+        "undecided" if not excludes_zero else "reproduced" if own.value < 0.0 else "not reproduced"
+    )
     words = f"{fixed(means[0], 3)}° and {fixed(means[1], 3)}°; difference {with_interval(own.value, own.low, own.high, 3, '°')}"
-    why = {"undecided": "holds zero", "reproduced": "lies below zero", "not reproduced": "lies above zero"}[verdict]
+    why = {
+        "undecided": "holds zero",
+        "reproduced": "lies below zero",
+        "not reproduced": "lies above zero",
+    }[verdict]
     known = f"{paper.FAST[lower]}° and {paper.FAST[higher]}°"
-    return Claim(f"{lower} below {higher}", known, words, f"{data}, {_named(test)}, {n} draws", verdict, f"the corrected interval {why}")
+    return Claim(
+        f"{lower} below {higher}",
+        known,
+        words,
+        f"{data}, {_named(test)}, {n} draws",
+        verdict,
+        f"the corrected interval {why}",
+    )
 
 
 def _named(test: str) -> str:

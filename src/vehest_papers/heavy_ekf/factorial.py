@@ -35,10 +35,18 @@ from vehest_papers.kit.statements import corrected
 SLIPS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)  # deg
 MISMATCHES = (-0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2)
 SEEDS = 20
-PLANTS = tuple((payload, wet, crossfall) for payload in (False, True) for wet in (False, True) for crossfall in (False, True))
+PLANTS = tuple(
+    (payload, wet, crossfall)
+    for payload in (False, True)
+    for wet in (False, True)
+    for crossfall in (False, True)
+)
 """Payload, wet patches, crossfall: each without and with."""
 PLAIN = PLANTS[0]
-ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"  # what the levels of noise were tuned on
+ONCE, PLAIN_ONLY = (
+    "all roads and loads",
+    "dry, flat, without payload",
+)  # what the levels of noise were tuned on
 PAIRS = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT), (paper.RATT, paper.LINT))
 LOST_DEGREES = 20.0  # an error of β by which a filter counts as lost
 ABSORBED_SLIP = 5.0
@@ -51,9 +59,15 @@ class Cell:
     tuned_on: str  # what the levels were tuned on
     conditions: Conditions  # of the plant; its slip is what the driver was asked for
     mismatch: float  # of the filters' stiffnesses
-    squared: Mapping[str, FloatArray]  # candidate -> mean squared error of β of each seed [rad²], (S,)
-    lost: Mapping[str, float]  # candidate -> share of seeds with an error above `LOST_DEGREES` at some time
-    reached: tuple[float, float, float]  # largest rear slip [deg] and largest |a_y| [m/s²], means over seeds, and the largest |a_y| of all
+    squared: Mapping[
+        str, FloatArray
+    ]  # candidate -> mean squared error of β of each seed [rad²], (S,)
+    lost: Mapping[
+        str, float
+    ]  # candidate -> share of seeds with an error above `LOST_DEGREES` at some time
+    reached: tuple[
+        float, float, float
+    ]  # largest rear slip [deg] and largest |a_y| [m/s²], means over seeds, and the largest |a_y| of all
 
     def rmse(self, name: str) -> float:
         """RMSE(β) over all seeds [deg]."""
@@ -74,10 +88,16 @@ class Change:
 class Factorial:
     """All that the twin is asked."""
 
-    tuned: Mapping[str, Mapping[str, Tuned]]  # what the levels were tuned on -> filter -> what was tuned
-    cells: Sequence[Cell]  # all cells, those of `ONCE` over all plants, those of `PLAIN_ONLY` on the plain one
+    tuned: Mapping[
+        str, Mapping[str, Tuned]
+    ]  # what the levels were tuned on -> filter -> what was tuned
+    cells: Sequence[
+        Cell
+    ]  # all cells, those of `ONCE` over all plants, those of `PLAIN_ONLY` on the plain one
 
-    def grid(self, plant: tuple[bool, bool, bool] = PLAIN, tuned_on: str = ONCE) -> list[list[Cell]]:
+    def grid(
+        self, plant: tuple[bool, bool, bool] = PLAIN, tuned_on: str = ONCE
+    ) -> list[list[Cell]]:
         """Cells of one plant, a row a mismatch, a column a slip."""
         found = {
             (cell.mismatch, cell.conditions.slip): cell
@@ -91,8 +111,16 @@ class Factorial:
 def factorial() -> Factorial:
     """Tune, drive and filter everything; minutes, once a process."""
     drives = {words: tuning_drives(plain=words == PLAIN_ONLY) for words in (ONCE, PLAIN_ONLY)}
-    found = {words: {name: tuned(name, own) for name in (*FILTERS, ORACLE)} for words, own in drives.items()}
-    cells = [cell for plant in PLANTS for slip in SLIPS for cell in _cells(found, Conditions(slip, *plant))]
+    found = {
+        words: {name: tuned(name, own) for name in (*FILTERS, ORACLE)}
+        for words, own in drives.items()
+    }
+    cells = [
+        cell
+        for plant in PLANTS
+        for slip in SLIPS
+        for cell in _cells(found, Conditions(slip, *plant))
+    ]
     return Factorial(found, cells)
 
 
@@ -110,17 +138,36 @@ def _cells(found: Mapping[str, Mapping[str, Tuned]], conditions: Conditions) -> 
     cells = []
     for tuned_on in (ONCE, PLAIN_ONLY) if plant_of(conditions) == PLAIN else (ONCE,):
         levels = {name: own.levels for name, own in found[tuned_on].items()}
-        same = fixed | {ORACLE: [sideslip_of(ORACLE, levels[ORACLE], own, CURVES) for own in drives]}
+        same = fixed | {
+            ORACLE: [sideslip_of(ORACLE, levels[ORACLE], own, CURVES) for own in drives]
+        }
         for mismatch in MISMATCHES:
             curves = mistaken(mismatch)
-            estimates = same | {name: [sideslip_of(name, levels[name], own, curves) for own in drives] for name in FILTERS}
+            estimates = same | {
+                name: [sideslip_of(name, levels[name], own, curves) for own in drives]
+                for name in FILTERS
+            }
             errors = {
-                name: np.stack([(own - each.sideslip)[SKIP:] for own, each in zip(of, drives, strict=True)])
+                name: np.stack(
+                    [(own - each.sideslip)[SKIP:] for own, each in zip(of, drives, strict=True)]
+                )
                 for name, of in estimates.items()
             }
             squared = {name: np.mean(np.square(own), axis=1) for name, own in errors.items()}
-            lost = {name: float(np.mean(np.degrees(np.abs(own)).max(axis=1) > LOST_DEGREES)) for name, own in errors.items()}
-            cells.append(Cell(tuned_on, conditions, mismatch, squared, lost, (slip, float(np.mean(lateral)), max(lateral))))
+            lost = {
+                name: float(np.mean(np.degrees(np.abs(own)).max(axis=1) > LOST_DEGREES))
+                for name, own in errors.items()
+            }
+            cells.append(
+                Cell(
+                    tuned_on,
+                    conditions,
+                    mismatch,
+                    squared,
+                    lost,
+                    (slip, float(np.mean(lateral)), max(lateral)),
+                )
+            )
     return cells
 
 
@@ -129,18 +176,27 @@ def _baselines():  # type: ignore[no-untyped-def]
     return baselines([own for _, own in tuning_drives()])
 
 
-def changes(cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]) -> dict[tuple[int, tuple[str, str]], Change]:
+def changes(
+    cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]
+) -> dict[tuple[int, tuple[str, str]], Change]:
     """(position of the cell, pair) -> change of RMSE(β), paired over seeds; all corrected together by Holm, as one table."""
     asked = [(at, pair) for at in range(len(cells)) for pair in pairs]
     size = np.ones(SEEDS)
     differences = [
-        difference_of_blocks(cells[at].squared[first][None], cells[at].squared[second][None], size, n_resamples=2000).root
+        difference_of_blocks(
+            cells[at].squared[first][None], cells[at].squared[second][None], size, n_resamples=2000
+        ).root
         for at, (first, second) in asked
     ]
     found = {}
     for key, (own, told_apart) in zip(asked, corrected(differences), strict=True):
         other = math.sqrt(float(cells[key[0]].squared[key[1][1]].mean()))
-        found[key] = Change(100.0 * own.value / other, max(100.0 * own.low / other, -100.0), 100.0 * own.high / other, told_apart)
+        found[key] = Change(
+            100.0 * own.value / other,
+            max(100.0 * own.low / other, -100.0),
+            100.0 * own.high / other,
+            told_apart,
+        )
     return found
 
 
@@ -189,13 +245,19 @@ class Mistake:
     def car(self) -> SingleTrackParameters:
         """The car that the filter takes it for."""
         front, rear = float(TRUCK.cg_to_front_axle), float(TRUCK.cg_to_rear_axle)
-        return replace(TRUCK, cg_to_front_axle=front - self.forward, cg_to_rear_axle=rear + self.forward)
+        return replace(
+            TRUCK, cg_to_front_axle=front - self.forward, cg_to_rear_axle=rear + self.forward
+        )
 
     def measured(self, own: Drive) -> Drive:
         """The drive as the sensors tell of it, its reference included."""
         samples = own.samples + np.array([self.yaw_rate, 0.0, self.ay, 0.0])
         samples[:, 3] *= self.steering
-        return replace(own, samples=samples, sideslip=own.sideslip + self.lever_arm * own.yaw_rate / own.samples[:, 1])
+        return replace(
+            own,
+            samples=samples,
+            sideslip=own.sideslip + self.lever_arm * own.yaw_rate / own.samples[:, 1],
+        )
 
 
 MISTAKES = (
@@ -224,23 +286,43 @@ def absorbed(levels: Mapping[str, Levels]) -> pd.DataFrame:
         drives = [mistake.measured(drive(conditions, seed)).recording for seed in _FITTED_SEEDS]
         fit = fit_motion(axle_motion(drives, mistake.car(), minimum_speed=2.0))
         curves = np.concatenate([fit.front, fit.rear])
-        squared: dict[str, list[float]] = {name: [] for name in (paper.LINT, paper.RATT, paper.RATTE)}
+        squared: dict[str, list[float]] = {
+            name: [] for name in (paper.LINT, paper.RATT, paper.RATTE)
+        }
         last = []
         for seed in range(SEEDS):
             truth = drive(conditions, seed)
             given = mistake.measured(truth)
             for name in squared:
                 states = states_of(name, levels[name], given, curves, mistake.car())
-                squared[name].append(float(np.mean(np.square(states[:, 0] - truth.sideslip)[SKIP:])))
+                squared[name].append(
+                    float(np.mean(np.square(states[:, 0] - truth.sideslip)[SKIP:]))
+                )
                 if name == paper.RATTE:
                     last.append(np.log(curves) + states[-400:, 4:].mean(axis=0) - np.log(CURVES))
-        cells.append(Cell(ONCE, conditions, 0.0, {name: np.array(own) for name, own in squared.items()}, {}, (0.0, 0.0, 0.0)))
+        cells.append(
+            Cell(
+                ONCE,
+                conditions,
+                0.0,
+                {name: np.array(own) for name, own in squared.items()},
+                {},
+                (0.0, 0.0, 0.0),
+            )
+        )
         ends.append((100.0 * (curves / CURVES - 1.0), 100.0 * np.expm1(np.mean(last, axis=0))))
     found = changes(cells, [(paper.RATTE, paper.RATT)])
     for at, (mistake, cell, (start, end)) in enumerate(zip(MISTAKES, cells, ends, strict=True)):
         change = found[at, (paper.RATTE, paper.RATT)]
-        row: dict[str, object] = {"mistake": mistake.name} | {name: cell.rmse(name) for name in cell.squared}
+        row: dict[str, object] = {"mistake": mistake.name} | {
+            name: cell.rmse(name) for name in cell.squared
+        }
         row |= {"change": change.percent, "low": change.low, "high": change.high}
-        row |= {"fit_front": start[1], "fit_rear": start[3], "end_front": end[1], "end_rear": end[3]}
+        row |= {
+            "fit_front": start[1],
+            "fit_rear": start[3],
+            "end_front": end[1],
+            "end_rear": end[3],
+        }
         rows.append(row)
     return pd.DataFrame(rows)

@@ -43,17 +43,28 @@ def figure_5(drive: Recording, wheels: SpeedFromWheels, data: str) -> Figure:
     corrected = wheels.corrected(shown)
     with new_figure(DOUBLE_COLUMN, 3.6) as figure:
         panels = figure.subplots(2, 1, sharex=True, sharey=True)
-        for axes, speeds, title in zip(panels, (raw, corrected), ("as measured", "corrected, Eqs. 61 to 64"), strict=True):
+        for axes, speeds, title in zip(
+            panels, (raw, corrected), ("as measured", "corrected, Eqs. 61 to 64"), strict=True
+        ):
             for values, colour, name in zip(speeds, WHEEL_COLOURS, WHEELS.values(), strict=True):
                 axes.plot(shown.time, values, color=colour, linewidth=0.9, label=name)
-            axes.plot(shown.time, shown["vx_ref"], color=MEASURED.colour, linewidth=1.3, label="true speed $u$")
+            axes.plot(
+                shown.time,
+                shown["vx_ref"],
+                color=MEASURED.colour,
+                linewidth=1.3,
+                label="true speed $u$",
+            )
             axes.set_title(title, loc="left")
             axes.set_ylabel("speed [m/s]")
             axes.margins(x=0.0)
         panels[1].set_xlabel("time [s]")
         legend_above(figure, panels[0], columns=5)
     spread = [float(np.sqrt(np.mean(np.var(speeds, axis=0)))) for speeds in (raw, corrected)]
-    error = [float(np.sqrt(np.mean((speeds.mean(0) - shown["vx_ref"]) ** 2))) for speeds in (raw, corrected)]
+    error = [
+        float(np.sqrt(np.mean((speeds.mean(0) - shown["vx_ref"]) ** 2)))
+        for speeds in (raw, corrected)
+    ]
     caption = (
         f"Speeds of the four wheels before and after their correction (Figure 5 of the paper), {data}, '{drive.id}'. Correction takes the "
         f"wheels' spread from {fixed(spread[0], 3)} to {fixed(spread[1], 3)} m/s, and the RMSE of their mean from {fixed(error[0], 3)} to "
@@ -63,9 +74,14 @@ def figure_5(drive: Recording, wheels: SpeedFromWheels, data: str) -> Figure:
     return Figure("figure_5", caption, figure)
 
 
-def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, data: str) -> Figure:
+def figure_6(
+    drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, data: str
+) -> Figure:
     """The track, β over the three laps, and details on a straight and in the handling section."""
-    straight, handling = busiest(drive, STRAIGHT_SECONDS, calmest=True), busiest(drive, HANDLING_SECONDS)
+    straight, handling = (
+        busiest(drive, STRAIGHT_SECONDS, calmest=True),
+        busiest(drive, HANDLING_SECONDS),
+    )
     x, y = _track(drive)
     with new_figure(DOUBLE_COLUMN, 5.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=(1.1, 1.2, 1.2))
@@ -83,7 +99,11 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
         _sideslip(whole, drive, estimates, minimum_speed, None)
         _sideslip(calm, drive, estimates, minimum_speed, straight)
         _sideslip(bends, drive, estimates, minimum_speed, handling)
-        for axes, letter, colour in ((whole, "b", "black"), (calm, "c", STRAIGHT), (bends, "d", HANDLING)):
+        for axes, letter, colour in (
+            (whole, "b", "black"),
+            (calm, "c", STRAIGHT),
+            (bends, "d", HANDLING),
+        ):
             axes.set_title(letter, loc="left", fontweight="bold", color=colour)
         legend_above(figure, whole)
     caption = (
@@ -112,7 +132,13 @@ def speed_and_acceleration(drive: Recording, number: int, what: str, data: str) 
     return Figure(f"figure_{number}", caption, figure)
 
 
-def sideslip_figure(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, name: str, caption: str) -> Figure:
+def sideslip_figure(
+    drive: Recording,
+    estimates: Mapping[str, Estimate],
+    minimum_speed: float,
+    name: str,
+    caption: str,
+) -> Figure:
     """β measured and estimated over a whole drive, and the errors: Figure 10."""
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1))
@@ -132,7 +158,11 @@ def sideslip_figure(drive: Recording, estimates: Mapping[str, Estimate], minimum
 
 
 def _sideslip(
-    axes: Any, drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, stretch: tuple[float, float] | None
+    axes: Any,
+    drive: Recording,
+    estimates: Mapping[str, Estimate],
+    minimum_speed: float,
+    stretch: tuple[float, float] | None,
 ) -> None:
     first, last = drive.index_range(*stretch) if stretch else (0, len(drive))
     shown = moving(drive, minimum_speed)[first:last]
@@ -142,7 +172,13 @@ def _sideslip(
     for label, estimate in estimates.items():
         line = LINES[label]
         values = np.degrees(estimate["sideslip"][first:last]) * shown
-        axes.plot(*decimated(time, values, POINTS), color=line.colour, linestyle=line.dash, linewidth=0.9, label=label)
+        axes.plot(
+            *decimated(time, values, POINTS),
+            color=line.colour,
+            linestyle=line.dash,
+            linewidth=0.9,
+            label=label,
+        )
     low, high = np.nanquantile(measured, [0.001, 0.999])
     room = 0.35 * (high - low) + 0.2
     axes.set_ylim(low - room, high + room)
@@ -156,7 +192,9 @@ def _track(drive: Recording) -> tuple[FloatArray, FloatArray]:
     step = 1.0 / drive.rate_hz
     yaw = np.cumsum(drive["yaw_rate_ref"]) * step
     vx, vy = drive["vx_ref"], drive["vy_ref"]
-    return np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * step, np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * step
+    return np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * step, np.cumsum(
+        vx * np.sin(yaw) + vy * np.cos(yaw)
+    ) * step
 
 
 def drawn(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:

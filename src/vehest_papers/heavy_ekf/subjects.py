@@ -59,7 +59,9 @@ def filters_of(part: PartArtefacts) -> dict[str, Filter]:
             found.setdefault(name, Filter(name, model, fitted))
     missing = [name for name in paper.ORDER if name not in found]
     if missing:
-        raise DataError(f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three")
+        raise DataError(
+            f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three"
+        )
     return {name: found[name] for name in paper.VARIANTS.values() if name in found}
 
 
@@ -80,8 +82,14 @@ def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
     motion = axle_motion(drives, car, slowest)
     axles = own.axle_curves.reshape(2, 2)
     of_fit = own.curve_covariance - (own.curves.deviation or 0.0) ** 2 * np.eye(4)
-    blocks = [of_fit[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
-    left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
+    blocks = [
+        of_fit[at : at + 2, at : at + 2] * np.outer(values, values)
+        for at, values in zip((0, 2), axles, strict=True)
+    ]
+    left = [
+        axle_force("rational", values, slip) - force
+        for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)
+    ]
     rms = np.sqrt(np.mean(np.square(left), axis=1))
     return TyreFit("rational", axles[0], axles[1], np.stack(blocks), rms, motion.slip, motion.force)
 

@@ -34,7 +34,10 @@ def table_3(rmse: Rmse, names: list[str], data: str) -> Table:
     columns = {"filter": Column("filter")}
     for drive, words in DRIVES.items():
         columns[f"paper_{drive}"] = Column(f"{words}, paper (real)")
-        columns |= {f"{tyres}_{drive}": Column(f"{words}, {title}, ours", decimals=3) for tyres, title in TYRES.items()}
+        columns |= {
+            f"{tyres}_{drive}": Column(f"{words}, {title}, ours", decimals=3)
+            for tyres, title in TYRES.items()
+        }
     caption = (
         f"RMSE(β) [deg] (Table 3 of the paper, whose figures are those of its prose: its RATTE is below 0.5, 44 % below its RATT and 65 % "
         f"below its LINT on the three laps). Ours: {data}. Fitted on other laps with nominal tyres."
@@ -44,16 +47,37 @@ def table_3(rmse: Rmse, names: list[str], data: str) -> Table:
 
 def overview(rmse: Rmse, ferrari: Rmse, names: list[str]) -> Table:
     """What the terminal shows."""
-    tests = [(f"truck, {words}, {title}", f"{tyres}_{drive}", rmse) for tyres, title in TYRES.items() for drive, words in DRIVES.items()]
+    tests = [
+        (f"truck, {words}, {title}", f"{tyres}_{drive}", rmse)
+        for tyres, title in TYRES.items()
+        for drive, words in DRIVES.items()
+    ]
     if ferrari:
         tests.append(("real Ferrari", "test", ferrari))
     rows = []
     for title, test, values in tests:
-        row: dict[str, object] = {"test": title} | {name: values.get((name, test), math.nan) for name in names}
-        rows.append(row | {"order": " < ".join(sorted(paper.ORDER, key=lambda name, of=values, on=test: of[name, on]))})  # type: ignore[misc]
-    columns = {"test": Column("test"), **{name: Column(f"{name} [deg]", decimals=3) for name in names}}
+        row: dict[str, object] = {"test": title} | {
+            name: values.get((name, test), math.nan) for name in names
+        }
+        rows.append(
+            row
+            | {
+                "order": " < ".join(
+                    sorted(paper.ORDER, key=lambda name, of=values, on=test: of[name, on])  # type: ignore[misc]
+                )
+            }
+        )
+    columns = {
+        "test": Column("test"),
+        **{name: Column(f"{name} [deg]", decimals=3) for name in names},
+    }
     columns["order"] = Column("order of the three")
-    return Table("overview", "Summary: RMSE(β) on every test; the paper's order is RATTE < RATT < LINT.", pd.DataFrame(rows), columns)
+    return Table(
+        "overview",
+        "Summary: RMSE(β) on every test; the paper's order is RATTE < RATT < LINT.",
+        pd.DataFrame(rows),
+        columns,
+    )
 
 
 def gains_table(rmse: Rmse) -> Table:
@@ -63,26 +87,40 @@ def gains_table(rmse: Rmse) -> Table:
         row: dict[str, object] = {"pair": f"{better} below {worse}", "paper": f"{known:.0f} %"}
         for tyres in TYRES:
             for drive in DRIVES:
-                row[f"{tyres}_{drive}"] = percent_below(rmse[better, f"{tyres}_{drive}"], rmse[worse, f"{tyres}_{drive}"])
+                row[f"{tyres}_{drive}"] = percent_below(
+                    rmse[better, f"{tyres}_{drive}"], rmse[worse, f"{tyres}_{drive}"]
+                )
         rows.append(row)
     columns = {"pair": Column("RMSE(β)"), "paper": Column("paper, three laps (real)")}
-    columns |= {f"{tyres}_{drive}": Column(f"{words}, {title}") for drive, words in DRIVES.items() for tyres, title in TYRES.items()}
+    columns |= {
+        f"{tyres}_{drive}": Column(f"{words}, {title}")
+        for drive, words in DRIVES.items()
+        for tyres, title in TYRES.items()
+    }
     caption = "By how much one filter lies below another; negative: above. Ours: SIMULATED."
     return Table("gains", caption, pd.DataFrame(rows), columns)
 
 
 def errors_table(
-    drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]], names: list[str], minimum_speed: float
+    drives: Mapping[str, Recording],
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    names: list[str],
+    minimum_speed: float,
 ) -> Table:
     """Errors of β as their mean and what varies about it, and where the car corners."""
     rows = []
     for test, drive in drives.items():
         scored = drive["vx"] >= minimum_speed
         for name in names:
-            error, cornering = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[scored], corners(drive)[scored]
+            error, cornering = (
+                np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[scored],
+                corners(drive)[scored],
+            )
             row: dict[str, object] = {"test": test.replace("_", ", "), "filter": name}
             row |= {"mean": float(error.mean()), "std": float(error.std())}
-            rows.append(row | {"cornering": _rms(error[cornering]), "straight": _rms(error[~cornering])})
+            rows.append(
+                row | {"cornering": _rms(error[cornering]), "straight": _rms(error[~cornering])}
+            )
     columns = {
         "test": Column("drive"),
         "filter": Column("filter"),
@@ -96,19 +134,33 @@ def errors_table(
 
 
 def order_in_words(
-    rmse: Rmse, errors: pd.DataFrame, fit: TyreFit, own: Mapping[str, OwnCurves], drives: Mapping[str, Recording], wander: float
+    rmse: Rmse,
+    errors: pd.DataFrame,
+    fit: TyreFit,
+    own: Mapping[str, OwnCurves],
+    drives: Mapping[str, Recording],
+    wander: float,
 ) -> str:
     """Where the order of the three is the paper's, where it is not, and why; ``wander`` is RATTE's level of noise of its tyres [1/√s]."""
     tests = [f"{tyres}_{drive}" for tyres in TYRES for drive in DRIVES]
-    orders = {test: tuple(sorted(paper.ORDER, key=lambda name, on=test: rmse[name, on])) for test in tests}  # type: ignore[misc]
+    orders = {
+        test: tuple(sorted(paper.ORDER, key=lambda name, on=test: rmse[name, on]))  # type: ignore[misc]
+        for test in tests
+    }
     same = [test.replace("_", " ") for test in tests if orders[test] == paper.ORDER]
     other = [test for test in tests if orders[test] != paper.ORDER]
     sentences = [
-        f"The order of the paper, RATTE < RATT < LINT, is ours on {listed(same)}." if same else "On no test is the paper's order ours."
+        f"The order of the paper, RATTE < RATT < LINT, is ours on {listed(same)}."
+        if same
+        else "On no test is the paper's order ours."
     ]
     if not other:
         return sentences[0]
-    sentences.append("It differs on " + listed([f"{test.replace('_', ' ')} ({' < '.join(orders[test])})" for test in other]) + ". Why:")
+    sentences.append(
+        "It differs on "
+        + listed([f"{test.replace('_', ' ')} ({' < '.join(orders[test])})" for test in other])
+        + ". Why:"
+    )
     reasons = [f"- **Little to tell a linear tyre from a rational one.** {_curvature(fit)}"]
     reasons.append(f"- **What the parameters start from.** {_starts(own, fit)}")
     reasons.append(
@@ -117,12 +169,16 @@ def order_in_words(
     )
     reasons.append(f"- **What is to be gained.** {_gained(errors)}")
     if (errors["filter"] == paper.HELD).any():
-        reasons.append(f"- **Straight ahead there is nothing to adapt to but the crossfall.** {_held(rmse, errors)}")
+        reasons.append(
+            f"- **Straight ahead there is nothing to adapt to but the crossfall.** {_held(rmse, errors)}"
+        )
     worst = [test for test in other if rmse[paper.RATTE, test] > rmse[paper.RATT, test]]
     if worst:
         parts = []
         for test in worst:
-            (mean, spread), (other_mean, other_spread) = (_parts(errors, test, name) for name in (paper.RATTE, paper.RATT))
+            (mean, spread), (other_mean, other_spread) = (
+                _parts(errors, test, name) for name in (paper.RATTE, paper.RATT)
+            )
             parts.append(
                 f"{test.replace('_', ' ')}: mean error {fixed(mean, 2)}° against {fixed(other_mean, 2)}°, standard deviation "
                 f"{fixed(spread, 2)}° against {fixed(other_spread, 2)}°"
@@ -166,7 +222,9 @@ def _curvature(fit: TyreFit) -> str:
     for axle, values, slip in zip(("front", "rear"), (fit.front, fit.rear), fit.slip, strict=True):
         reach = float(np.quantile(np.abs(slip), 0.999))
         lost = reach**2 / (reach**2 + 2.0 * float(values[0]))
-        words.append(f"{axle} {fixed(math.degrees(reach), 1)}°, where the fitted curve lies {fixed(100 * lost, 0)} % below its tangent")
+        words.append(
+            f"{axle} {fixed(math.degrees(reach), 1)}°, where the fitted curve lies {fixed(100 * lost, 0)} % below its tangent"
+        )
     return f"In the validation drives the slip angles reach (99.9 % of samples) {'; '.join(words)}."
 
 
@@ -174,7 +232,9 @@ def _gained(errors: pd.DataFrame) -> str:
     """Standard deviations of the errors, which no constant offset enters, of fixed tyres on drives with the same and with other ones."""
     words = []
     for drive in DRIVES:
-        (same_mean, same), (worn_mean, worn) = (_parts(errors, f"{tyres}_{drive}", paper.RATT) for tyres in ("nominal", "worn"))
+        (same_mean, same), (worn_mean, worn) = (
+            _parts(errors, f"{tyres}_{drive}", paper.RATT) for tyres in ("nominal", "worn")
+        )
         words.append(
             f"{DRIVES[drive]} {fixed(same, 2)}° on nominal and {fixed(worn, 2)}° on worn tyres, beside mean errors of "
             f"{fixed(same_mean, 2)}° and {fixed(worn_mean, 2)}°"
@@ -188,9 +248,16 @@ def _held(rmse: Rmse, errors: pd.DataFrame) -> str:
     for tyres in TYRES:
         for drive in DRIVES:
             test = f"{tyres}_{drive}"
-            spread = [fixed(_parts(errors, test, name)[1], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
-            errors_of = [fixed(rmse[name, test], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
-            words.append(f"{tyres} {drive} {', '.join(errors_of)}° (standard deviations {', '.join(spread)}°)")
+            spread = [
+                fixed(_parts(errors, test, name)[1], 2)
+                for name in (paper.HELD, paper.RATTE, paper.RATT)
+            ]
+            errors_of = [
+                fixed(rmse[name, test], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)
+            ]
+            words.append(
+                f"{tyres} {drive} {', '.join(errors_of)}° (standard deviations {', '.join(spread)}°)"
+            )
     return (
         "There a filter lays the crossfall, and offsets of yaw rate and steering, upon its tyres, which it then brings into the next bend. "
         f"RMSE(β) of {paper.HELD}, whose parameters are held there, of RATTE and of RATT: {'; '.join(words)}."
@@ -205,12 +272,18 @@ def _starts(own: Mapping[str, OwnCurves], fit: TyreFit) -> str:
         nominal = own["nominal"].linear
         changes = [
             percent_below(float(after[0]), float(before[0]))
-            for after, before in ((curves.linear.front, nominal.front), (curves.linear.rear, nominal.rear))
+            for after, before in (
+                (curves.linear.front, nominal.front),
+                (curves.linear.rear, nominal.rear),
+            )
         ]
         words.append(f"{TYRES[tyres]} {changes[0]} front and {changes[1]} rear")
     start = [
         percent_below(float(plant[0]), float(values[1]))
-        for plant, values in ((own["nominal"].linear.front, fit.front), (own["nominal"].linear.rear, fit.rear))
+        for plant, values in (
+            (own["nominal"].linear.front, fit.front),
+            (own["nominal"].linear.rear, fit.rear),
+        )
     ]
     return (
         f"The plant's own nominal stiffness, by a straight line through its forces, lies {start[0]} front and {start[1]} rear below what "

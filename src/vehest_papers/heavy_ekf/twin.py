@@ -29,13 +29,24 @@ from vehest_papers.heavy_ekf import paper
 RATE = 20.0  # Hz, as in the paper
 FINER = 20  # steps of the plant a sample: 400 Hz
 SECONDS = 120.0
-TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)  # as in conf/vehicle/heavy_truck.yaml
+TRUCK = SingleTrackParameters(
+    7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0
+)  # as in conf/vehicle/heavy_truck.yaml
 CURVES = np.array([paper.CURVES[name] for name in ("c1_front", "c2_front", "c1_rear", "c2_rear")])
 TRACK, CG_HEIGHT = 2.08, 0.85  # m, likewise; both assumed there
-PAYLOAD, PAYLOAD_BEHIND, PAYLOAD_HEIGHT = 1978.0, 1.0, 1.4  # kg, a quarter; m behind the centre of gravity and above the road; assumed
+PAYLOAD, PAYLOAD_BEHIND, PAYLOAD_HEIGHT = (
+    1978.0,
+    1.0,
+    1.4,
+)  # kg, a quarter; m behind the centre of gravity and above the road; assumed
 CROSSFALL = math.radians(1.0)
 DRY, WET = 1.0, 0.6
-NOISE = {"yaw_rate": math.radians(0.1), "ay": 0.1, "steer": math.radians(0.05), "vx": 0.05}  # a sample, white; assumed
+NOISE = {
+    "yaw_rate": math.radians(0.1),
+    "ay": 0.1,
+    "steer": math.radians(0.05),
+    "vx": 0.05,
+}  # a sample, white; assumed
 SLIP_GAIN, TURN_GAIN = 4.0, 10.0  # 1/s
 LARGEST_STEER, FASTEST_STEER = 0.7, 1.0  # rad, rad/s
 FRONT_SHARE = 0.98  # of the front axle's largest force, which the driver does not ask more of
@@ -52,7 +63,9 @@ class Conditions:
     slip: float  # largest rear slip angle that the driver holds [deg]
     payload: bool = False  # whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows
     wet_patches: bool = False  # whether the friction steps from 1 to 0.6 and back along the road
-    crossfall: bool = False  # whether the road falls by 1° to the left all along, as on one side of a crown
+    crossfall: bool = (
+        False  # whether the road falls by 1° to the left all along, as on one side of a crown
+    )
 
 
 @dataclass(frozen=True)
@@ -71,11 +84,18 @@ class Plant:
             return cls(TRUCK, 1.0, 1.0, CG_HEIGHT)
         mass = TRUCK.mass + PAYLOAD
         behind = PAYLOAD * PAYLOAD_BEHIND / mass
-        inertia = TRUCK.yaw_inertia + TRUCK.mass * behind**2 + PAYLOAD * (PAYLOAD_BEHIND - behind) ** 2
+        inertia = (
+            TRUCK.yaw_inertia + TRUCK.mass * behind**2 + PAYLOAD * (PAYLOAD_BEHIND - behind) ** 2
+        )
         front, rear = TRUCK.cg_to_front_axle + behind, TRUCK.cg_to_rear_axle - behind
         height = (TRUCK.mass * CG_HEIGHT + PAYLOAD * PAYLOAD_HEIGHT) / mass
-        at_front, at_rear = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle), mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
-        car = replace(TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear)
+        at_front, at_rear = (
+            mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle),
+            mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle),
+        )
+        car = replace(
+            TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear
+        )
         return cls(car, float(at_front), float(at_rear), float(height))
 
     @property
@@ -87,12 +107,16 @@ class Plant:
     def slides_at(self) -> float:
         """Lateral acceleration that the axles' largest forces can make on a dry road, Σ c₂ √(2c₁)/2 F_z/F_z0 / M [m/s²]."""
         loads = np.array([self.load_front, self.load_rear])
-        return float(np.sum(loads * CURVES[1::2] * np.sqrt(2.0 * CURVES[::2]) / 2.0)) / float(self.car.mass)
+        return float(np.sum(loads * CURVES[1::2] * np.sqrt(2.0 * CURVES[::2]) / 2.0)) / float(
+            self.car.mass
+        )
 
     def curves(self, friction: float) -> FloatArray:
         """c₁ and c₂ of the front, then of the rear axle as a filter that takes the friction for 1 sees them, (4,)."""
         loads = np.array([self.load_front, self.load_rear])
-        return np.stack([0.5 * (friction + 1.0) * CURVES[::2], friction * loads * CURVES[1::2]], axis=1).ravel()
+        return np.stack(
+            [0.5 * (friction + 1.0) * CURVES[::2], friction * loads * CURVES[1::2]], axis=1
+        ).ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +152,9 @@ class Drive:
         return Recording("twin", "twin", RATE, 0.0, channels, "simulated")
 
 
-def course(conditions: Conditions, generator: np.random.Generator, seconds: float = SECONDS) -> Course:
+def course(
+    conditions: Conditions, generator: np.random.Generator, seconds: float = SECONDS
+) -> Course:
     """A course of bends to either side, of which one at least asks for the whole slip, at a speed that wavers."""
     step = 1.0 / (RATE * FINER)
     time = np.arange(round(seconds / step)) * step
@@ -137,9 +163,18 @@ def course(conditions: Conditions, generator: np.random.Generator, seconds: floa
     while at < seconds - BEND_SECONDS[0]:
         length = float(generator.uniform(*BEND_SECONDS))
         share = 1.0 if n_bends % 4 == 0 else float(generator.uniform(SMALLEST_BEND, 1.0))
-        rise = np.clip((time - at) / RAMP_SECONDS, 0.0, 1.0), np.clip((at + length - time) / RAMP_SECONDS, 0.0, 1.0)
+        rise = (
+            np.clip((time - at) / RAMP_SECONDS, 0.0, 1.0),
+            np.clip((at + length - time) / RAMP_SECONDS, 0.0, 1.0),
+        )
         shape = np.minimum(*rise)
-        slip += float(generator.choice([-1.0, 1.0])) * share * largest * 0.5 * (1.0 - np.cos(math.pi * shape))
+        slip += (
+            float(generator.choice([-1.0, 1.0]))
+            * share
+            * largest
+            * 0.5
+            * (1.0 - np.cos(math.pi * shape))
+        )
         at += length + float(generator.uniform(*REST_SECONDS))
         n_bends += 1
     phase, mean = generator.uniform(0.0, 2.0 * math.pi, 2), float(generator.uniform(*SPEEDS))
@@ -156,7 +191,10 @@ def course(conditions: Conditions, generator: np.random.Generator, seconds: floa
 def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     """A drive of a course, and sensors, that the seed alone decides: the same for all plants of equal slip."""
     generator = np.random.default_rng([seed, 22])
-    plant, own = Plant.of(payload=conditions.payload), course(conditions, np.random.default_rng([seed, 4]), seconds)
+    plant, own = (
+        Plant.of(payload=conditions.payload),
+        course(conditions, np.random.default_rng([seed, 4]), seconds),
+    )
     states, steer, lateral = driven(plant, own)
     kept = slice(None, None, FINER)
     sideslip, yaw_rate = states[kept].T
@@ -165,15 +203,50 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     noise = np.array([NOISE[name] for name in ("yaw_rate", "vx", "ay", "steer")])
     samples = clean + noise * generator.standard_normal(clean.shape)
     rear_slip = -sideslip + float(plant.car.cg_to_rear_axle) * yaw_rate / speed
-    return Drive(conditions, samples, sideslip.copy(), yaw_rate.copy(), rear_slip, lateral[kept].copy(), own.friction[kept].copy(), plant)
+    return Drive(
+        conditions,
+        samples,
+        sideslip.copy(),
+        yaw_rate.copy(),
+        rear_slip,
+        lateral[kept].copy(),
+        own.friction[kept].copy(),
+        plant,
+    )
 
 
 def driven(plant: Plant, own: Course) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States (β, r), (K, 2), road-wheel angle and lateral acceleration (K,) along a course, by Runge and Kutta's fourth order."""
-    states, steer, lateral = np.zeros((len(own.speed), 2)), np.zeros(len(own.speed)), np.zeros(len(own.speed))
-    car = np.array([plant.car.mass, plant.car.yaw_inertia, plant.car.cg_to_front_axle, plant.car.cg_to_rear_axle], dtype=np.float64)
-    tyres = np.array([CURVES[0], CURVES[1] * plant.load_front, CURVES[2], CURVES[3] * plant.load_rear])
-    _drive(car, tyres, own.speed, own.slip, own.slip_rate, own.friction, own.road, 1.0 / (RATE * FINER), states, steer, lateral)
+    states, steer, lateral = (
+        np.zeros((len(own.speed), 2)),
+        np.zeros(len(own.speed)),
+        np.zeros(len(own.speed)),
+    )
+    car = np.array(
+        [
+            plant.car.mass,
+            plant.car.yaw_inertia,
+            plant.car.cg_to_front_axle,
+            plant.car.cg_to_rear_axle,
+        ],
+        dtype=np.float64,
+    )
+    tyres = np.array(
+        [CURVES[0], CURVES[1] * plant.load_front, CURVES[2], CURVES[3] * plant.load_rear]
+    )
+    _drive(
+        car,
+        tyres,
+        own.speed,
+        own.slip,
+        own.slip_rate,
+        own.friction,
+        own.road,
+        1.0 / (RATE * FINER),
+        states,
+        steer,
+        lateral,
+    )
     return states, steer, lateral
 
 
@@ -186,7 +259,9 @@ def _drive(car, tyres, speed, slip, slip_rate, friction, road, step, states, ste
     angle = 0.0
     for k in range(len(speed)):
         u, mu, pull = speed[k], friction[k], road[k]
-        wanted = _steering(car, tyres, u, mu, pull, slip[k], slip_rate[k], states[k, 0], states[k, 1])
+        wanted = _steering(
+            car, tyres, u, mu, pull, slip[k], slip_rate[k], states[k, 0], states[k, 1]
+        )
         moved = min(max(wanted - angle, -FASTEST_STEER * step), FASTEST_STEER * step)
         angle = min(max(angle + moved, -LARGEST_STEER), LARGEST_STEER)
         steer[k] = angle
@@ -194,9 +269,15 @@ def _drive(car, tyres, speed, slip, slip_rate, friction, road, step, states, ste
         if k + 1 == len(speed):
             break
         half = 0.5 * step
-        b1, r1, _ = rates(car, tyres, u, mu, pull, angle, states[k, 0] + half * b0, states[k, 1] + half * r0)
-        b2, r2, _ = rates(car, tyres, u, mu, pull, angle, states[k, 0] + half * b1, states[k, 1] + half * r1)
-        b3, r3, _ = rates(car, tyres, u, mu, pull, angle, states[k, 0] + step * b2, states[k, 1] + step * r2)
+        b1, r1, _ = rates(
+            car, tyres, u, mu, pull, angle, states[k, 0] + half * b0, states[k, 1] + half * r0
+        )
+        b2, r2, _ = rates(
+            car, tyres, u, mu, pull, angle, states[k, 0] + half * b1, states[k, 1] + half * r1
+        )
+        b3, r3, _ = rates(
+            car, tyres, u, mu, pull, angle, states[k, 0] + step * b2, states[k, 1] + step * r2
+        )
         states[k + 1, 0] = states[k, 0] + step / 6.0 * (b0 + 2.0 * b1 + 2.0 * b2 + b3)
         states[k + 1, 1] = states[k, 1] + step / 6.0 * (r0 + 2.0 * r1 + 2.0 * r2 + r3)
 
@@ -209,7 +290,11 @@ def rates(car, tyres, u, mu, pull, angle, sideslip, yaw_rate):  # type: ignore[n
     front = _axle(angle - sideslip - front_arm * turn, tyres[0], tyres[1], mu).force
     rear = _axle(rear_arm * turn - sideslip, tyres[2], tyres[3], mu).force
     acceleration = (front + rear) / mass
-    return (acceleration + pull) / u - yaw_rate, (front_arm * front - rear_arm * rear) / inertia, acceleration
+    return (
+        (acceleration + pull) / u - yaw_rate,
+        (front_arm * front - rear_arm * rear) / inertia,
+        acceleration,
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -218,11 +303,17 @@ def _steering(car, tyres, u, mu, pull, slip, slip_rate, sideslip, yaw_rate):  # 
     mass, inertia, front_arm, rear_arm = car
     own = rear_arm * yaw_rate / u - sideslip
     rear = _axle(own, tyres[2], tyres[3], mu).force
-    turn = (rear * (front_arm + rear_arm) / (mass * front_arm) + pull) / u + slip_rate + SLIP_GAIN * (slip - own)
+    turn = (
+        (rear * (front_arm + rear_arm) / (mass * front_arm) + pull) / u
+        + slip_rate
+        + SLIP_GAIN * (slip - own)
+    )
     bend = tyres[0] * (mu + 1.0)
     largest = FRONT_SHARE * tyres[1] * mu * math.sqrt(bend) / 2.0
     front = (inertia * TURN_GAIN * (turn - yaw_rate) + rear_arm * rear) / front_arm
     front = min(max(front, -largest), largest)
     stiffness = tyres[1] * mu  # front = stiffness α/(1 + α²/bend), the smaller of the two solutions
-    angle = 2.0 * front / (stiffness + math.sqrt(stiffness * stiffness - 4.0 * front * front / bend))
+    angle = (
+        2.0 * front / (stiffness + math.sqrt(stiffness * stiffness - 4.0 * front * front / bend))
+    )
     return angle + sideslip + front_arm * yaw_rate / u

@@ -13,7 +13,17 @@ from vehest.constants import FloatArray
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, new_figure
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.heavy_ekf.candidates import DATA_SHEET, DRAWN, FILTERS, ORACLE, REFINED, STATIC_MAP, WITH_STATE, ZERO, table_of
+from vehest_papers.heavy_ekf.candidates import (
+    DATA_SHEET,
+    DRAWN,
+    FILTERS,
+    ORACLE,
+    REFINED,
+    STATIC_MAP,
+    WITH_STATE,
+    ZERO,
+    table_of,
+)
 from vehest_papers.heavy_ekf.factorial import (
     LOST_DEGREES,
     MISMATCHES,
@@ -38,7 +48,12 @@ from vehest_papers.kit.reading import with_interval
 DATA = "SIMULATED, the paper's single track"
 LIMIT = 100.0  # %, where the colours end
 CLAIMED = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT))
-SHOWN = ((2.0, -0.2), (5.0, -0.2), (8.0, -0.2), (5.0, 0.0))  # slip and mismatch of the cells whose rows are shown
+SHOWN = (
+    (2.0, -0.2),
+    (5.0, -0.2),
+    (8.0, -0.2),
+    (5.0, 0.0),
+)  # slip and mismatch of the cells whose rows are shown
 ROWS = (ZERO, STATIC_MAP, DATA_SHEET, *FILTERS, ORACLE)
 Changes = dict[tuple[int, tuple[str, str]], Change]
 
@@ -63,12 +78,19 @@ def claims_of(own: Factorial, found: Changes) -> list[Claim]:
                 verdict = "reproduced" if change.percent < 0.0 else "not reproduced"
             name = f"{pair[0]} below {pair[1]}"
             data = f"simulated, twin, {slip:g}°, {100 * mismatch:+.0f} %"
-            why = {"undecided": "the corrected interval holds zero", "reproduced": "it lies below zero"}.get(verdict, "it lies above zero")
-            claims.append(Claim(name, f"{paper.GAINS[pair]:.0f} % below", words, data, verdict, why))
+            why = {
+                "undecided": "the corrected interval holds zero",
+                "reproduced": "it lies below zero",
+            }.get(verdict, "it lies above zero")
+            claims.append(
+                Claim(name, f"{paper.GAINS[pair]:.0f} % below", words, data, verdict, why)
+            )
     return claims
 
 
-def twin_blocks(own: Factorial) -> tuple[list[Block], list[Claim], dict[str, pd.DataFrame], list[Block]]:
+def twin_blocks(
+    own: Factorial,
+) -> tuple[list[Block], list[Claim], dict[str, pd.DataFrame], list[Block]]:
     """What stands in front, the claims, tables that are written alone, and the appendix."""
     cells = _flat(own.grid())
     found = changes(cells, PAIRS)
@@ -120,8 +142,14 @@ def _map_cells(cells: Sequence[Cell], found: Changes) -> pd.DataFrame:
 def _map(cells: Sequence[Cell], found: Changes, name: str, tuned_on: str) -> Figure:
     """Two panels: change of RATTE's RMSE(β) against RATT's and against LINT's over slip and mismatch."""
     shape = (len(MISMATCHES), len(SLIPS))
-    values = {pair: np.array([found[at, pair].percent for at in range(len(cells))]).reshape(shape) for pair in CLAIMED}
-    apart = {pair: np.array([found[at, pair].told_apart for at in range(len(cells))]).reshape(shape) for pair in CLAIMED}
+    values = {
+        pair: np.array([found[at, pair].percent for at in range(len(cells))]).reshape(shape)
+        for pair in CLAIMED
+    }
+    apart = {
+        pair: np.array([found[at, pair].told_apart for at in range(len(cells))]).reshape(shape)
+        for pair in CLAIMED
+    }
     figure = _drawn(values, apart)
     caption = (
         f"Change of RATTE's RMSE(β) against RATT (left) and LINT (right), {DATA}, {SEEDS} seeds a cell; dry, flat, without payload. "
@@ -133,7 +161,9 @@ def _map(cells: Sequence[Cell], found: Changes, name: str, tuned_on: str) -> Fig
     return Figure(name, caption, figure)
 
 
-def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str], Any]) -> MatplotlibFigure:
+def _drawn(
+    values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str], Any]
+) -> MatplotlibFigure:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
@@ -144,17 +174,34 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
         for axes, pair in zip(panels, CLAIMED, strict=True):
             for (row, column), value in np.ndenumerate(values[pair]):
                 colour = colours.to_rgba(float(np.clip(value, -LIMIT, LIMIT)))
-                box = Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8)
+                box = Rectangle(
+                    (column - 0.5, row - 0.5),
+                    1.0,
+                    1.0,
+                    facecolor=colour,
+                    edgecolor="white",
+                    linewidth=0.8,
+                )
                 if not apart[pair][row, column]:
                     box.set(hatch="////", edgecolor="#333333", linewidth=0.0)
                 axes.add_patch(box)
                 ink = "white" if abs(value) > 65.0 else "#111111"
-                axes.text(column, row, fixed(float(value), 0), ha="center", va="center", fontsize=6.5, color=ink)
+                axes.text(
+                    column,
+                    row,
+                    fixed(float(value), 0),
+                    ha="center",
+                    va="center",
+                    fontsize=6.5,
+                    color=ink,
+                )
             level = -paper.GAINS[pair]
             if values[pair].min() < level < values[pair].max():
                 lines = axes.contour(values[pair], levels=[level], colors="black", linewidths=1.4)
                 axes.clabel(lines, fmt=lambda at: f"{at:.0f} %", fontsize=6.5)
-            axes.set_title(f"{pair[0]} against {pair[1]}; paper −{paper.GAINS[pair]:.0f} %", loc="left")
+            axes.set_title(
+                f"{pair[0]} against {pair[1]}; paper −{paper.GAINS[pair]:.0f} %", loc="left"
+            )
             axes.set_xticks(range(len(SLIPS)), [f"{slip:g}" for slip in SLIPS])
             axes.set_xlabel("largest rear slip [deg]")
             axes.set_xlim(-0.5, len(SLIPS) - 0.5)
@@ -162,17 +209,31 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
             axes.grid(visible=False)
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
-        panels[0].set_yticks(range(len(MISMATCHES)), [f"{100 * mismatch:+.0f}" for mismatch in MISMATCHES])
+        panels[0].set_yticks(
+            range(len(MISMATCHES)), [f"{100 * mismatch:+.0f}" for mismatch in MISMATCHES]
+        )
         panels[0].set_ylabel("filters' stiffness [%]")
-        figure.colorbar(colours, ax=list(panels), label="change of RMSE(β) [%]", pad=0.02, aspect=25).outline.set_visible(False)
+        figure.colorbar(
+            colours, ax=list(panels), label="change of RMSE(β) [%]", pad=0.02, aspect=25
+        ).outline.set_visible(False)
     return figure
 
 
 def _counts(found: Changes, pair: tuple[str, str]) -> tuple[int, int, int]:
     """Cells in which the first is better, worse, and better by as much as in the paper; each by more than chance."""
     own = [change for (_, of), change in found.items() if of == pair]
-    better, worse = (sum(change.told_apart and sign * change.percent > 0.0 for change in own) for sign in (-1.0, 1.0))
-    return better, worse, sum(change.told_apart and change.percent <= -paper.GAINS.get(pair, math.inf) for change in own)
+    better, worse = (
+        sum(change.told_apart and sign * change.percent > 0.0 for change in own)
+        for sign in (-1.0, 1.0)
+    )
+    return (
+        better,
+        worse,
+        sum(
+            change.told_apart and change.percent <= -paper.GAINS.get(pair, math.inf)
+            for change in own
+        ),
+    )
 
 
 def _in_words(found: Changes) -> str:
@@ -198,7 +259,10 @@ def _rows(own: Factorial) -> Table:
             row[f"cell_{at}"] = with_interval(cell.rmse(name), *interval(cell, name), 2)
         rows.append(row)
     columns = {"candidate": Column("candidate")}
-    columns |= {f"cell_{at}": Column(f"{slip:g}°, {100 * mismatch:+.0f} % [deg]") for at, (slip, mismatch) in enumerate(SHOWN)}
+    columns |= {
+        f"cell_{at}": Column(f"{slip:g}°, {100 * mismatch:+.0f} % [deg]")
+        for at, (slip, mismatch) in enumerate(SHOWN)
+    }
     caption = (
         f"RMSE(β) with 95 % intervals over {SEEDS} seeds in four cells of the map, {DATA}. {ORACLE.capitalize()}: RATT with the plant's "
         "own curves; static map: fitted on the tuning drives; data sheet: wheelbase and centre of gravity; "
@@ -216,12 +280,22 @@ def _regions(own: Factorial) -> Table:
             for state in ("", WITH_STATE):
                 pairs = [(first + state, second + state) for first, second in CLAIMED]
                 found = changes(cells, pairs)
-                row: dict[str, object] = {"plant": _plant_name(plant), "state": "yes" if state else "no", "tuned": tuned_on}
+                row: dict[str, object] = {
+                    "plant": _plant_name(plant),
+                    "state": "yes" if state else "no",
+                    "tuned": tuned_on,
+                }
                 for pair, (_, title) in zip(pairs, CLAIMED, strict=True):
                     row[title] = "{} / {}".format(*_counts(found, pair))
-                for key, name in (("median", paper.RATTE + state), ("median_lint", paper.LINT + state), ("oracle", ORACLE)):
+                for key, name in (
+                    ("median", paper.RATTE + state),
+                    ("median_lint", paper.LINT + state),
+                    ("oracle", ORACLE),
+                ):
                     row[key] = _median(cells, name)
-                row["lost"] = 100.0 * float(np.mean([cell.lost[paper.RATTE + state] for cell in cells]))
+                row["lost"] = 100.0 * float(
+                    np.mean([cell.lost[paper.RATTE + state] for cell in cells])
+                )
                 rows.append(row)
     columns = {
         "plant": Column("plant and road"),
@@ -247,7 +321,13 @@ def _median(cells: Sequence[Cell], name: str) -> float:
 
 def _plant_name(plant: tuple[bool, bool, bool]) -> str:
     payload, wet, crossfall = plant
-    return ", ".join(["wet patches" if wet else "dry", "1° crossfall" if crossfall else "flat", *(["payload"] if payload else [])])
+    return ", ".join(
+        [
+            "wet patches" if wet else "dry",
+            "1° crossfall" if crossfall else "flat",
+            *(["payload"] if payload else []),
+        ]
+    )
 
 
 def _crossfall_in_words(own: Factorial) -> str:
@@ -257,17 +337,24 @@ def _crossfall_in_words(own: Factorial) -> str:
         cells = _flat(own.grid(plant))
         found = changes(cells, CLAIMED)
         better = [_counts(found, pair)[:2] for pair in CLAIMED]
-        moved.append(f"{_plant_name(plant)}: {better[0][0]} and {better[1][0]} (above in {better[0][1]} and {better[1][1]})")
+        moved.append(
+            f"{_plant_name(plant)}: {better[0][0]} and {better[1][0]} (above in {better[0][1]} and {better[1][1]})"
+        )
     parts = []
     for plant in ((False, False, True), (True, True, True)):
         cells = _flat(own.grid(plant))
-        medians = [_median(cells, name) for name in (paper.RATTE, f"{paper.RATTE}{WITH_STATE}", f"{paper.LINT}{WITH_STATE}")]
+        medians = [
+            _median(cells, name)
+            for name in (paper.RATTE, f"{paper.RATTE}{WITH_STATE}", f"{paper.LINT}{WITH_STATE}")
+        ]
         parts.append(
             f"{_plant_name(plant)}: RATTE {fixed(medians[0], 2)}°, with the state {fixed(medians[1], 2)}°, LINT with the state "
             f"{fixed(medians[2], 2)}°"
         )
     return (
-        f"Cells of {len(SLIPS) * len(MISMATCHES)} in which RATTE lies below RATT and below LINT on other roads: " + "; ".join(moved) + ". "
+        f"Cells of {len(SLIPS) * len(MISMATCHES)} in which RATTE lies below RATT and below LINT on other roads: "
+        + "; ".join(moved)
+        + ". "
         "One state for the pull of the crossfall does more than the curve of the tyre: medians of RMSE(β) over the cells, "
         + "; ".join(parts)
         + "."
@@ -277,7 +364,9 @@ def _crossfall_in_words(own: Factorial) -> str:
 def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
     levels = {name: tuned.levels for name, tuned in own.tuned[ONCE].items()}
     frame = absorbed(levels)
-    frame["interval"] = [with_interval(row["change"], row["low"], row["high"], 0) for row in frame.to_dict("records")]
+    frame["interval"] = [
+        with_interval(row["change"], row["low"], row["high"], 0) for row in frame.to_dict("records")
+    ]
     columns = {
         "mistake": Column("what is wrong"),
         paper.LINT: Column("LINT [deg]", decimals=3),
@@ -297,7 +386,9 @@ def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
     rows = frame.to_dict("records")
     usual = float(rows[0]["change"])  # of the row in which nothing is wrong
     absorbing = [
-        str(row["mistake"]) for row in rows[1:] if row["high"] < min(usual, 0.0) and max(abs(row["end_front"]), abs(row["end_rear"])) > 5.0
+        str(row["mistake"])
+        for row in rows[1:]
+        if row["high"] < min(usual, 0.0) and max(abs(row["end_front"]), abs(row["end_rear"])) > 5.0
     ]
     harmed = [str(row["mistake"]) for row in rows if row["low"] > 0.0]
     words = ""
@@ -309,7 +400,9 @@ def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
         )
     if harmed:
         words += "Adapting harms under: " + "; ".join(harmed) + "."
-    return Table("twin_absorbed", caption, frame, columns), "**What RATTE absorbs.** " + (words or "Neither gain nor harm is told apart.")
+    return Table("twin_absorbed", caption, frame, columns), "**What RATTE absorbs.** " + (
+        words or "Neither gain nor harm is told apart."
+    )
 
 
 def _plant_in_words(own: Factorial) -> str:
@@ -317,7 +410,9 @@ def _plant_in_words(own: Factorial) -> str:
     largest = max(cell.reached[2] for cell in own.cells)
     lifts = 9.80665 * TRACK / (2.0 * largest)
     noise = f"{math.degrees(NOISE['yaw_rate']):.2g}°/s, {NOISE['ay']:g} m/s², {math.degrees(NOISE['steer']):.2g}° and {NOISE['vx']:g} m/s"
-    reached = sorted({(cell.conditions.slip, round(cell.reached[0], 1)) for cell in _flat(own.grid())})
+    reached = sorted(
+        {(cell.conditions.slip, round(cell.reached[0], 1)) for cell in _flat(own.grid())}
+    )
     return (
         f"The plant is Equations 1, 2, 4 to 6 with Table 1's curves, by Runge and Kutta at 400 Hz; drives of {SECONDS:g} s at 10.5 to 28 "
         f"m/s, sampled at 20 Hz; white noise of {noise} on yaw rate, a_y, steering and speed, assumed. A driver holds the rear slip of "
@@ -333,7 +428,13 @@ def _plant_in_words(own: Factorial) -> str:
 
 
 def _tuning(own: Factorial) -> Table:
-    frame = pd.DataFrame([{"tuned": tuned_on, **row} for tuned_on, found in own.tuned.items() for row in table_of(found)])
+    frame = pd.DataFrame(
+        [
+            {"tuned": tuned_on, **row}
+            for tuned_on, found in own.tuned.items()
+            for row in table_of(found)
+        ]
+    )
     columns = {
         "tuned": Column("tuned on"),
         "filter": Column("filter"),

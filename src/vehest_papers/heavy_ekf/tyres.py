@@ -13,7 +13,13 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.tyre_fit import AxleMotion, TyreFit, axle_force, axle_motion, fit_motion
+from vehest.estimators.filtering.tyre_fit import (
+    AxleMotion,
+    TyreFit,
+    axle_force,
+    axle_motion,
+    fit_motion,
+)
 from vehest.report.document import Column, Figure, Table
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure, significant
@@ -33,7 +39,10 @@ QUANTITIES = {
     "tyre_c1_rear": ("c1_rear", "$c_{1R}$ [rad²]", 1.0),
 }
 """Quantity of an estimate -> parameter of a curve, label of its axis, scale of it."""
-LINEAR_LABELS = {"cornering_stiffness_front": "$C_F$ [kN/rad]", "cornering_stiffness_rear": "$C_R$ [kN/rad]"}
+LINEAR_LABELS = {
+    "cornering_stiffness_front": "$C_F$ [kN/rad]",
+    "cornering_stiffness_rear": "$C_R$ [kN/rad]",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +55,28 @@ class OwnCurves:
     offsets: Mapping[str, FloatArray]
 
     @classmethod
-    def of(cls, drives: Sequence[Recording], car: SingleTrackParameters, minimum_speed: float) -> OwnCurves:
+    def of(
+        cls, drives: Sequence[Recording], car: SingleTrackParameters, minimum_speed: float
+    ) -> OwnCurves:
         """Both fits to drives on the same tyres, which hold their forces; each drive's offsets of slip are taken off before."""
         motions, offsets = [], {}
         for number, drive in enumerate(drives):
             motion = axle_motion([drive], car, minimum_speed, measured_forces=True)
-            offsets[drive.id] = np.array([_no_force(slip, force) for slip, force in zip(motion.slip, motion.force, strict=True)])
-            motions.append(motion._replace(slip=motion.slip - offsets[drive.id][:, None], block=motion.block + 10_000 * number))
-        together = AxleMotion(*(np.concatenate(parts, axis=-1) for parts in zip(*motions, strict=True)))
+            offsets[drive.id] = np.array(
+                [
+                    _no_force(slip, force)
+                    for slip, force in zip(motion.slip, motion.force, strict=True)
+                ]
+            )
+            motions.append(
+                motion._replace(
+                    slip=motion.slip - offsets[drive.id][:, None],
+                    block=motion.block + 10_000 * number,
+                )
+            )
+        together = AxleMotion(
+            *(np.concatenate(parts, axis=-1) for parts in zip(*motions, strict=True))
+        )
         return cls(fit_motion(together, "rational"), fit_motion(together, "linear"), offsets)
 
     def value(self, quantity: str, name: str) -> float:
@@ -82,12 +105,33 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
             reach = float(np.abs(slip).max())
             grid = np.linspace(-reach, reach, 201)
             dots = {"s": 2, "color": "#b5b9be", "linewidths": 0, "rasterized": True}
-            axes.scatter(np.degrees(slip[chosen]), 1e-3 * force[chosen], label="from accelerations", **dots)
+            axes.scatter(
+                np.degrees(slip[chosen]), 1e-3 * force[chosen], label="from accelerations", **dots
+            )
             low, high = _band(fit, axle, grid, row)
-            axes.fill_between(np.degrees(grid), 1e-3 * low, 1e-3 * high, color="#4aa5e0", alpha=0.4, linewidth=0, label="95 %")
-            axes.plot(np.degrees(grid), 1e-3 * fit.curve(axle, grid), color="#0b4f9c", label="fitted, Eq. 4")
+            axes.fill_between(
+                np.degrees(grid),
+                1e-3 * low,
+                1e-3 * high,
+                color="#4aa5e0",
+                alpha=0.4,
+                linewidth=0,
+                label="95 %",
+            )
+            axes.plot(
+                np.degrees(grid),
+                1e-3 * fit.curve(axle, grid),
+                color="#0b4f9c",
+                label="fitted, Eq. 4",
+            )
             if own is not None:
-                axes.plot(np.degrees(grid), 1e-3 * own.rational.curve(axle, grid), color="#b8480b", linestyle="dashed", label="plant's own")
+                axes.plot(
+                    np.degrees(grid),
+                    1e-3 * own.rational.curve(axle, grid),
+                    color="#b8480b",
+                    linestyle="dashed",
+                    label="plant's own",
+                )
             axes.set_title(f"{axle} axle", loc="left")
             axes.set_xlabel(f"slip angle $\\alpha_{'F' if row == 0 else 'R'}$ [deg]")
         panels[0].set_ylabel("lateral force [kN]")
@@ -106,28 +150,44 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
     return Figure(name, caption, figure)
 
 
-def _band(fit: TyreFit, axle: Literal["front", "rear"], grid: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
+def _band(
+    fit: TyreFit, axle: Literal["front", "rear"], grid: FloatArray, row: int
+) -> tuple[FloatArray, FloatArray]:
     """Curve ± 1.96 standard deviations to first order in the parameters."""
     values = getattr(fit, axle)
     curve = fit.curve(axle, grid)
     nudged = values * (1.0 + 1e-4 * np.eye(len(values)))
-    slopes = np.stack([(axle_force(fit.kind, own, grid) - curve) / (1e-4 * value) for own, value in zip(nudged, values, strict=True)])
-    half = 1.96 * np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", slopes, fit.covariance[row], slopes), 0.0))
+    slopes = np.stack(
+        [
+            (axle_force(fit.kind, own, grid) - curve) / (1e-4 * value)
+            for own, value in zip(nudged, values, strict=True)
+        ]
+    )
+    half = 1.96 * np.sqrt(
+        np.maximum(np.einsum("ig,ij,jg->g", slopes, fit.covariance[row], slopes), 0.0)
+    )
     return curve - half, curve + half
 
 
 def table_1(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Table:
     """c₁ and c₂ of both axles: paper, fitted with 95 % intervals, and the plant's own."""
     rows = []
-    for axle, values, interval in (("front", fit.front, fit.interval[0]), ("rear", fit.rear, fit.interval[1])):
+    for axle, values, interval in (
+        ("front", fit.front, fit.interval[0]),
+        ("rear", fit.rear, fit.interval[1]),
+    ):
         for position, (parameter, unit) in enumerate((("c1", "rad²"), ("c2", "N/rad"))):
             row: dict[str, object] = {"parameter": f"{parameter}, {axle}", "unit": unit}
             if own is not None:
                 row["paper"] = paper.CURVES[f"{parameter}_{axle}"]
             row |= {"fitted": float(values[position]), "interval": float(interval[position])}
             if own is not None:
-                row["own"] = float((own.rational.front if axle == "front" else own.rational.rear)[position])
-                row["own_interval"] = float(own.rational.interval[0 if axle == "front" else 1][position])
+                row["own"] = float(
+                    (own.rational.front if axle == "front" else own.rational.rear)[position]
+                )
+                row["own_interval"] = float(
+                    own.rational.interval[0 if axle == "front" else 1][position]
+                )
             rows.append(row)
     columns = {
         "parameter": Column("parameter"),
@@ -140,7 +200,9 @@ def table_1(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Table:
     }
     frame = pd.DataFrame(rows)
     caption = f"Parameters of the rational tyre at friction 1 (Table 1 of the paper), ours fitted to the training drives, {data}."
-    return Table(name, caption, frame, {key: column for key, column in columns.items() if key in frame})
+    return Table(
+        name, caption, frame, {key: column for key, column in columns.items() if key in frame}
+    )
 
 
 def parameters_figure(
@@ -162,12 +224,23 @@ def parameters_figure(
             for tyres, estimate in estimates.items():
                 colour = TYRE_COLOURS.get(tyres, "#0b4f9c")
                 title = TYRES.get(tyres, tyres)
-                axes.plot(*decimated(drives[tyres].time, scale * estimate[quantity], POINTS), color=colour, linewidth=1.0, label=title)
+                axes.plot(
+                    *decimated(drives[tyres].time, scale * estimate[quantity], POINTS),
+                    color=colour,
+                    linewidth=1.0,
+                    label=title,
+                )
                 values.append(scale * estimate[quantity])
                 if tyres in own:
                     truth = scale * own[tyres].value(quantity, filter_name)
                     if "c1" not in quantity or truth < 3.0 * float(np.max(values[-1])):
-                        axes.axhline(truth, color=colour, linewidth=0.9, linestyle="dashed", label=f"plant's own, {title}")
+                        axes.axhline(
+                            truth,
+                            color=colour,
+                            linewidth=0.9,
+                            linestyle="dashed",
+                            label=f"plant's own, {title}",
+                        )
             axes.set_ylabel(LINEAR_LABELS[quantity] if linear else label)
             axes.margins(x=0.0)
         for axes in panels[-1]:
@@ -185,7 +258,10 @@ def convergence_time(time: FloatArray, values: FloatArray, target: float) -> flo
 
 
 def convergence_table(
-    drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]], own: Mapping[str, OwnCurves], names: Sequence[str]
+    drives: Mapping[str, Recording],
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    own: Mapping[str, OwnCurves],
+    names: Sequence[str],
 ) -> Table:
     """Start, end and the plant's own value of every estimated parameter, and from when on it stays near."""
     rows = []
@@ -202,7 +278,9 @@ def convergence_table(
                     {
                         "test": test.replace("_", ", "),
                         "filter": name,
-                        "parameter": parameter.replace("c2", "C") if name == paper.LINT else parameter,
+                        "parameter": parameter.replace("c2", "C")
+                        if name == paper.LINT
+                        else parameter,
                         "start": float(values[0]),
                         "end": float(np.mean(values[-round(20 * drive.rate_hz) :])),
                         "own": target,

@@ -31,32 +31,62 @@ LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns 
 def table_2(car: SingleTrackParameters) -> Table:
     """Vehicle parameters: the paper's table is not legible."""
     rows = [
-        ("mass M", "kg", car.mass, "the axle curves' largest forces, 39.0 + 38.6 kN, taken as the weight"),
-        ("front semi-wheelbase a_F", "m", car.cg_to_front_axle, "share of those forces; wheelbase 3.5 m, for the eigenvalue ratio"),
+        (
+            "mass M",
+            "kg",
+            car.mass,
+            "the axle curves' largest forces, 39.0 + 38.6 kN, taken as the weight",
+        ),
+        (
+            "front semi-wheelbase a_F",
+            "m",
+            car.cg_to_front_axle,
+            "share of those forces; wheelbase 3.5 m, for the eigenvalue ratio",
+        ),
         ("rear semi-wheelbase a_R", "m", car.cg_to_rear_axle, "likewise"),
         ("yaw inertia J", "kg m²", car.yaw_inertia, "M a_F a_R, for the eigenvalue ratio"),
         ("tracks t_F, t_R", "m", 2.08, "assumed"),
         ("height of the centre of gravity", "m", 0.85, "assumed: slides before it rolls over"),
     ]
-    frame = pd.DataFrame([{"parameter": a, "unit": b, "value": float(c), "from": d} for a, b, c, d in rows])
+    frame = pd.DataFrame(
+        [{"parameter": a, "unit": b, "value": float(c), "from": d} for a, b, c, d in rows]
+    )
     columns = {
         "parameter": Column("parameter"),
         "unit": Column("unit"),
         "value": Column("value", each=True, digits=5),
         "from": Column("from"),
     }
-    return Table("table_2", "Vehicle parameters (Table 2 of the paper, whose values are not legible): all assumed.", frame, columns)
+    return Table(
+        "table_2",
+        "Vehicle parameters (Table 2 of the paper, whose values are not legible): all assumed.",
+        frame,
+        columns,
+    )
 
 
 def eigenvalues_table(car: SingleTrackParameters) -> Table:
     """Eigenvalues of the linear single track with Table 1's stiffnesses, and the ratio of their sizes."""
-    stiff = replace(car, cornering_stiffness_front=paper.CURVES["c2_front"], cornering_stiffness_rear=paper.CURVES["c2_rear"])
+    stiff = replace(
+        car,
+        cornering_stiffness_front=paper.CURVES["c2_front"],
+        cornering_stiffness_rear=paper.CURVES["c2_rear"],
+    )
     rows = []
-    for speed, ratio, pair in zip(SPEEDS, ratios(stiff, np.array(SPEEDS)), eigenvalues(stiff, np.array(SPEEDS)), strict=True):
+    for speed, ratio, pair in zip(
+        SPEEDS, ratios(stiff, np.array(SPEEDS)), eigenvalues(stiff, np.array(SPEEDS)), strict=True
+    ):
         shown = " and ".join(
-            f"{fixed(float(one.real), 1)}{f' ± {fixed(abs(float(one.imag)), 1)}i' if abs(one.imag) > 1e-9 else ''}" for one in pair
+            f"{fixed(float(one.real), 1)}{f' ± {fixed(abs(float(one.imag)), 1)}i' if abs(one.imag) > 1e-9 else ''}"
+            for one in pair
         )
-        rows.append({"speed": speed, "eigenvalues": shown if abs(pair[0].imag) <= 1e-9 else shown.split(" and ")[0], "ratio": float(ratio)})
+        rows.append(
+            {
+                "speed": speed,
+                "eigenvalues": shown if abs(pair[0].imag) <= 1e-9 else shown.split(" and ")[0],
+                "ratio": float(ratio),
+            }
+        )
     columns = {
         "speed": Column("u [m/s]", decimals=0),
         "eigenvalues": Column("eigenvalues [1/s]"),
@@ -69,7 +99,9 @@ def eigenvalues_table(car: SingleTrackParameters) -> Table:
     return Table("eigenvalues", caption, pd.DataFrame(rows), columns)
 
 
-def eigenvalues(car: SingleTrackParameters, speed: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.complex128]]:
+def eigenvalues(
+    car: SingleTrackParameters, speed: FloatArray
+) -> np.ndarray[tuple[int, int], np.dtype[np.complex128]]:
     """Both eigenvalues of (β, r) at each speed, (K, 2) [1/s]."""
     return np.asarray(np.linalg.eigvals(lateral_model(car, speed).A), dtype=np.complex128)
 
@@ -87,7 +119,9 @@ def tracks_of(drive: Recording) -> tuple[float, float]:
     found = []
     for left, right in (("fl", "fr"), ("rl", "rr")):
         scale = np.cos(drive["steer"][moving]) if left == "fl" else 1.0
-        difference = RADIUS * scale * (drive[f"wheel_speed_{right}"] - drive[f"wheel_speed_{left}"])[moving]
+        difference = (
+            RADIUS * scale * (drive[f"wheel_speed_{right}"] - drive[f"wheel_speed_{left}"])[moving]
+        )
         found.append(float(difference @ turn / (turn @ turn)))
     return found[0], found[1]
 
@@ -96,24 +130,45 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
     """Eqs. 61 to 64 on the AV-21's wheel speeds: tracks from the training range, then the test ranges."""
     tracks = np.mean([tracks_of(drive) for drive in recordings_of(part, part.split.train)], axis=0)
     turning = np.where(tracks > LOCKED, tracks, 0.0)
-    wheels = SpeedFromWheels(wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1]))
+    wheels = SpeedFromWheels(
+        wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1])
+    )
     rows, claims = [], []
     for test, spans in part.split.tests.items():
         parts = [drive for drive in recordings_of(part, spans) if (drive["vx_ref"] > SLOWEST).any()]
         sums = [block_sums(drive, wheels) for drive in parts]
-        raw, corrected, raw_spread, spread, sizes = (np.concatenate(values) for values in zip(*sums, strict=True))
+        raw, corrected, raw_spread, spread, sizes = (
+            np.concatenate(values) for values in zip(*sums, strict=True)
+        )
         means, spreads = (
-            difference_of_blocks(second[None], first[None], sizes).root for first, second in ((raw, corrected), (raw_spread, spread))
+            difference_of_blocks(second[None], first[None], sizes).root
+            for first, second in ((raw, corrected), (raw_spread, spread))
         )
         row: dict[str, object] = {"test": test.replace("_", " "), "blocks": len(sizes)}
-        for name, before, after, own in (("spread", raw_spread, spread, spreads), ("mean", raw, corrected, means)):
-            row[f"{name}_raw"], row[name] = (float(np.sqrt(values.sum() / sizes.sum())) for values in (before, after))
+        for name, before, after, own in (
+            ("spread", raw_spread, spread, spreads),
+            ("mean", raw, corrected, means),
+        ):
+            row[f"{name}_raw"], row[name] = (
+                float(np.sqrt(values.sum() / sizes.sum())) for values in (before, after)
+            )
             row[f"{name}_change"] = with_interval(own.value, own.low, own.high, 3)
         rows.append(row)
         verdict = verdict_below(spreads.low, spreads.high)
-        why = "interval of the change" if turning.all() else "interval of the change; one axle alone"
+        why = (
+            "interval of the change" if turning.all() else "interval of the change; one axle alone"
+        )
         words = f"{fixed(row['spread_raw'], 3)} to {fixed(row['spread'], 3)} m/s; change {row['spread_change']}"  # type: ignore[arg-type]
-        claims.append(Claim("Eqs. 61 to 64 bring wheels together", "Figure 5", words, f"real, AV-21, {row['test']}", verdict, why))
+        claims.append(
+            Claim(
+                "Eqs. 61 to 64 bring wheels together",
+                "Figure 5",
+                words,
+                f"real, AV-21, {row['test']}",
+                verdict,
+                why,
+            )
+        )
     columns = {
         "test": Column("range"),
         "blocks": Column("blocks of 10 s", decimals=0),
@@ -138,11 +193,15 @@ def _locked_in_words(tracks: FloatArray) -> str:
     axles = zip(("front", "rear"), ("61, 62", "63, 64"), tracks, strict=True)
     locked = [f"{name} (Eqs. {which})" for name, which, track in axles if track <= LOCKED]
     return (
-        f"The wheels of the {' and '.join(locked)} axle turn alike, as with a locked differential: it is left as it is. " if locked else ""
+        f"The wheels of the {' and '.join(locked)} axle turn alike, as with a locked differential: it is left as it is. "
+        if locked
+        else ""
     )
 
 
-def block_sums(drive: Recording, wheels: SpeedFromWheels) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def block_sums(
+    drive: Recording, wheels: SpeedFromWheels
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Over blocks of 10 s: squared error of the wheels' mean as measured and corrected, their variance likewise, and samples."""
     moving = (drive["vx_ref"] > SLOWEST).astype(np.float64)
     raw = wheels.wheel_radius * drive.stack([f"wheel_speed_{wheel}" for wheel in WHEELS]).T

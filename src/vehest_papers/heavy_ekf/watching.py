@@ -45,16 +45,23 @@ def observability_of(own: RationalFilter, drive: Recording, minimum_speed: float
     )
 
 
-def observability_blocks(filters: Mapping[str, Filter], drive: Recording, minimum_speed: float, data: str) -> list[Block]:
+def observability_blocks(
+    filters: Mapping[str, Filter], drive: Recording, minimum_speed: float, data: str
+) -> list[Block]:
     """Smallest singular value along a drive, a line a filter, with the lateral acceleration; and in words."""
-    found = {name: observability_of(own.fitted, drive, minimum_speed).smallest for name, own in filters.items()}
+    found = {
+        name: observability_of(own.fitted, drive, minimum_speed).smallest
+        for name, own in filters.items()
+    }
     cornering = corners(drive)
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         for name, values in found.items():
             time = drive.time[: len(values)]
             shown = np.maximum(values, 1e-6)
-            top.semilogy(*decimated(time, shown, POINTS), color=LINES[name].colour, linewidth=0.8, label=name)
+            top.semilogy(
+                *decimated(time, shown, POINTS), color=LINES[name].colour, linewidth=0.8, label=name
+            )
         top.axhline(1.0, color="#888888", linewidth=0.7)
         top.margins(x=0.0)
         top.set_ylabel("smallest singular value")
@@ -72,20 +79,32 @@ def observability_blocks(filters: Mapping[str, Filter], drive: Recording, minimu
     sentences = []
     for name, values in found.items():
         turning = cornering[: len(values)]
-        middle = [float(np.median(values[where])) if where.any() else float("nan") for where in (turning, ~turning)]
+        middle = [
+            float(np.median(values[where])) if where.any() else float("nan")
+            for where in (turning, ~turning)
+        ]
         share = 100.0 * float(np.mean(values >= 1.0))
         sentences.append(
             f"{name}: median {middle[0]:.2g} while cornering (|a_y| above {CORNERING:g} m/s²) and {middle[1]:.2g} otherwise; above one for "
             f"{fixed(share, 0)} % of the time"
         )
-    return [Figure("observability", caption, figure), "Smallest singular value. " + ". ".join(sentences) + "."]
+    return [
+        Figure("observability", caption, figure),
+        "Smallest singular value. " + ". ".join(sentences) + ".",
+    ]
 
 
 def faults(wheels: SpeedFromWheels) -> dict[str, Callable[[Recording], Recording]]:
     """What is done to a drive: name -> drive as it would be recorded."""
 
     def changed(**changes: Callable[[FloatArray], FloatArray]) -> Callable[[Recording], Recording]:
-        return lambda drive: replace(drive, channels={**drive.channels, **{name: change(drive[name]) for name, change in changes.items()}})
+        return lambda drive: replace(
+            drive,
+            channels={
+                **drive.channels,
+                **{name: change(drive[name]) for name, change in changes.items()},
+            },
+        )
 
     def dropout(drive: Recording) -> Recording:
         silent = np.arange(len(drive)) % round(40 * drive.rate_hz) < round(4 * drive.rate_hz)
@@ -111,18 +130,37 @@ def faults(wheels: SpeedFromWheels) -> dict[str, Callable[[Recording], Recording
     def standing(drive: Recording) -> Recording:
         middle = slice(len(drive) // 2, len(drive) // 2 + round(30 * drive.rate_hz))
         still = {name: samples.copy() for name, samples in drive.channels.items()}
-        for name in ("vx", "vx_ref", "vy_ref", "yaw_rate", "yaw_rate_ref", "ay", "ax", "sideslip_ref"):
+        for name in (
+            "vx",
+            "vx_ref",
+            "vy_ref",
+            "yaw_rate",
+            "yaw_rate_ref",
+            "ay",
+            "ax",
+            "sideslip_ref",
+        ):
             if name in still:
-                still[name][middle] -= still[name][middle] if name.endswith("_ref") or name == "vx" else still[name][middle].mean()
+                still[name][middle] -= (
+                    still[name][middle]
+                    if name.endswith("_ref") or name == "vx"
+                    else still[name][middle].mean()
+                )
         return replace(drive, channels=still)
 
     return {
         "nothing": lambda drive: drive,
-        "a wheel drops out, speed from the mean of the four": lambda drive: mean_of_wheels(dropout(drive)),
-        "a wheel drops out, speed from those that are plausible": lambda drive: wheels(dropout(drive)),
+        "a wheel drops out, speed from the mean of the four": lambda drive: mean_of_wheels(
+            dropout(drive)
+        ),
+        "a wheel drops out, speed from those that are plausible": lambda drive: wheels(
+            dropout(drive)
+        ),
         "steering 5° off": changed(steer=lambda samples: samples + np.radians(5.0)),
         "yaw rate of the other sign": changed(yaw_rate=np.negative),
-        "lateral acceleration saturated at 2 m/s²": changed(ay=lambda samples: np.clip(samples, -2.0, 2.0)),
+        "lateral acceleration saturated at 2 m/s²": changed(
+            ay=lambda samples: np.clip(samples, -2.0, 2.0)
+        ),
         "yaw rate and lateral acceleration missing for 10 s": with_gap,
         "30 s at a standstill, from one sample to the next": standing,
         "the drive backwards": backwards,
@@ -133,17 +171,28 @@ def monitor(nis: FloatArray, dof: FloatArray, rate_hz: float) -> FloatArray:
     """Mean of nis over measured numbers in windows of 10 s that follow one another, NaN where nothing was measured."""
     length = round(MONITOR_SECONDS * rate_hz)
     count = len(nis) // length
-    total, number = (values[: count * length].reshape(count, length).sum(1) for values in (nis, dof))
+    total, number = (
+        values[: count * length].reshape(count, length).sum(1) for values in (nis, dof)
+    )
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
 def bad_input_table(
-    filters: Mapping[str, Filter], drive: Recording, sound: list[Recording], wheels: SpeedFromWheels, minimum_speed: float, data: str
+    filters: Mapping[str, Filter],
+    drive: Recording,
+    sound: list[Recording],
+    wheels: SpeedFromWheels,
+    minimum_speed: float,
+    data: str,
 ) -> list[Block]:
     """Effect of each fault on each filter, and which check detects it."""
     limits = {}
     for name, own in filters.items():
-        means = [monitor(estimate["nis"], estimate["nis_dof"], other.rate_hz) for other in sound for estimate in [own.of(other)]]
+        means = [
+            monitor(estimate["nis"], estimate["nis_dof"], other.rate_hz)
+            for other in sound
+            for estimate in [own.of(other)]
+        ]
         limits[name] = MARGIN * float(np.nanmax(np.concatenate(means)))
     clean = {(finding.check, finding.channel) for finding in checks_of_recording(drive)}
     rows, silent = [], []
@@ -153,25 +202,36 @@ def bad_input_table(
         found = [
             f"{finding.check}: {finding.channel}"
             for finding in checks_of_recording(damaged)
-            if (finding.level != "note" or finding.check in ("nan", "reverse")) and (finding.check, finding.channel) not in clean
+            if (finding.level != "note" or finding.check in ("nan", "reverse"))
+            and (finding.check, finding.channel) not in clean
         ]
-        row: dict[str, object] = {"fault": fault, "check": "; ".join(dict.fromkeys(found)) or MISSING}
+        row: dict[str, object] = {
+            "fault": fault,
+            "check": "; ".join(dict.fromkeys(found)) or MISSING,
+        }
         alarmed = False
         for name, own in filters.items():
             estimate = own.of(damaged)
             error = np.degrees(estimate["sideslip"] - drive["sideslip_ref"])[scored]
-            over = float(np.mean(monitor(estimate["nis"], estimate["nis_dof"], drive.rate_hz) > limits[name]))
+            over = float(
+                np.mean(monitor(estimate["nis"], estimate["nis_dof"], drive.rate_hz) > limits[name])
+            )
             row[f"rmse_{name}"] = float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
             row[f"over_{name}"] = 100.0 * over
             alarmed |= over > 0.0
-            row["finite"] = bool(row.get("finite", True)) and all(np.isfinite(values).all() for values in estimate.channels.values())
+            row["finite"] = bool(row.get("finite", True)) and all(
+                np.isfinite(values).all() for values in estimate.channels.values()
+            )
         row["finite"] = "yes" if row["finite"] else "NO"
         if fault != "nothing" and not alarmed and not found:
             silent.append(fault)
         rows.append(row)
     columns = {"fault": Column("what is wrong"), "finite": Column("estimates finite")}
     columns |= {f"rmse_{name}": Column(f"RMSE(β) {name} [deg]", decimals=2) for name in filters}
-    columns |= {f"over_{name}": Column(f"monitor {name}: windows beyond the limit [%]", decimals=0) for name in filters}
+    columns |= {
+        f"over_{name}": Column(f"monitor {name}: windows beyond the limit [%]", decimals=0)
+        for name in filters
+    }
     columns["check"] = Column("`vehest data check` says, beyond what it says of the drive itself")
     listed_limits = listed([f"{name} {fixed(value, 1)}" for name, value in limits.items()])
     caption = (
@@ -180,5 +240,7 @@ def bad_input_table(
         f"validation drives: {listed_limits}. RMSE(β) against the true reference at {minimum_speed:g} m/s and more, forwards. Backwards, "
         "at a standstill and below that speed the filters take the car to roll without slip and measure nothing."
     )
-    words = "Neither the monitor nor the check detects: " + "; ".join(silent) + "." if silent else ""
+    words = (
+        "Neither the monitor nor the check detects: " + "; ".join(silent) + "." if silent else ""
+    )
     return [Table("bad_input", caption, pd.DataFrame(rows), columns), *([words] if words else [])]

@@ -15,7 +15,14 @@ from vehest_papers.kit.reading import with_interval
 
 Verdict = Literal["reproduced", "not reproduced", "undecided", "not testable on this data"]
 
-_COLUMNS = {"claim": "claim", "paper": "paper", "ours": "ours, with 95 % interval", "data": "data", "verdict": "verdict", "why": "why"}
+_COLUMNS = {
+    "claim": "claim",
+    "paper": "paper",
+    "ours": "ours, with 95 % interval",
+    "data": "data",
+    "verdict": "verdict",
+    "why": "why",
+}
 
 
 @dataclass(frozen=True)
@@ -34,18 +41,26 @@ def claims_table(claims: Sequence[Claim], note: str = "") -> Table:
     """Table ``claims``: claim, paper, ours with interval, data, verdict."""
     rows = pd.DataFrame([asdict(own) for own in claims], columns=list(_COLUMNS))
     number = {verdict: sum(own.verdict == verdict for own in claims) for verdict in _VERDICTS}
-    counts = ", ".join(f"{n} {verdict}" for verdict, n in number.items() if n) or "nothing to compare"
+    counts = (
+        ", ".join(f"{n} {verdict}" for verdict, n in number.items() if n) or "nothing to compare"
+    )
     caption = f"What the paper claims and what came out here: {counts}. {_RULE} {note}".strip()
     return Table("claims", caption, rows, {name: Column(title) for name, title in _COLUMNS.items()})
 
 
-def order_claim(ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Name, str], paper: str, data: str) -> Claim:
+def order_claim(
+    ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Name, str], paper: str, data: str
+) -> Claim:
     """The claim that ``lower`` has the lower RMSE(β) of two estimators, by the corrected interval of their difference."""
     claim = f"{titles[lower]} below {titles[higher]}"
     own = ranking.pairs.get((lower, higher))
     if own is None:
         missing = [titles[name] for name in (lower, higher) if name not in ranking.rmse]
-        why = f"no finite error of {' and '.join(missing)}" if missing else f"the test has {ranking.n_blocks} blocks only"
+        why = (
+            f"no finite error of {' and '.join(missing)}"
+            if missing
+            else f"the test has {ranking.n_blocks} blocks only"
+        )
         return Claim(claim, paper, "–", data, "not testable on this data", why)
     difference = with_interval(own.difference, own.low, own.high, 3, "°")
     figures = f"{fixed(ranking.rmse[lower], 3)}° and {fixed(ranking.rmse[higher], 3)}°; difference {difference}"
@@ -53,16 +68,27 @@ def order_claim(ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Nam
     return Claim(claim, paper, figures, data, verdict, why)
 
 
-def bound_claim(ranking: Ranking, name: Name, title: str, limit: float, paper: str, data: str) -> Claim:
+def bound_claim(
+    ranking: Ranking, name: Name, title: str, limit: float, paper: str, data: str
+) -> Claim:
     """The claim that an estimator's RMSE(β) lies below a limit [deg], by the 95 % interval of its RMSE over blocks and seeds."""
     claim = f"{title} below {fixed(limit, 2)}°"
     if name not in ranking.intervals:
-        return Claim(claim, paper, "–", data, "not testable on this data", f"the test has {ranking.n_blocks} blocks only")
+        return Claim(
+            claim,
+            paper,
+            "–",
+            data,
+            "not testable on this data",
+            f"the test has {ranking.n_blocks} blocks only",
+        )
     low, high = ranking.intervals[name]
     verdict = verdict_below(low, high, limit)
     why = {"reproduced": "the interval lies below", "not reproduced": "the interval lies above"}
     words = why.get(verdict, "the interval holds the limit")
-    return Claim(claim, paper, with_interval(ranking.rmse[name], low, high, 3, "°"), data, verdict, words)
+    return Claim(
+        claim, paper, with_interval(ranking.rmse[name], low, high, 3, "°"), data, verdict, words
+    )
 
 
 def verdict_below(low: float, high: float, limit: float = 0.0) -> Verdict:
@@ -77,7 +103,12 @@ def verdict_of_all(verdicts: Sequence[Verdict]) -> Verdict:
     return "reproduced" if set(verdicts) == {"reproduced"} else "undecided"
 
 
-_VERDICTS: tuple[Verdict, ...] = ("reproduced", "not reproduced", "undecided", "not testable on this data")
+_VERDICTS: tuple[Verdict, ...] = (
+    "reproduced",
+    "not reproduced",
+    "undecided",
+    "not testable on this data",
+)
 _OF_ORDER: dict[str, tuple[Verdict, str]] = {
     "lower": ("reproduced", "the corrected interval of the difference lies below zero"),
     "higher": ("not reproduced", "the corrected interval of the difference lies above zero"),

@@ -13,4 +13,11 @@ def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None
     for own in axes:
         for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
+    figure.legend(
+        list(entries.values()),
+        list(entries),
+        loc="outside upper left",
+        ncols=columns,
+        columnspacing=1.3,
+        handlelength=2.6,
+    )

@@ -15,7 +15,10 @@ from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 def kinds_of_parts(artefacts: StudyArtefacts, names: Iterable[str]) -> str:
     """``**Title: REAL data**`` of some parts."""
-    return "; ".join(f"**{artefacts.titles[name]}: {words_of_kinds(artefacts.parts[name]).upper()} data**" for name in names)
+    return "; ".join(
+        f"**{artefacts.titles[name]}: {words_of_kinds(artefacts.parts[name]).upper()} data**"
+        for name in names
+    )
 
 
 def absent_parts(artefacts: StudyArtefacts) -> str:
@@ -34,7 +37,9 @@ def scoring(protocol: Protocol, reading: str = "") -> str:
 
 def warnings_in_words(parts: Mapping[str, PartArtefacts]) -> str:
     """Warnings on parts, by title; empty where there is none."""
-    lines = dict.fromkeys(f"{title}: {line}" for title, part in parts.items() for line in warnings_of(part))
+    lines = dict.fromkeys(
+        f"{title}: {line}" for title, part in parts.items() for line in warnings_of(part)
+    )
     return bullets("**Mind:**", lines) if lines else ""
 
 
@@ -53,7 +58,9 @@ def how_it_was_made(lines: Sequence[str]) -> str:
     return bullets("## Appendix: how it was made", lines)
 
 
-def ranges_table(artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]) -> Table:
+def ranges_table(
+    artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]
+) -> Table:
     """Ranges of training, validation and tests, a row a part; ``tests``: test set -> what it is called, where that is another name."""
     rows = [
         {
@@ -61,9 +68,23 @@ def ranges_table(artefacts: StudyArtefacts, name: str, caption: str, tests: Mapp
             "kind": words_of_kinds(part),
             "train": spans_in_words(part.split.train),
             "validation": spans_in_words(part.split.validation),
-            "tests": "; ".join(f"{tests.get(test, test)}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()),
+            "tests": "; ".join(
+                f"{tests.get(test, test)}: {spans_in_words(spans)}"
+                for test, spans in part.split.tests.items()
+            ),
         }
         for key, part in artefacts.parts.items()
     ]
-    titles = {"part": "part", "kind": "data", "train": "training", "validation": "validation", "tests": "tests"}
-    return Table(name, caption, pd.DataFrame(rows), {column: Column(title) for column, title in titles.items()})
+    titles = {
+        "part": "part",
+        "kind": "data",
+        "train": "training",
+        "validation": "validation",
+        "tests": "tests",
+    }
+    return Table(
+        name,
+        caption,
+        pd.DataFrame(rows),
+        {column: Column(title) for column, title in titles.items()},
+    )

@@ -42,7 +42,10 @@ def jacobians_along(
     """A (T, n, n) and H (T, m, n) about the states (T, n) with inputs (T, p) along a drive, by automatic differentiation."""
     from torch.func import jacrev, vmap
 
-    at = (torch.as_tensor(states, dtype=torch.float64), torch.as_tensor(inputs, dtype=torch.float64))
+    at = (
+        torch.as_tensor(states, dtype=torch.float64),
+        torch.as_tensor(inputs, dtype=torch.float64),
+    )
     A, H = (vmap(jacrev(function))(*at).detach().numpy() for function in (transition, observation))
     return A, H
 
@@ -51,7 +54,9 @@ def observability_matrices(A: FloatArray, H: FloatArray, steps: int) -> FloatArr
     """O of every window of N samples of A (T, n, n) and H (T, m, n), (T - N + 1, N m, n); raises ValueError unless N is between 1 and T."""
     count = len(A) - steps + 1
     if not 1 <= steps <= len(A):
-        raise ValueError(f"a window of {steps} samples does not fit into {len(A)}; take 1 to {len(A)}")
+        raise ValueError(
+            f"a window of {steps} samples does not fit into {len(A)}; take 1 to {len(A)}"
+        )
     product = np.broadcast_to(np.eye(A.shape[-1]), (count, *A.shape[1:]))
     rows = []
     for ahead in range(steps):
@@ -95,4 +100,6 @@ def observability_along(
     full[full <= 1e-13 * full[:, :1]] = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.where(np.abs(directions) > 1e-7, directions / full[:, :, None], 0.0)
-    return Observability(full[:, -1], np.sqrt(np.square(spread).sum(1)), np.count_nonzero(full, axis=1))
+    return Observability(
+        full[:, -1], np.sqrt(np.square(spread).sum(1)), np.count_nonzero(full, axis=1)
+    )

@@ -36,17 +36,26 @@ def paired_difference(
     """
     for name, losses in (("first", first), ("second", second)):
         if losses.ndim != 2 or losses.shape[0] == 0 or losses.shape[1] != len(sequence):
-            raise DataError(f"losses of the {name} estimator must be of shape (seeds, {len(sequence)}), not {losses.shape}")
+            raise DataError(
+                f"losses of the {name} estimator must be of shape (seeds, {len(sequence)}), not {losses.shape}"
+            )
         if not np.isfinite(losses).all():
-            raise DataError(f"losses of the {name} estimator hold {int((~np.isfinite(losses)).sum())} values that are not finite")
-    starts = _block_starts(sequence, None if block_seconds is None else max(round(block_seconds * rate_hz), 1))
+            raise DataError(
+                f"losses of the {name} estimator hold {int((~np.isfinite(losses)).sum())} values that are not finite"
+            )
+    starts = _block_starts(
+        sequence, None if block_seconds is None else max(round(block_seconds * rate_hz), 1)
+    )
     if len(starts) < 2:
         raise DataError(
             f"there are {len(starts)} blocks to resample, at least two are needed; give more sequences or a shorter block_seconds"
         )
     sizes = np.diff([*starts, len(sequence)]).astype(np.float64)
     return difference_of_blocks(
-        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples
+        np.add.reduceat(first, starts, axis=1),
+        np.add.reduceat(second, starts, axis=1),
+        sizes,
+        n_resamples=n_resamples,
     )
 
 
@@ -59,5 +68,8 @@ def _block_starts(sequence: NDArray[np.int64], block: int | None) -> NDArray[np.
     """First sample of each block; a sequence's last block may be shorter."""
     bounds = np.flatnonzero(np.diff(sequence)) + 1
     edges = [0, *bounds.tolist(), len(sequence)]
-    starts = [np.arange(begin, end, block or max(end - begin, 1)) for begin, end in itertools.pairwise(edges)]
+    starts = [
+        np.arange(begin, end, block or max(end - begin, 1))
+        for begin, end in itertools.pairwise(edges)
+    ]
     return np.concatenate(starts).astype(np.int64)

@@ -22,7 +22,10 @@ MOST_NAMED = 12
 
 def recordings_of(part: PartArtefacts, spans: Iterable[Span]) -> list[Recording]:
     """Scored ranges at the evaluation rate, references included."""
-    return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
+    return [
+        read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop)
+        for span in spans
+    ]
 
 
 def lengths_of(part: PartArtefacts, spans: Iterable[Span]) -> list[int]:
@@ -43,8 +46,13 @@ def models_by_candidate(
         groups.setdefault(candidate_of(model), []).append(model)
     for name, models in groups.items():
         if len({model.seed for model in models}) != len(models):
-            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    names = [*(name for name in order if name in groups), *(name for name in groups if name not in order)]
+            raise DataError(
+                f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own"
+            )
+    names = [
+        *(name for name in order if name in groups),
+        *(name for name in groups if name not in order),
+    ]
     return {name: sorted(groups[name], key=lambda model: model.seed) for name in names}
 
 
@@ -60,14 +68,22 @@ def spans_in_words(spans: Sequence[Span]) -> str:
     words = []
     for span in spans:
         whole = span.start == -math.inf and span.stop == math.inf
-        words.append(as_text(span.recording) if whole else f"{as_text(span.recording)} ({_times(span)})")
-    return ", ".join(words) if len(words) <= MOST_NAMED else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
+        words.append(
+            as_text(span.recording) if whole else f"{as_text(span.recording)} ({_times(span)})"
+        )
+    return (
+        ", ".join(words)
+        if len(words) <= MOST_NAMED
+        else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
+    )
 
 
 def _times(span: Span) -> str:
     if span.start == -math.inf:
         return f"up to {span.stop:g} s"
-    return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
+    return (
+        f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
+    )
 
 
 def sideslip_error(part: Scored) -> FloatArray:
@@ -77,9 +93,17 @@ def sideslip_error(part: Scored) -> FloatArray:
 
 def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], float]:
     """(estimator, variant, seed, test set, metric) -> value, over all samples under nominal conditions."""
-    metrics = part.metrics[(part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")]
+    metrics = part.metrics[
+        (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")
+    ]
     return {
-        (str(row["estimator"]), str(row["variant"]), int(row["seed"]), str(row["test_set"]), str(row["metric"])): float(row["value"])
+        (
+            str(row["estimator"]),
+            str(row["variant"]),
+            int(row["seed"]),
+            str(row["test_set"]),
+            str(row["metric"]),
+        ): float(row["value"])
         for row in metrics.to_dict("records")
     }
 
@@ -90,7 +114,11 @@ def median_and_range(values: FloatArray, decimals: int) -> str:
     if not len(finite):
         return MISSING
     words = fixed(float(np.median(finite)), decimals)
-    return words if len(finite) == 1 else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"
+    return (
+        words
+        if len(finite) == 1
+        else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"
+    )
 
 
 def percent_below(value: float, other: float) -> str:

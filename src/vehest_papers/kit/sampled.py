@@ -28,13 +28,26 @@ class SampledErrors:
     def __contains__(self, candidate: object) -> bool:
         return candidate in self.candidates
 
-    def figure(self, values: FloatArray, n_blocks: int, generator: np.random.Generator, *, root: bool = False) -> Measured:
+    def figure(
+        self,
+        values: FloatArray,
+        n_blocks: int,
+        generator: np.random.Generator,
+        *,
+        root: bool = False,
+    ) -> Measured:
         """Mean over seeds, or the root of it, of values by resample and seed (n + 1, S), of which the first row is the test itself."""
         drawn, n_seeds, power = values, values.shape[1], 0.5 if root else 1.0
         if n_seeds > 1:
-            drawn = np.take_along_axis(values, generator.integers(n_seeds, size=(len(values), n_seeds - 1)), axis=1)
-        logs, of_each = (power * np.log(np.maximum(own, SMALLEST)) for own in (drawn[1:].mean(axis=1), values[0]))
-        return Measured(float(max(values[0].mean(), SMALLEST)) ** power, logs, of_each, n_blocks, self.paired)
+            drawn = np.take_along_axis(
+                values, generator.integers(n_seeds, size=(len(values), n_seeds - 1)), axis=1
+            )
+        logs, of_each = (
+            power * np.log(np.maximum(own, SMALLEST)) for own in (drawn[1:].mean(axis=1), values[0])
+        )
+        return Measured(
+            float(max(values[0].mean(), SMALLEST)) ** power, logs, of_each, n_blocks, self.paired
+        )
 
 
 def resampled(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:

@@ -53,7 +53,9 @@ def third_octave(frequency: FloatArray, hz: float) -> NDArray[np.bool_]:
     return inside
 
 
-def periodogram(series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS) -> Periodogram:
+def periodogram(
+    series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS
+) -> Periodogram:
     """Welch's method over several series: Hann windows that overlap by half, each segment without its mean.
 
     Series count by their number of segments; what is left over at the end of each counts nowhere. The line at 0 Hz and, because the
@@ -79,7 +81,14 @@ def periodogram(series: Sequence[FloatArray], rate_hz: float, segment_seconds: f
             )
         if not np.isfinite(samples).all():
             raise DataError(f"series {position} has gaps, which a periodogram cannot skip")
-        frequency, density = signal.welch(samples, rate_hz, window="hann", nperseg=length, noverlap=length // 2, detrend="constant")
+        frequency, density = signal.welch(
+            samples,
+            rate_hz,
+            window="hann",
+            nperseg=length,
+            noverlap=length // 2,
+            detrend="constant",
+        )
         own = 1 + (len(samples) - length) // (length - length // 2)
         total += own * density
         n_segments += own
@@ -96,7 +105,9 @@ def lateral_velocity_rate(recording: Recording) -> FloatArray:
     """
     velocity = recording["vy_ref"]
     if len(velocity) < 3:
-        raise DataError(f"recording '{recording.id}' has {len(velocity)} samples; a central difference needs three")
+        raise DataError(
+            f"recording '{recording.id}' has {len(velocity)} samples; a central difference needs three"
+        )
     return (velocity[2:] - velocity[:-2]) * (0.5 * recording.rate_hz)
 
 

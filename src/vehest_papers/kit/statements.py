@@ -42,7 +42,9 @@ class Change:
 
     log_ratio: float  # its logarithm
     error: float  # standard error of that
-    dof: float  # degrees of freedom of Student's t, by Welch and Satterthwaite from blocks and seeds
+    dof: (
+        float  # degrees of freedom of Student's t, by Welch and Satterthwaite from blocks and seeds
+    )
 
     @classmethod
     def of(cls, first: Measured, second: Measured | None, limit: float = 1.0) -> Change:
@@ -52,11 +54,15 @@ class Change:
         """
         draws = first.draws - (second.draws if second is not None else 0.0)
         parts = [own for own in (first, second) if own is not None]
-        error = float(np.std(draws)) if min(own.n_blocks for own in parts) >= LEAST_BLOCKS else math.nan
+        error = (
+            float(np.std(draws)) if min(own.n_blocks for own in parts) >= LEAST_BLOCKS else math.nan
+        )
         apart = [own.of_each for own in parts]
         if second is not None and first.paired and second.paired:
             apart = [first.of_each - second.of_each]
-        of_seeds = [(float(np.var(own, ddof=1)) / len(own), len(own) - 1) for own in apart if len(own) > 1]
+        of_seeds = [
+            (float(np.var(own, ddof=1)) / len(own), len(own) - 1) for own in apart if len(own) > 1
+        ]
         of_blocks = max(error**2 - sum(variance for variance, _ in of_seeds), 0.0)
         terms = [(of_blocks, min(own.n_blocks for own in parts) - 1), *of_seeds]
         spread = sum(variance**2 / max(free, 1) for variance, free in terms)
@@ -67,7 +73,9 @@ class Change:
     def p_value(self, beyond: float = 0.0) -> float:
         """Two-sided, of the hypothesis that the relative change is ``beyond``; NaN where nothing is known of it."""
         distance = abs(self.log_ratio - math.log1p(beyond))
-        return 2.0 * float(stats.t.sf(distance / self.error, self.dof)) if self.error > 0 else math.nan
+        return (
+            2.0 * float(stats.t.sf(distance / self.error, self.dof)) if self.error > 0 else math.nan
+        )
 
     def ends(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Ends of the interval of the ratio."""
@@ -78,18 +86,28 @@ class Change:
         """In words: ``−24 % [−31, −16]``."""
         low, high = self.ends(confidence)
         value = percent(math.exp(self.log_ratio))
-        return f"{value} % [{percent(low)}, {percent(high)}]" if math.isfinite(low) else f"{value} %"
+        return (
+            f"{value} % [{percent(low)}, {percent(high)}]" if math.isfinite(low) else f"{value} %"
+        )
 
     def as_ratio(self) -> str:
         """The ratio in words: ``2.1 [1.7, 2.6]``."""
         low, high = self.ends()
         value = math.exp(self.log_ratio)
-        return f"{short(value)} [{short(low)}, {short(high)}]" if math.isfinite(low) else short(value)
+        return (
+            f"{short(value)} [{short(low)}, {short(high)}]" if math.isfinite(low) else short(value)
+        )
 
     def in_decibels(self, confidence: float = CONFIDENCE) -> str:
         """The ratio of two powers in words: ``7.1 dB [5.2, 9.0]``."""
-        value, low, high = (10.0 * math.log10(own) for own in (math.exp(self.log_ratio), *self.ends(confidence)))
-        return f"{fixed(value, 1)} dB [{fixed(low, 1)}, {fixed(high, 1)}]" if math.isfinite(low) else f"{fixed(value, 1)} dB"
+        value, low, high = (
+            10.0 * math.log10(own) for own in (math.exp(self.log_ratio), *self.ends(confidence))
+        )
+        return (
+            f"{fixed(value, 1)} dB [{fixed(low, 1)}, {fixed(high, 1)}]"
+            if math.isfinite(low)
+            else f"{fixed(value, 1)} dB"
+        )
 
     def over(self, other: Change) -> Change:
         """The ratio of two ratios that share no resamples."""
@@ -115,7 +133,9 @@ class Compared:
     """One comparison."""
 
     label: str  # which, in the cell of the table; several of one label show the first alone
-    change: Change | None  # of what is claimed to be lower, or higher, to the other; none where there is nothing to compare
+    change: (
+        Change | None
+    )  # of what is claimed to be lower, or higher, to the other; none where there is nothing to compare
     expected: Expected = "lower"  # what is claimed of it
     beyond: float = 0.0  # relative change that it is claimed to lie below, or above
     # as a relative change, a ratio of powers in decibels, or a ratio, times ``limit`` where it was divided by that
@@ -145,12 +165,16 @@ class Statement:
     paper: str  # its figures
     data: str  # what ours come from
     tests: Sequence[Compared]  # that must all come out as claimed
-    missing: str = "no such candidates here"  # why it cannot be tested, where nothing is there to compare
+    missing: str = (
+        "no such candidates here"  # why it cannot be tested, where nothing is there to compare
+    )
 
 
 def outcomes(tests: Sequence[Compared]) -> list[tuple[Outcome, float]]:
     """What becomes of comparisons that are judged together, corrected by Holm, and the confidence at which their intervals stand."""
-    values = [own.change.p_value(own.beyond) if own.change is not None else math.nan for own in tests]
+    values = [
+        own.change.p_value(own.beyond) if own.change is not None else math.nan for own in tests
+    ]
     known = [position for position, value in enumerate(values) if math.isfinite(value)]
     adjusted = dict(zip(known, holm([values[position] for position in known]), strict=True))
     found: list[tuple[Outcome, float]] = []
@@ -159,7 +183,11 @@ def outcomes(tests: Sequence[Compared]) -> list[tuple[Outcome, float]]:
             found.append(("not told apart", CONFIDENCE))
             continue
         assert own.change is not None
-        factor = max(adjusted[position] / values[position], 1.0) if values[position] > 0 else float(len(known))
+        factor = (
+            max(adjusted[position] / values[position], 1.0)
+            if values[position] > 0
+            else float(len(known))
+        )
         if adjusted[position] >= 1.0 - CONFIDENCE:
             outcome: Outcome = "not told apart"
         else:
@@ -187,13 +215,24 @@ def decided(entries: Sequence[Statement | Claim]) -> list[Claim]:
             claims.append(entry)
             continue
         tests = [test for test in entry.tests if test.change is not None]
-        claims.append(_claim(entry, [(test, *found) for test, found in zip(tests, outcomes(tests), strict=True)]))
+        claims.append(
+            _claim(
+                entry, [(test, *found) for test, found in zip(tests, outcomes(tests), strict=True)]
+            )
+        )
     return claims
 
 
 def _claim(statement: Statement, found: Sequence[tuple[Compared, Outcome, float]]) -> Claim:
     if not found:
-        return Claim(statement.claim, statement.paper, "–", statement.data, "not testable on this data", statement.missing)
+        return Claim(
+            statement.claim,
+            statement.paper,
+            "–",
+            statement.data,
+            "not testable on this data",
+            statement.missing,
+        )
     words, shown = [], set[str]()
     for test, _, confidence in found:
         if test.label not in shown:
@@ -204,7 +243,11 @@ def _claim(statement: Statement, found: Sequence[tuple[Compared, Outcome, float]
     verdict: Verdict = "not reproduced" if turned else "undecided" if open_ones else "reproduced"
     why = "by more than chance"
     if turned or open_ones:
-        parts = ((len(found) - turned - open_ones, "as claimed"), (turned, "contrary"), (open_ones, "open"))
+        parts = (
+            (len(found) - turned - open_ones, "as claimed"),
+            (turned, "contrary"),
+            (open_ones, "open"),
+        )
         why = ", ".join(f"{number} {word}" for number, word in parts if number)
     return Claim(statement.claim, statement.paper, "; ".join(words), statement.data, verdict, why)
 
@@ -213,5 +256,7 @@ def counted(claim: str, paper: str, ours: str, data: str, found: Sequence[bool],
     """A claim that every one of some cases is to show: all, none or some of them."""
     if not found:
         return Claim(claim, paper, "–", data, "not testable on this data", "nothing to compare")
-    verdict: Verdict = "reproduced" if all(found) else "not reproduced" if not any(found) else "undecided"
+    verdict: Verdict = (
+        "reproduced" if all(found) else "not reproduced" if not any(found) else "undecided"
+    )
     return Claim(claim, paper, ours, data, verdict, why)

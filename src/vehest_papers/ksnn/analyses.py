@@ -22,7 +22,10 @@ from vehest_papers.ksnn.subjects import Trained
 
 STRETCH_SECONDS = 30.0
 TRAINED_ON = {"scheme_1": "Corvette C-1", "scheme_2": "Ferrari F-1"}
-TESTED_ON = {"scheme_1": "Ferrari F-2", "scheme_2": "Corvette C-2"}  # part -> the test set of the car that it does not train on
+TESTED_ON = {
+    "scheme_1": "Ferrari F-2",
+    "scheme_2": "Corvette C-2",
+}  # part -> the test set of the car that it does not train on
 
 
 def of_the_data(artefacts: StudyArtefacts) -> list[Block]:
@@ -39,7 +42,9 @@ def of_the_data(artefacts: StudyArtefacts) -> list[Block]:
     source = f"{words_of_kinds(first)} drives at {first.protocol.rate_hz:g} Hz"
     whole = artefacts.parts.get("ferrari_whole")
     if whole is not None:
-        sets["one file of F-2"] = recordings_of(whole, [span for spans in whole.split.tests.values() for span in spans])
+        sets["one file of F-2"] = recordings_of(
+            whole, [span for spans in whole.split.tests.values() for span in spans]
+        )
         source += "; and one file of the paper's F-2, real, at the same rate"
     return data_quality(sets, source)
 
@@ -62,7 +67,9 @@ def of_sensitivities(schemes: Sequence[Scheme]) -> list[Block]:
     """Figure 7: KS-NN linear no bias beside the Luenberger observer, a column a scheme."""
     columns = []
     for scheme in schemes:
-        network, observer = (scheme.model(category) for category in (paper.LINEAR, paper.LUENBERGER))
+        network, observer = (
+            scheme.model(category) for category in (paper.LINEAR, paper.LUENBERGER)
+        )
         if network is not None and observer is not None:
             columns.append((_trained(scheme, network), _trained(scheme, observer)))
     return sensitivities(columns) if columns else []
@@ -76,15 +83,32 @@ def of_residuals(schemes: Sequence[Scheme]) -> list[Block]:
         models = [model for category in shown if (model := scheme.model(category)) is not None]
         if not models or models[0].estimator != "ksnn":
             continue
-        own = [Residuals(model.estimator, model.variant, model.title, scheme.part.scored(model, scheme.other)) for model in models]
-        panels.append(Panel(TESTED_ON[scheme.name], TRAINED_ON[scheme.name], scheme.kind, own, scheme.part.protocol.rate_hz))
+        own = [
+            Residuals(
+                model.estimator, model.variant, model.title, scheme.part.scored(model, scheme.other)
+            )
+            for model in models
+        ]
+        panels.append(
+            Panel(
+                TESTED_ON[scheme.name],
+                TRAINED_ON[scheme.name],
+                scheme.kind,
+                own,
+                scheme.part.protocol.rate_hz,
+            )
+        )
     return residuals(panels) if panels else []
 
 
 def of_interpretation(schemes: Sequence[Scheme]) -> list[Block]:
     """Section IV: networks of both schemes, and how an estimate comes about where a test drive slides most."""
     linear, nonlinear = (
-        [_trained(scheme, model) for scheme in schemes if (model := scheme.model(category)) is not None]
+        [
+            _trained(scheme, model)
+            for scheme in schemes
+            if (model := scheme.model(category)) is not None
+        ]
         for category in (paper.LINEAR, paper.NONLINEAR)
     )
     if not linear:
@@ -94,7 +118,13 @@ def of_interpretation(schemes: Sequence[Scheme]) -> list[Block]:
     n = min(round(STRETCH_SECONDS * drive.rate_hz), len(drive))
     begin = int(np.convolve(np.square(drive["vy_ref"]), np.ones(n), mode="valid").argmax())
     stretch = (float(drive.time[begin]), float(drive.time[begin + n - 1]))
-    return interpretation(linear, nonlinear, drive, stretch, f"{TESTED_ON[first.name]}, {first.kind}, recording {drive.id}")
+    return interpretation(
+        linear,
+        nonlinear,
+        drive,
+        stretch,
+        f"{TESTED_ON[first.name]}, {first.kind}, recording {drive.id}",
+    )
 
 
 def _trained(scheme: Scheme, model: EvaluatedModel) -> Trained:

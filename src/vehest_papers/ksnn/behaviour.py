@@ -27,7 +27,16 @@ from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
-WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)  # samples after the start at v = 0 at which errors are read
+WINDOWS = (
+    5,
+    10,
+    15,
+    20,
+    30,
+    45,
+    60,
+    90,
+)  # samples after the start at v = 0 at which errors are read
 STRIDE = 4  # every so many samples of a test drive end windows
 MOST_SEEDS = 3  # seeds of a candidate that are run again here
 HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
@@ -42,19 +51,30 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
     return estimator if isinstance(estimator, Luenberger) else None
 
 
-def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str], test: str) -> tuple[SegmentErrors, float]:
+def at_low_yaw_rate(
+    scheme: Scheme, threshold: float, categories: Sequence[str], test: str
+) -> tuple[SegmentErrors, float]:
     """SegmentErrors where |ω| lies below the observer's threshold [rad/s], and the share of such samples."""
     part, rate = scheme.part, scheme.part.protocol.rate_hz
-    recordings = [reference for reference, _ in pieces_of(part.split.tests[test], lambda span: _reference(scheme, span), part.protocol)]
+    recordings = [
+        reference
+        for reference, _ in pieces_of(
+            part.split.tests[test], lambda span: _reference(scheme, span), part.protocol
+        )
+    ]
     segments: dict[str, list[Segments]] = {}
     share = math.nan
     for category in categories:
         for model in scheme.models(category)[: 2 * MOST_SEEDS]:
             scored = part.scored(model, test)
-            masks: list[FloatArray] = [(np.abs(own) < threshold).astype(float) for own in yaw_rates(scored, recordings)]
+            masks: list[FloatArray] = [
+                (np.abs(own) < threshold).astype(float) for own in yaw_rates(scored, recordings)
+            ]
             share = float(np.concatenate(masks).mean())
             segments.setdefault(category, []).append(masked_segments(scored, masks, rate))
-    return SegmentErrors(segments if 0.0 < share < HIGHEST_SHARE else {}, f"{test} at little yaw rate"), share
+    return SegmentErrors(
+        segments if 0.0 < share < HIGHEST_SHARE else {}, f"{test} at little yaw rate"
+    ), share
 
 
 def _reference(scheme: Scheme, span: Span) -> Recording:
@@ -70,12 +90,21 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
     recordings = recordings_of(scheme.part, scheme.part.split.tests[test])
     for model in scheme.models(category)[:MOST_SEEDS]:
         estimator = load_model(model.model_folder)
-        if not isinstance(estimator, WindowedEstimator) or abs(estimator.settings.rate_hz - recordings[0].rate_hz) > 1e-9:
+        if (
+            not isinstance(estimator, WindowedEstimator)
+            or abs(estimator.settings.rate_hz - recordings[0].rate_hz) > 1e-9
+        ):
             return SegmentErrors({}, test)
         for length in WINDOWS:
-            parts = [own for recording in recordings if (own := _with_window(estimator, recording, length)) is not None]
+            parts = [
+                own
+                for recording in recordings
+                if (own := _with_window(estimator, recording, length)) is not None
+            ]
             if parts:
-                segments.setdefault(str(length), []).append(segments_of(parts, recordings[0].rate_hz / STRIDE))
+                segments.setdefault(str(length), []).append(
+                    segments_of(parts, recordings[0].rate_hz / STRIDE)
+                )
     return SegmentErrors(segments, f"{test} after the start", same_models=True)
 
 
@@ -91,10 +120,14 @@ def _with_window(estimator: WindowedEstimator, recording: Recording, length: int
         windows = series.unfold(0, length, 1).transpose(1, 2)[ends - length]
         vy = network(windows).double().numpy().reshape(-1)
     speed, reference, ay = (recording[name][ends] for name in ("vx", "vy_ref", "ay"))
-    return Scored(recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay)
+    return Scored(
+        recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay
+    )
 
 
-def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tuple[SegmentErrors, dict[str, float]]:
+def without_biases(
+    scheme: Scheme, categories: Sequence[str], test: str
+) -> tuple[SegmentErrors, dict[str, float]]:
     """Errors with the measured a_y and with each car's mean bias taken off (Section IX-A), and the biases of both cars [m/s²].
 
     The mean of v̇ - (a_y - ωu_m) over a car's training set, which takes the reference, is added to its a_y. Nothing is trained again: a
@@ -108,22 +141,31 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
         Candidates ``CATEGORY, as measured`` and ``CATEGORY, corrected``; biases by ``own`` and ``other``.
     """
     part = scheme.part
-    biases = {"own": mean_bias(recordings_of(part, part.split.train)), "other": mean_bias(recordings_of(part, part.split.validation))}
+    biases = {
+        "own": mean_bias(recordings_of(part, part.split.train)),
+        "other": mean_bias(recordings_of(part, part.split.validation)),
+    }
     segments: dict[str, list[Segments]] = {}
     for category in categories:
         for model in scheme.models(category)[:MOST_SEEDS]:
             segments.setdefault(f"{category}, as measured", []).append(segments_on(model, test))
-            segments.setdefault(f"{category}, corrected", []).append(_corrected(scheme, model, biases, test))
+            segments.setdefault(f"{category}, corrected", []).append(
+                _corrected(scheme, model, biases, test)
+            )
     return SegmentErrors(segments, f"{test} with and without biases", same_models=True), biases
 
 
-def _corrected(scheme: Scheme, model: EvaluatedModel, biases: dict[str, float], test: str) -> Segments:
+def _corrected(
+    scheme: Scheme, model: EvaluatedModel, biases: dict[str, float], test: str
+) -> Segments:
     part = scheme.part
     estimator = load_model(model.model_folder)
     holds_offset = not (isinstance(estimator, Ksnn) and not estimator.settings.bias)
     shift = biases["other"] - (biases["own"] if holds_offset else 0.0)
     scored = []
-    for reference, piece in pieces_of(part.split.tests[test], lambda span: _reference(scheme, span), part.protocol):
+    for reference, piece in pieces_of(
+        part.split.tests[test], lambda span: _reference(scheme, span), part.protocol
+    ):
         seen = reference.without_references()
         shifted = replace(seen, channels={**seen.channels, "ay": seen["ay"] + shift})
         scored.append(score(estimator.estimate([shifted])[0], reference, piece, part.protocol))

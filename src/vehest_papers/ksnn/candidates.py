@@ -48,12 +48,18 @@ def runs_of(part: artefacts.PartArtefacts) -> pd.DataFrame:
     for model in part.models:
         own = (model.estimator, model.variant, model.seed)
         row: dict[str, object] = {"estimator": own[0], "variant": own[1], "title": model.title}
-        row |= {"category": category_of(*own[:2]), "structure": structure_of(own[1]), "seed": model.seed}
+        row |= {
+            "category": category_of(*own[:2]),
+            "structure": structure_of(own[1]),
+            "seed": model.seed,
+        }
         wanted = {f"{metric}.{name}": (*own, name, metric) for name in sets for metric in METRICS}
         wanted |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
         missing = [column for column, key in wanted.items() if key not in known]
         if missing:
-            raise DataError(f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again")
+            raise DataError(
+                f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again"
+            )
         rows.append(row | {column: known[key] for column, key in wanted.items()})
     return pd.DataFrame(rows)
 
@@ -85,7 +91,9 @@ def chosen(runs: pd.DataFrame) -> pd.Series:
     column = f"rmse_vy.{VALIDATION}"
     if column not in runs:
         if len(runs) > 1:
-            raise DataError(f"{len(runs)} runs of {runs.iloc[0]['title']} and no validation range to choose one by")
+            raise DataError(
+                f"{len(runs)} runs of {runs.iloc[0]['title']} and no validation range to choose one by"
+            )
         return runs.iloc[0]
     values = runs[column].to_numpy(dtype=float)
     return runs.iloc[int(np.argmin(np.where(np.isfinite(values), values, np.inf)))]
@@ -94,5 +102,8 @@ def chosen(runs: pd.DataFrame) -> pd.Series:
 def chosen_by_category(runs: pd.DataFrame) -> dict[str, pd.Series]:
     """Category -> the run that validation chooses among all its structures and seeds: baselines, then as in Tables IV and V."""
     present, known = dict.fromkeys(runs["category"]), (*paper.BASELINES, *paper.CATEGORIES)
-    order = [*(name for name in known if name in present), *(name for name in present if name not in known)]
+    order = [
+        *(name for name in known if name in present),
+        *(name for name in present if name not in known),
+    ]
     return {name: chosen(runs[runs["category"] == name]) for name in order}

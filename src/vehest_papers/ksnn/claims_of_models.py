@@ -19,7 +19,15 @@ from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import median_and_range
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
-from vehest_papers.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
+from vehest_papers.kit.statements import (
+    Change,
+    Compared,
+    Measured,
+    Statement,
+    counted,
+    outcomes,
+    short,
+)
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.comparing import N_RESAMPLES
 from vehest_papers.ksnn.linear_system import LocalModels
@@ -28,23 +36,47 @@ from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_
 
 ENOUGH, LONGER = "30", "60"  # samples of a window: the paper's 1.5 s, and twice that
 SLACK = -0.05
-BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))  # centres of thirds of an octave, 0.1 to 6.3 Hz
+BANDS_HZ = tuple(
+    float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0)
+)  # centres of thirds of an octave, 0.1 to 6.3 Hz
 P2 = "linear_no_bias_p2"
 BIASES = {"before": "as measured", "after": "corrected"}
 
 
 def at_low_yaw_rates(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
     """Section II-B: below its threshold the observer knows nothing of v."""
-    categories = (paper.ZERO, paper.STATIC_MAP, paper.LUENBERGER, paper.GRU, paper.LSTM, *paper.STRUCTURED)
+    categories = (
+        paper.ZERO,
+        paper.STATIC_MAP,
+        paper.LUENBERGER,
+        paper.GRU,
+        paper.LSTM,
+        *paper.STRUCTURED,
+    )
     tests, rows = [], []
     for scheme in schemes:
         observer = behaviour.luenberger_of(scheme)
         if observer is None:
             continue
-        errors, share = behaviour.at_low_yaw_rate(scheme, observer.threshold, categories, scheme.other)
-        tests.append(Compared(f"S{scheme.name[-1]}", errors.change(paper.NONLINEAR, paper.LUENBERGER, "rmse_vy")))
-        row = {"scheme": scheme.title, "gain": observer.gain, "threshold": observer.threshold, "share": 100 * share}
-        rows += [row | {"model": name, "rmse": errors.in_words(name, "rmse_vy")} for name in categories if name in errors]
+        errors, share = behaviour.at_low_yaw_rate(
+            scheme, observer.threshold, categories, scheme.other
+        )
+        tests.append(
+            Compared(
+                f"S{scheme.name[-1]}", errors.change(paper.NONLINEAR, paper.LUENBERGER, "rmse_vy")
+            )
+        )
+        row = {
+            "scheme": scheme.title,
+            "gain": observer.gain,
+            "threshold": observer.threshold,
+            "share": 100 * share,
+        }
+        rows += [
+            row | {"model": name, "rmse": errors.in_words(name, "rmse_vy")}
+            for name in categories
+            if name in errors
+        ]
     statement = Statement(
         "where |ω| is below the observer's threshold: RMSE(v) of nonlinear no bias on the other car below the observer's (reset to 0)",
         "“overcome”",
@@ -60,9 +92,7 @@ def at_low_yaw_rates(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None
         "model": Column("model"),
         "rmse": Column("RMSE(v) there, other car [m/s]"),
     }
-    caption = (
-        "Where the yaw rate lies below the observer's tuned threshold; all seeds of the structures that validation chooses, up to six."
-    )
+    caption = "Where the yaw rate lies below the observer's tuned threshold; all seeds of the structures that validation chooses, up to six."
     return statement, Table("low_yaw_rate", caption, pd.DataFrame(rows), columns) if rows else None
 
 
@@ -72,7 +102,9 @@ def tuned(schemes: Sequence[Scheme]) -> Claim:
     for scheme in schemes:
         observer = behaviour.luenberger_of(scheme)
         if observer is not None:
-            words.append(f"S{scheme.name[-1]} α {fixed(observer.gain, 1)}, ω_th {fixed(observer.threshold, 3)} rad/s")
+            words.append(
+                f"S{scheme.name[-1]} α {fixed(observer.gain, 1)}, ω_th {fixed(observer.threshold, 3)} rad/s"
+            )
     return Claim(
         "tuned α and ω_th of Luenberger",
         "boxes alone",
@@ -92,14 +124,30 @@ def on_convergence(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
                 continue
             errors = behaviour.after_start(scheme, category, scheme.other)
             if category == paper.NONLINEAR:
-                tests.append(Compared(f"S{scheme.name[-1]}", errors.change(LONGER, ENOUGH, "rmse_vy"), "higher", beyond=SLACK))
+                tests.append(
+                    Compared(
+                        f"S{scheme.name[-1]}",
+                        errors.change(LONGER, ENOUGH, "rmse_vy"),
+                        "higher",
+                        beyond=SLACK,
+                    )
+                )
             row: dict[str, object] = {"scheme": scheme.title, "model": category}
-            rows.append(row | {f"after_{length}": errors.value(str(length), "rmse_vy") for length in behaviour.WINDOWS})
+            rows.append(
+                row
+                | {
+                    f"after_{length}": errors.value(str(length), "rmse_vy")
+                    for length in behaviour.WINDOWS
+                }
+            )
     claim = "1.5 s are enough: with 3 s RMSE(v) is not 5 % lower, nonlinear no bias, other car"
     statement = Statement(claim, "asked for", schemes[0].kind, tests, "test drives too short")
     rate = schemes[0].part.protocol.rate_hz
     columns = {"scheme": Column("scheme"), "model": Column("model")}
-    columns |= {f"after_{length}": Column(f"{length / rate:g} s", decimals=3) for length in behaviour.WINDOWS}
+    columns |= {
+        f"after_{length}": Column(f"{length / rate:g} s", decimals=3)
+        for length in behaviour.WINDOWS
+    }
     caption = "RMSE(v) [m/s] on the other car so long after a start at v = 0, û = u_m, up to three seeds; trained on windows of 1.5 s."
     return statement, Table("after_start", caption, pd.DataFrame(rows), columns) if rows else None
 
@@ -115,9 +163,23 @@ def on_biases(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
             if change is None:
                 continue
             if category in (paper.NONLINEAR, paper.NONLINEAR_BIAS, paper.LSTM):
-                tests.append(Compared(f"S{scheme.name[-1]} {category.removeprefix('KS-NN ')}", change))
-            row = {"scheme": scheme.title, "own": biases["own"], "other": biases["other"], "model": category, "change": change.in_percent()}
-            rows.append(row | {word: errors.in_words(f"{category}, {key}", "rmse_vy") for word, key in BIASES.items()})
+                tests.append(
+                    Compared(f"S{scheme.name[-1]} {category.removeprefix('KS-NN ')}", change)
+                )
+            row = {
+                "scheme": scheme.title,
+                "own": biases["own"],
+                "other": biases["other"],
+                "model": category,
+                "change": change.in_percent(),
+            }
+            rows.append(
+                row
+                | {
+                    word: errors.in_words(f"{category}, {key}", "rmse_vy")
+                    for word, key in BIASES.items()
+                }
+            )
     claim = "biases of a_y removed (by the reference): RMSE(v) on the other car falls"
     statement = Statement(claim, "“expected”", schemes[0].kind, tests)
     columns = {
@@ -134,7 +196,9 @@ def on_biases(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
         "trained again: those that can hold an offset get the other car's a_y with the own car's bias, the others without any. Up to "
         "three seeds."
     )
-    return statement, Table("biases_removed", caption, pd.DataFrame(rows), columns) if rows else None
+    return statement, Table(
+        "biases_removed", caption, pd.DataFrame(rows), columns
+    ) if rows else None
 
 
 def on_noise(schemes: Sequence[Scheme]) -> Claim:
@@ -151,14 +215,18 @@ def on_noise(schemes: Sequence[Scheme]) -> Claim:
             theirs = sensitivity_of(observer, yaw_rate).band_gains(HIGHEST_HZ)
             if not all(theirs):
                 continue
-            ours = np.array([sensitivity_of(network, yaw_rate).band_gains(HIGHEST_HZ) for network in networks]) / np.array(theirs)
+            ours = np.array(
+                [sensitivity_of(network, yaw_rate).band_gains(HIGHEST_HZ) for network in networks]
+            ) / np.array(theirs)
             found += [bool(own < 1.0) for own in ours.ravel()]
             ratios.append(ours)
     words = "–"
     if ratios:
         low, high = np.min(np.concatenate(ratios), axis=0), np.max(np.concatenate(ratios), axis=0)
         words = f"ratios over seeds: a_y {short(low[0])} to {short(high[0])}, a_x {short(low[1])} to {short(high[1])}"
-    return counted(claim, "“significantly lower”", words, schemes[0].kind, found, "every seed, or not")
+    return counted(
+        claim, "“significantly lower”", words, schemes[0].kind, found, "every seed, or not"
+    )
 
 
 def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:
@@ -166,30 +234,69 @@ def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:
     entries: list[Claim | Statement] = []
     for scheme in schemes:
         shown = [paper.NONLINEAR, paper.LUENBERGER, paper.LSTM]
-        models = {category: model for category in shown if (model := scheme.model(category)) is not None}
+        models = {
+            category: model for category in shown if (model := scheme.model(category)) is not None
+        }
         claim = f"residual PSD lowest at every frequency, {scheme.title.lower()}"
         levels = band_levels(scheme, models, scheme.other) if len(models) == len(shown) else {}
         if not levels:
-            entries.append(Claim(claim, "yes", "–", scheme.kind, "not testable on this data", "tests too short or candidates missing"))
+            entries.append(
+                Claim(
+                    claim,
+                    "yes",
+                    "–",
+                    scheme.kind,
+                    "not testable on this data",
+                    "tests too short or candidates missing",
+                )
+            )
             continue
         pairs = [(hz, other) for other in shown[1:] for hz in BANDS_HZ]
-        tests = [Compared("", Change.of(levels[paper.NONLINEAR, hz], levels[other, hz])) for hz, other in pairs]
+        tests = [
+            Compared("", Change.of(levels[paper.NONLINEAR, hz], levels[other, hz]))
+            for hz, other in pairs
+        ]
         found = [outcome for outcome, _ in outcomes(tests)]
         lower = sum(own.change is not None and own.change.log_ratio < 0 for own in tests)
         turned, significant = found.count("the other way round"), found.count("as claimed")
         ours = f"lower in {lower} of {len(tests)} bands; by more than chance {significant} lower, {turned} higher"
-        verdict = "not reproduced" if turned else "reproduced" if lower == len(tests) else "undecided"
-        entries.append(Claim(claim, "yes", ours, scheme.kind, verdict, "against Luenberger and LSTM, 0.1 to 6.3 Hz"))  # type: ignore[arg-type]
+        verdict = (
+            "not reproduced" if turned else "reproduced" if lower == len(tests) else "undecided"
+        )
+        entries.append(
+            Claim(
+                claim,
+                "yes",
+                ours,
+                scheme.kind,
+                verdict,  # type: ignore[arg-type]
+                "against Luenberger and LSTM, 0.1 to 6.3 Hz",
+            )
+        )
         if scheme is schemes[-1]:
             above = [
-                Compared(f"{hz:g} Hz", Change.of(levels[paper.LSTM, hz], levels[paper.NONLINEAR, hz]), "higher", shown="decibels")
+                Compared(
+                    f"{hz:g} Hz",
+                    Change.of(levels[paper.LSTM, hz], levels[paper.NONLINEAR, hz]),
+                    "higher",
+                    shown="decibels",
+                )
                 for hz in (BANDS_HZ[0], 1.0)
             ]
-            entries.append(Statement("LSTM's above KS-NN's, scheme 2", "7 dB at 0.1 Hz, 8 to 10 dB at 1 Hz", scheme.kind, above))
+            entries.append(
+                Statement(
+                    "LSTM's above KS-NN's, scheme 2",
+                    "7 dB at 0.1 Hz, 8 to 10 dB at 1 Hz",
+                    scheme.kind,
+                    above,
+                )
+            )
     return entries
 
 
-def band_levels(scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str) -> dict[tuple[str, float], Measured]:
+def band_levels(
+    scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str
+) -> dict[tuple[str, float], Measured]:
     """Power of the errors by candidate and band, segments of 25.6 s that do not overlap resampled together; none where there are few."""
     rate = scheme.part.protocol.rate_hz
     length = round(SEGMENT_SECONDS * rate)
@@ -200,7 +307,9 @@ def band_levels(scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str)
         for part in scheme.part.scored(model, test):
             error = part.vy - part.vy_ref
             for start in range(0, len(error) - length + 1, length):
-                frequency, density = signal.periodogram(error[start : start + length], rate, window="hann", detrend="constant")
+                frequency, density = signal.periodogram(
+                    error[start : start + length], rate, window="hann", detrend="constant"
+                )
                 segments.append(density)
         if len(segments) < 8:
             return {}
@@ -212,7 +321,9 @@ def band_levels(scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str)
     for category, own in power.items():
         for hz in BANDS_HZ:
             band = own[:, third_octave(frequency, hz)].mean(axis=1)
-            levels[category, hz] = Measured(float(band.mean()), np.log(counts @ band / (number - 1)), np.zeros(1), number)
+            levels[category, hz] = Measured(
+                float(band.mean()), np.log(counts @ band / (number - 1)), np.zeros(1), number
+            )
     return levels
 
 
@@ -229,7 +340,10 @@ def on_parameters(schemes: Sequence[Scheme]) -> tuple[list[Claim], Table | None]
         if own:
             rows.append({"scheme": scheme.title, "n_seeds": len(own)} | _parameters_in_words(own))
     data = schemes[0].kind
-    gamma, beta = (np.array([getattr(own, name) for own in models]).reshape(-1, 2, 2) for name in ("gamma", "beta"))
+    gamma, beta = (
+        np.array([getattr(own, name) for own in models]).reshape(-1, 2, 2)
+        for name in ("gamma", "beta")
+    )
 
     def of(values: NDArray[np.bool_]) -> str:
         return f"{int(values.sum())} of {len(values)}"
@@ -239,7 +353,14 @@ def on_parameters(schemes: Sequence[Scheme]) -> tuple[list[Claim], Table | None]
     why = "all seeds, P = 2"
     claims = [
         counted("IV: γ₁ below one at ω = 0", "yes", of(leaks), data, leaks.tolist(), why),
-        counted("IV: γ₁ closer to one at the higher yaw rate", "yes", of(nearer), data, nearer.tolist(), why),
+        counted(
+            "IV: γ₁ closer to one at the higher yaw rate",
+            "yes",
+            of(nearer),
+            data,
+            nearer.tolist(),
+            why,
+        ),
         counted("IV: β₁ below one", "“typically”", of(reduced), data, reduced.tolist(), why),
     ]
     columns = {"scheme": Column("scheme"), "n_seeds": Column("seeds", decimals=0)}
@@ -249,10 +370,19 @@ def on_parameters(schemes: Sequence[Scheme]) -> tuple[list[Claim], Table | None]
         for where, words in (("low", "ω = 0"), ("high", "highest ω"))
     }
     caption = "The paper's own model of twelve parameters, linear without bias and P = 2, over all seeds: median [lowest, highest]."
-    return claims, Table("twelve_parameters", caption, pd.DataFrame(rows), columns) if rows else None
+    return claims, Table(
+        "twelve_parameters", caption, pd.DataFrame(rows), columns
+    ) if rows else None
 
 
-_SYMBOLS = {"gamma_1": "γ₁", "beta_1": "β₁", "gamma_2": "γ₂", "beta_2": "β₂", "weight_1": "w₁₁", "weight_2": "w₁₂"}
+_SYMBOLS = {
+    "gamma_1": "γ₁",
+    "beta_1": "β₁",
+    "gamma_2": "γ₂",
+    "beta_2": "β₂",
+    "weight_1": "w₁₁",
+    "weight_2": "w₁₂",
+}
 
 
 def _parameters_in_words(models: Sequence[LocalModels]) -> dict[str, str]:
@@ -261,7 +391,10 @@ def _parameters_in_words(models: Sequence[LocalModels]) -> dict[str, str]:
     for name in _SYMBOLS:
         kind, row = name.rsplit("_", 1)
         values = np.array([getattr(own, kind)[:, int(row) - 1] for own in linear])
-        words |= {f"{name}_low": median_and_range(values[:, 0], 3), f"{name}_high": median_and_range(values[:, -1], 3)}
+        words |= {
+            f"{name}_low": median_and_range(values[:, 0], 3),
+            f"{name}_high": median_and_range(values[:, -1], 3),
+        }
     return words
 
 
@@ -271,7 +404,11 @@ def on_cost(frame: pd.DataFrame, kind: str) -> Claim:
     if frame.empty:
         return Claim(claim, "no numbers", "–", kind, "not testable on this data", "no network here")
     shown = (paper.LUENBERGER, *paper.PLAIN, *paper.WITHOUT_BIAS)
-    words = [f"{row['model'].removeprefix('KS-NN ')} {row['of_estimate']}" for row in frame.to_dict("records") if row["model"] in shown]
+    words = [
+        f"{row['model'].removeprefix('KS-NN ')} {row['of_estimate']}"
+        for row in frame.to_dict("records")
+        if row["model"] in shown
+    ]
     linear, lstm = cost.IN_C_US["ksnn", "linear_no_bias_p2"], cost.IN_C_US["lstm", "states_5"]
     timed = f"; in C {short(linear)} (linear, P = 2) to {short(lstm)} µs (LSTM, 5 states)"
     why = "GRU, LSTM affordable too" if {paper.GRU, paper.LSTM} & set(frame["model"]) else "counted"

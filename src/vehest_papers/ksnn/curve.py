@@ -29,18 +29,24 @@ TESTS = {"own": "own car", "other": "other car"}
 class Curve:
     """Errors by category and amount."""
 
-    errors: Mapping[str, SegmentErrors]  # ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``
+    errors: Mapping[
+        str, SegmentErrors
+    ]  # ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``
     minutes: Sequence[str]  # amounts, from the least, as they are written in names
     lines: Mapping[str, tuple[str, str]]  # category -> estimator and variant
 
 
 def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
     """The curve of parts called ``minutes_2.5_a`` and so on, and of the scheme that has all minutes; none where there are no such parts."""
-    found = [(match[1], scheme) for name, scheme in shorter.items() if (match := NAMED.fullmatch(name))]
+    found = [
+        (match[1], scheme) for name, scheme in shorter.items() if (match := NAMED.fullmatch(name))
+    ]
     if not found:
         return None
     amounts = sorted({minutes for minutes, _ in found}, key=float)
-    structures = {(model.estimator, model.variant) for _, scheme in found for model in scheme.part.models}
+    structures = {
+        (model.estimator, model.variant) for _, scheme in found for model in scheme.part.models
+    }
     everything = f"{minutes_of(whole.part):.3g}"
     sources = [*found, (everything, whole)]
     segments: dict[str, dict[str, list[Segments]]] = {word: {} for word in TESTS}
@@ -49,9 +55,14 @@ def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
             if (model.estimator, model.variant) in structures:
                 key = f"{category_of(model.estimator, model.variant)}@{minutes}"
                 for word in TESTS:
-                    segments[word].setdefault(key, []).append(segments_on(model, getattr(scheme, word)))
+                    segments[word].setdefault(key, []).append(
+                        segments_on(model, getattr(scheme, word))
+                    )
     lines = {category_of(*name): name for name in sorted(structures)}
-    errors = {word: SegmentErrors(own, f"{getattr(whole, word)} by minutes") for word, own in segments.items()}
+    errors = {
+        word: SegmentErrors(own, f"{getattr(whole, word)} by minutes")
+        for word, own in segments.items()
+    }
     return Curve(errors, [*amounts, everything], lines)
 
 
@@ -62,8 +73,16 @@ def curve_table(curve: Curve) -> Table:
         errors = curve.errors[word]
         for category in curve.lines:
             row: dict[str, object] = {"test": title, "model": category}
-            rows.append(row | {minutes: errors.in_words(f"{category}@{minutes}", "fvu") for minutes in curve.minutes})
-    columns = {"test": Column("test"), "model": Column("model")} | {minutes: Column(f"{minutes} min") for minutes in curve.minutes}
+            rows.append(
+                row
+                | {
+                    minutes: errors.in_words(f"{category}@{minutes}", "fvu")
+                    for minutes in curve.minutes
+                }
+            )
+    columns = {"test": Column("test"), "model": Column("model")} | {
+        minutes: Column(f"{minutes} min") for minutes in curve.minutes
+    }
     caption = (
         "FVU by the minutes learnt and stopped on together, scheme 2, with 95 % intervals over blocks, seeds and two places of the drives. "
         "Structures as in the paper's Table V."
@@ -79,7 +98,9 @@ def curve_figure(curve: Curve) -> Figure:
             errors = curve.errors[word]
             for category, name in curve.lines.items():
                 points = [
-                    (float(minutes), own) for minutes in curve.minutes if (own := errors.get(f"{category}@{minutes}", "fvu")) is not None
+                    (float(minutes), own)
+                    for minutes in curve.minutes
+                    if (own := errors.get(f"{category}@{minutes}", "fvu")) is not None
                 ]
                 if not points or category in (paper.ZERO, paper.KINEMATIC):
                     continue
@@ -87,8 +108,15 @@ def curve_figure(curve: Curve) -> Figure:
                 values = [own.value for _, own in points]
                 ends = [own.interval for _, own in points]
                 bars = np.abs(np.array(ends) - np.array(values)[:, None]).T
-                looks: dict[str, Any] = {"color": line.colour, "linestyle": line.dash, "marker": line.marker, "elinewidth": 0.6}
-                axes.errorbar([minutes for minutes, _ in points], values, yerr=bars, label=category, **looks)
+                looks: dict[str, Any] = {
+                    "color": line.colour,
+                    "linestyle": line.dash,
+                    "marker": line.marker,
+                    "elinewidth": 0.6,
+                }
+                axes.errorbar(
+                    [minutes for minutes, _ in points], values, yerr=bars, label=category, **looks
+                )
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_title(title, loc="left")

@@ -15,7 +15,14 @@ from vehest.data.recording import Recording
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, listed, new_figure
 from vehest_papers.kit.legends import legend_above
-from vehest_papers.kit.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest_papers.kit.spectra import (
+    Periodogram,
+    decibels,
+    lateral_velocity_rate,
+    mean_bias,
+    periodogram,
+    process_noise,
+)
 from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_frequencies
 
 NOISE_COLOUR = "#555555"
@@ -55,7 +62,10 @@ PUBLISHED_BIAS: Mapping[str, float] = {"corvette": 0.10, "ferrari": -0.03}
 
 def statistics(recordings: Sequence[Recording]) -> Statistics:
     """Table I's figures over all samples of some recordings with vx, yaw_rate, ay and vy_ref."""
-    speed, yaw_rate, ay, velocity = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "ay", "vy_ref"))
+    speed, yaw_rate, ay, velocity = (
+        np.concatenate([own[name] for own in recordings])
+        for name in ("vx", "yaw_rate", "ay", "vy_ref")
+    )
     low, high = np.quantile(velocity, [0.01, 0.99])
     return Statistics(
         u_min=float(speed.min()),
@@ -75,7 +85,12 @@ def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[B
     groups: dict[tuple[str, str], list[Recording]] = {}
     for recording in (recording for recordings in sets.values() for recording in recordings):
         groups.setdefault((recording.vehicle, recording.kind), []).append(recording)
-    ordered = dict(sorted(groups.items(), key=lambda item: (item[0][1], "ferrari" not in item[0][0].lower(), item[0][0])))
+    ordered = dict(
+        sorted(
+            groups.items(),
+            key=lambda item: (item[0][1], "ferrari" not in item[0][0].lower(), item[0][0]),
+        )
+    )
     spectra = {group: spectra_of(recordings) for group, recordings in ordered.items()}
     return [
         _table(sets, source),
@@ -89,7 +104,9 @@ def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[B
 def _table(sets: Mapping[str, Sequence[Recording]], source: str) -> Table:
     rows = []
     for name, recordings in sets.items():
-        cars = listed([car_title(vehicle) for vehicle in dict.fromkeys(own.vehicle for own in recordings)])
+        cars = listed(
+            [car_title(vehicle) for vehicle in dict.fromkeys(own.vehicle for own in recordings)]
+        )
         if name in PUBLISHED:
             rows.append(_row(name, "paper", cars, PUBLISHED[name]))
         rows.append(_row(name, f"ours, {kinds_of(recordings)}", cars, statistics(recordings)))
@@ -130,7 +147,9 @@ def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogra
 
 
 def _figure_4(
-    groups: Mapping[tuple[str, str], Sequence[Recording]], spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]], source: str
+    groups: Mapping[tuple[str, str], Sequence[Recording]],
+    spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]],
+    source: str,
 ) -> Figure:
     colours = car_colours(groups)
     with new_figure(DOUBLE_COLUMN * 0.75, 0.6 + 1.75 * len(groups)) as figure:
@@ -141,18 +160,41 @@ def _figure_4(
             hz, above, below = rate.frequency[shown], rate.density[shown], noise.density[shown]
             lowest = min(lowest, float(above.min()), float(below.min()))
             fill = partial(axes.fill_between, hz, above, below, linewidth=0, interpolate=True)
-            fill(where=above >= below, color=colours[vehicle, kind], alpha=0.16, label="signal above noise")
+            fill(
+                where=above >= below,
+                color=colours[vehicle, kind],
+                alpha=0.16,
+                label="signal above noise",
+            )
             fill(where=above < below, color=NOISE_COLOUR, alpha=0.28, label="noise above signal")
             axes.loglog(hz, above, color=colours[vehicle, kind], label="$\\dot{v}$")
-            axes.loglog(hz, below, color=NOISE_COLOUR, linestyle="dashed", label="process noise $\\dot{v} - (a_y - \\omega u_m)$")
-            axes.set_title(f"{car_title(vehicle)}, {kind}", loc="left", color=colours[vehicle, kind], fontweight="bold")
-            axes.set_title(f"mean bias {fixed(mean_bias(groups[vehicle, kind]), 3)} m/s²", loc="right")
+            axes.loglog(
+                hz,
+                below,
+                color=NOISE_COLOUR,
+                linestyle="dashed",
+                label="process noise $\\dot{v} - (a_y - \\omega u_m)$",
+            )
+            axes.set_title(
+                f"{car_title(vehicle)}, {kind}",
+                loc="left",
+                color=colours[vehicle, kind],
+                fontweight="bold",
+            )
+            axes.set_title(
+                f"mean bias {fixed(mean_bias(groups[vehicle, kind]), 3)} m/s²", loc="right"
+            )
             axes.set_ylabel("density [(m/s²)²/Hz]")
             axes.set_xlim(hz[0], HIGHEST_HZ)
         panels[-1].set_xlabel("frequency [Hz]")
         plain_frequencies(panels[-1])
         legend_above(figure, panels[0], columns=2)
-    segments = listed([f"{noise.n_segments} segments ({car_title(vehicle)}, {kind})" for (vehicle, kind), (_, noise) in spectra.items()])
+    segments = listed(
+        [
+            f"{noise.n_segments} segments ({car_title(vehicle)}, {kind})"
+            for (vehicle, kind), (_, noise) in spectra.items()
+        ]
+    )
     caption = (
         f"Periodograms of v̇ and of the process noise v̇ − (a_y − ωu_m), Figure 4 of the paper. Data: {source}. Welch's method, Hann windows "
         f"of {1.0 / next(iter(spectra.values()))[0].frequency[1]:.1f} s, {segments}; shaded where signal and noise differ."
@@ -161,16 +203,28 @@ def _figure_4(
 
 
 def _noise_in_words(
-    groups: Mapping[tuple[str, str], Sequence[Recording]], spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]]
+    groups: Mapping[tuple[str, str], Sequence[Recording]],
+    spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]],
 ) -> str:
     sentences = []
     for (vehicle, kind), (rate, noise) in spectra.items():
         differences = [decibels(rate.level(hz), noise.level(hz)) for hz in READ_AT_HZ]
-        listed_levels = listed([f"{fixed(own, 1)} dB at {hz:g} Hz" for own, hz in zip(differences, READ_AT_HZ, strict=True)])
-        published = next((bias for name, bias in PUBLISHED_BIAS.items() if name in vehicle.lower()), None)
-        beside = "" if published is None else f" (the paper, on real drives: {fixed(published, 2)} m/s²)"
+        listed_levels = listed(
+            [
+                f"{fixed(own, 1)} dB at {hz:g} Hz"
+                for own, hz in zip(differences, READ_AT_HZ, strict=True)
+            ]
+        )
+        published = next(
+            (bias for name, bias in PUBLISHED_BIAS.items() if name in vehicle.lower()), None
+        )
+        beside = (
+            "" if published is None else f" (the paper, on real drives: {fixed(published, 2)} m/s²)"
+        )
         bias = fixed(mean_bias(groups[vehicle, kind]), 3)
-        sentences.append(f"**{car_title(vehicle)}** ({kind}): v̇ against the process noise {listed_levels}; mean bias {bias} m/s²{beside}.")
+        sentences.append(
+            f"**{car_title(vehicle)}** ({kind}): v̇ against the process noise {listed_levels}; mean bias {bias} m/s²{beside}."
+        )
     lead = "How far v̇ stands out of what the kinematics leave unexplained (positive: signal above noise; means over a third of an octave):"
     return f"{lead}\n\n" + "\n".join(f"- {sentence}" for sentence in sentences)
 
@@ -181,19 +235,43 @@ def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str
         axes = figure.add_subplot()
         reach, points, point_colours = 0.0, [], []
         for position, ((vehicle, kind), recordings) in enumerate(groups.items()):
-            ay, velocity = (np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref"))
+            ay, velocity = (
+                np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref")
+            )
             kept = np.linspace(0, len(ay) - 1, min(len(ay), MOST_POINTS)).round().astype(int)
             points.append(np.stack([ay[kept], velocity[kept]]))
             point_colours += [colours[vehicle, kind]] * len(kept)
             centres, medians = _medians(ay, velocity)
             label = f"{car_title(vehicle)}, {kind}"
-            looks: dict[str, Any] = {"marker": "os^D"[position % 4], "markeredgecolor": "white", "markeredgewidth": 0.5, "markersize": 4.5}
-            axes.plot(centres, medians, color=colours[vehicle, kind], linewidth=1.4, label=label, zorder=3, **looks)
+            looks: dict[str, Any] = {
+                "marker": "os^D"[position % 4],
+                "markeredgecolor": "white",
+                "markeredgewidth": 0.5,
+                "markersize": 4.5,
+            }
+            axes.plot(
+                centres,
+                medians,
+                color=colours[vehicle, kind],
+                linewidth=1.4,
+                label=label,
+                zorder=3,
+                **looks,
+            )
             reach = max(reach, float(np.quantile(np.abs(velocity), 0.9995)))
-        order = np.random.default_rng(0).permutation(len(point_colours))  # so that no car hides another
+        order = np.random.default_rng(0).permutation(
+            len(point_colours)
+        )  # so that no car hides another
         scattered = np.concatenate(points, axis=1)[:, order]
         axes.scatter(
-            scattered[0], scattered[1], c=np.array(point_colours)[order], s=1.6, alpha=0.25, linewidths=0, rasterized=True, zorder=2
+            scattered[0],
+            scattered[1],
+            c=np.array(point_colours)[order],
+            s=1.6,
+            alpha=0.25,
+            linewidths=0,
+            rasterized=True,
+            zorder=2,
         )
         axes.set_ylim(-1.08 * reach, 1.08 * reach)
         axes.set_xlabel("lateral acceleration $a_y$ [m/s²]")
@@ -216,9 +294,13 @@ def _medians(ay: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArr
 def _handling_in_words(groups: Mapping[tuple[str, str], Sequence[Recording]]) -> str:
     sizes = {}
     for group, recordings in groups.items():
-        ay, velocity = (np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref"))
+        ay, velocity = (
+            np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref")
+        )
         near = np.abs(np.abs(ay) - COMPARED_AY) < 0.5 * AY_WIDTH
-        sizes[group] = float(np.median(np.abs(velocity[near]))) if near.sum() >= LEAST_SAMPLES else np.nan
+        sizes[group] = (
+            float(np.median(np.abs(velocity[near]))) if near.sum() >= LEAST_SAMPLES else np.nan
+        )
     words = [
         f"{car_title(vehicle)} ({kind}) {fixed(size, 2) + ' m/s' if np.isfinite(size) else MISSING}"
         for (vehicle, kind), size in sizes.items()
@@ -226,7 +308,12 @@ def _handling_in_words(groups: Mapping[tuple[str, str], Sequence[Recording]]) ->
     text = f"Median |v| at |a_y| between {COMPARED_AY - 0.5:g} and {COMPARED_AY + 0.5:g} m/s²: {listed(words)}."
     for kind in sorted({kind for _, kind in sizes}):
         cars = {
-            name: [size for (vehicle, own), size in sizes.items() if own == kind and name in vehicle.lower()] for name in PUBLISHED_BIAS
+            name: [
+                size
+                for (vehicle, own), size in sizes.items()
+                if own == kind and name in vehicle.lower()
+            ]
+            for name in PUBLISHED_BIAS
         }
         if all(len(own) == 1 and np.isfinite(own[0]) for own in cars.values()):
             larger = cars["ferrari"][0] > cars["corvette"][0]

@@ -35,11 +35,19 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         if name not in artefacts.parts:
             raise DataError(f"study '{artefacts.study}' needs part '{name}'")
         if not {"c2", "f2"} <= set(artefacts.parts[name].split.tests):
-            raise DataError(f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2")
+            raise DataError(
+                f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2"
+            )
     parts = {name: scheme_of(artefacts, name) for name in artefacts.parts}
     schemes = [parts[name] for name in SCHEMES]
-    ablations = {cause: own for cause in CAUSES if (own := [parts[name] for number in "12" if (name := f"{cause}_{number}") in parts])}
-    curve = curve_of(parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")})
+    ablations = {
+        cause: own
+        for cause in CAUSES
+        if (own := [parts[name] for number in "12" if (name := f"{cause}_{number}") in parts])
+    }
+    curve = curve_of(
+        parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")}
+    )
     pairs = _pairs(parts)
     entries, found = _entries(schemes, parts, curve, pairs)
     figure_6 = (
@@ -64,7 +72,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     if curve is not None:
         blocks += ["## With fewer minutes", curve_figure(curve)]
     blocks += _appendices(artefacts, parts, schemes, curve, found)
-    data = {f"candidates_{name}": tables.candidates(parts[name].runs, list(parts[name].part.split.tests)) for name in SCHEMES}
+    data = {
+        f"candidates_{name}": tables.candidates(
+            parts[name].runs, list(parts[name].part.split.tests)
+        )
+        for name in SCHEMES
+    }
     if pairs:
         data["small_cars_all"] = tables.across_cars(pairs, "small_cars_all", "").frame
     return {REPORT: Document(artefacts.title, blocks, data)}
@@ -81,7 +94,10 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
         own = "c2" if name.endswith("_1") else "f2"
         return Scheme(name, title, part, own, "f2" if own == "c2" else "c2")
     learnt = {span.dataset for span in part.split.train}
-    own = next((test for test in tests if learnt & {span.dataset for span in part.split.tests[test]}), tests[0])
+    own = next(
+        (test for test in tests if learnt & {span.dataset for span in part.split.tests[test]}),
+        tests[0],
+    )
     return Scheme(name, title, part, own, next((test for test in tests if test != own), own))
 
 
@@ -91,7 +107,10 @@ def _pairs(parts: Mapping[str, Scheme]) -> list[Scheme]:
 
 
 def _entries(
-    schemes: Sequence[Scheme], parts: Mapping[str, Scheme], curve: Curve | None, pairs: Sequence[Scheme]
+    schemes: Sequence[Scheme],
+    parts: Mapping[str, Scheme],
+    curve: Curve | None,
+    pairs: Sequence[Scheme],
 ) -> tuple[list[Statement | Claim], list[Table]]:
     """All statements in the paper's order, and the tables behind those on how estimators behave."""
     low, low_table = claims_of_models.at_low_yaw_rates(schemes)
@@ -105,8 +124,15 @@ def _entries(
         for number in "12"
         if f"steering_{number}" in parts and f"no_steering_{number}" in parts
     ]
-    entries: list[Statement | Claim] = [*claims.on_accuracy(schemes), *claims.on_sideslip(parts.get("ferrari_drive"))]
-    entries += [claims_of_models.on_noise(schemes), *claims_of_models.on_spectra(schemes), claims_of_models.on_cost(costs, schemes[0].kind)]
+    entries: list[Statement | Claim] = [
+        *claims.on_accuracy(schemes),
+        *claims.on_sideslip(parts.get("ferrari_drive")),
+    ]
+    entries += [
+        claims_of_models.on_noise(schemes),
+        *claims_of_models.on_spectra(schemes),
+        claims_of_models.on_cost(costs, schemes[0].kind),
+    ]
     if "one_vehicle" in parts:
         entries += claims.on_regularisation(parts["scheme_2"], parts["one_vehicle"])
     entries.append(claims_of_models.tuned(schemes))
@@ -115,7 +141,13 @@ def _entries(
         entries.append(claims.on_minutes(errors, curve.minutes[0], schemes[-1], f"{word} car"))
     entries += [low, *claims.on_steering(steering), converged, biases, *parameters]
     entries.append(claims.on_pairs(pairs))
-    made = [low_table, start_table, bias_table, parameter_table, cost.cost_table(costs, window) if len(costs) else None]
+    made = [
+        low_table,
+        start_table,
+        bias_table,
+        parameter_table,
+        cost.cost_table(costs, window) if len(costs) else None,
+    ]
     return entries, [table for table in made if table is not None]
 
 
@@ -123,7 +155,11 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
     kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
     schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
     words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
-    others = {kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind] for kind in kinds.values() if kind != schemes}
+    others = {
+        kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind]
+        for kind in kinds.values()
+        if kind != schemes
+    }
     if others:
         counts = listed([f"{len(titles)} are {kind}" for kind, titles in others.items()])
         words += f" Of the other parts {counts}: see the appendix."
@@ -139,7 +175,11 @@ def _note(schemes: Sequence[Scheme]) -> str:
 
 
 def _appendices(
-    artefacts: StudyArtefacts, parts: Mapping[str, Scheme], schemes: Sequence[Scheme], curve: Curve | None, found: Sequence[Table]
+    artefacts: StudyArtefacts,
+    parts: Mapping[str, Scheme],
+    schemes: Sequence[Scheme],
+    curve: Curve | None,
+    found: Sequence[Table],
 ) -> list[Block]:
     runs = {name: own.runs for name, own in parts.items()}
     blocks: list[Block] = ["## Appendix: statements on how estimators behave", *found]
@@ -147,28 +187,50 @@ def _appendices(
         blocks.append(curve_table(curve))
     blocks += ["## Appendix: the paper's tables"]
     for scheme, number in zip(schemes, ("IV", "V"), strict=True):
-        which = f"{scheme.title.lower()} (Table {number} of the paper). Ours: {scheme.kind.upper()}."
+        which = (
+            f"{scheme.title.lower()} (Table {number} of the paper). Ours: {scheme.kind.upper()}."
+        )
         caption = f"The one run of each category that validation chooses, {which}"
         blocks.append(tables.chosen_runs(scheme, f"table_{4 if number == 'IV' else 5}", caption))
-    blocks.append(tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), schemes[0].kind))
+    blocks.append(
+        tables.sideslip(
+            runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), schemes[0].kind
+        )
+    )
     if "one_vehicle" in runs:
         blocks.append(tables.regularisation(runs["scheme_2"], runs["one_vehicle"]))
     others = [parts[name] for name in OTHER_CARS if name in parts]
     if others:
         caption = "FVU and RMSE(v) with 95 % intervals, of each category the structure that validation chooses."
-        blocks += ["## Appendix: a simulated DevBot and the real Ferrari", tables.across_cars(others, "devbot", caption)]
+        blocks += [
+            "## Appendix: a simulated DevBot and the real Ferrari",
+            tables.across_cars(others, "devbot", caption),
+        ]
         blocks += map(tables.whether_an_order_means_anything, others)
     pairs = _pairs(parts)
     if pairs:
-        blocks += ["## Appendix: pairs of small cars", tables.small_cars(pairs), *map(tables.whether_an_order_means_anything, pairs)]
+        blocks += [
+            "## Appendix: pairs of small cars",
+            tables.small_cars(pairs),
+            *map(tables.whether_an_order_means_anything, pairs),
+        ]
     blocks += ["## Appendix: noise of the accelerations", *analyses.of_sensitivities(schemes)]
     blocks += ["## Appendix: spectra of the residuals", *analyses.of_residuals(schemes)]
     blocks += ["## Appendix: what the networks have learnt", *analyses.of_interpretation(schemes)]
     warned = methods.warnings_in_words({scheme.title: scheme.part for scheme in schemes})
-    blocks += ["## Appendix: the data", *analyses.of_the_data(artefacts), *([warned] if warned else [])]
+    blocks += [
+        "## Appendix: the data",
+        *analyses.of_the_data(artefacts),
+        *([warned] if warned else []),
+    ]
     blocks += _how_it_was_made(artefacts)
     whole = pd.concat([scheme.runs for scheme in schemes], ignore_index=True)
-    blocks += [tables.instances(whole), *analyses.of_activation(schemes), tables.stopping(runs, artefacts.titles), PATENT_NOTE]
+    blocks += [
+        tables.instances(whole),
+        *analyses.of_activation(schemes),
+        tables.stopping(runs, artefacts.titles),
+        PATENT_NOTE,
+    ]
     return blocks
 
 
@@ -176,7 +238,9 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     fits = sum(len(part.models) for part in artefacts.parts.values())
     lines = [
         f"Command: {as_code(artefacts.command)}; {fits} fits",
-        methods.scoring(artefacts.parts["scheme_1"].protocol, ", held and never interpolated from later values"),
+        methods.scoring(
+            artefacts.parts["scheme_1"].protocol, ", held and never interpolated from later values"
+        ),
         "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
         "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "
         "is of the other car. Test data choose nothing.",
@@ -186,7 +250,10 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         *methods.facts_of(artefacts.parts.values()),
     ]
     caption = "What was used for what (the first two rows are Table II of the paper)."
-    return [methods.how_it_was_made(lines), methods.ranges_table(artefacts, "table_2", caption, SET_TITLES)]
+    return [
+        methods.how_it_was_made(lines),
+        methods.ranges_table(artefacts, "table_2", caption, SET_TITLES),
+    ]
 
 
 def _averaging(artefacts: StudyArtefacts) -> str:

@@ -15,15 +15,32 @@ from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, listed, new_figure, significant
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    REFERENCE_COLOUR,
+    fixed,
+    listed,
+    new_figure,
+    significant,
+)
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.ksnn.activation import LOCAL_COLOURS, LOCAL_DASHES
 from vehest_papers.ksnn.linear_system import LocalModels, LpvModel, SubModels, decomposed_estimate
 from vehest_papers.ksnn.subjects import Trained
 
 MODEL_COLOURS = ("#0b4f9c", "#c2182b", "#00876c", "#a6761d", "#8e24aa")
-PART_COLOURS = {"slip_rate": "#0b4f9c", "pseudo_measurement": "#00876c", "speed": "#b8480b", "bias": "#8e24aa"}
-PART_DASHES = {"slip_rate": "solid", "pseudo_measurement": "dashed", "speed": "dashdot", "bias": "dotted"}
+PART_COLOURS = {
+    "slip_rate": "#0b4f9c",
+    "pseudo_measurement": "#00876c",
+    "speed": "#b8480b",
+    "bias": "#8e24aa",
+}
+PART_DASHES = {
+    "slip_rate": "solid",
+    "pseudo_measurement": "dashed",
+    "speed": "dashdot",
+    "bias": "dotted",
+}
 PART_TITLES = {
     "slip_rate": "first: slip rate $a_y - \\omega u_m$",
     "pseudo_measurement": "second: $\\dot{u}_m - a_x$",
@@ -41,7 +58,11 @@ STEADY_YAW_RATE = 0.4  # yaw rate for it where the last centre is at zero [rad/s
 
 
 def interpretation(
-    linear: Sequence[Trained], nonlinear: Sequence[Trained], drive: Recording, stretch: tuple[float, float], source: str
+    linear: Sequence[Trained],
+    nonlinear: Sequence[Trained],
+    drive: Recording,
+    stretch: tuple[float, float],
+    source: str,
 ) -> list[Block]:
     """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions; ``stretch`` [s] is drawn.
 
@@ -50,7 +71,11 @@ def interpretation(
     blocks = gain_curves(linear) if linear else []
     for own in (*linear, *nonlinear)[:1]:
         blocks += sub_models(own, drive, stretch, source)
-    names = [f"feedback_{number}" for number in range(1, len(nonlinear) + 1)] if len(nonlinear) > 1 else ["feedback"]
+    names = (
+        [f"feedback_{number}" for number in range(1, len(nonlinear) + 1)]
+        if len(nonlinear) > 1
+        else ["feedback"]
+    )
     for name, own in zip(names, nonlinear, strict=False):
         blocks += feedback_functions(own, drive, source, name=name)
     return blocks
@@ -77,17 +102,31 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
         for axes, panel in zip(grid, panels, strict=False):
             for position, (own, model) in enumerate(zip(models, linear, strict=True)):
                 yaw_rate = np.union1d(np.linspace(0.0, 1.1 * model.centres[-1], 200), model.centres)
-                values = _poles(model, yaw_rate) if panel == "poles" else getattr(model.gains(yaw_rate), panel)
+                values = (
+                    _poles(model, yaw_rate)
+                    if panel == "poles"
+                    else getattr(model.gains(yaw_rate), panel)
+                )
                 colour = MODEL_COLOURS[position % len(MODEL_COLOURS)]
                 for column, dash in enumerate(("solid", "dashed")):
                     label = own.described if not column and panel == "gamma" else None
-                    axes.plot(yaw_rate, values[:, column], color=colour, linestyle=dash, label=label)
+                    axes.plot(
+                        yaw_rate, values[:, column], color=colour, linestyle=dash, label=label
+                    )
                     if panel != "poles":
                         axes.plot(
-                            model.centres, getattr(model, panel)[:, column], color=colour, marker="o", linestyle="none", markersize=3.0
+                            model.centres,
+                            getattr(model, panel)[:, column],
+                            color=colour,
+                            marker="o",
+                            linestyle="none",
+                            markersize=3.0,
                         )
             first, second, unit = labels[panel]
-            axes.set_title(f"{first} solid, {second} dashed" + (f" [{unit}]" if unit != "1" else ""), loc="left")
+            axes.set_title(
+                f"{first} solid, {second} dashed" + (f" [{unit}]" if unit != "1" else ""),
+                loc="left",
+            )
             axes.set_xlabel("$|\\omega|$ [rad/s]")
             if panel in ("gamma", "beta", "poles"):
                 axes.axhline(1.0, color="#888888", linewidth=0.7, linestyle="dotted")
@@ -98,16 +137,30 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
         f"Learned gains of linear KS-NNs over the magnitude of the yaw rate: {'; '.join(own.described for own in models)}. Dots are local "
         "models; poles are those of the recursion at constant yaw rate, in magnitude."
     )
-    return [Figure("learned_gains", caption, figure), "\n\n".join(gains_in_words(own) for own in models)]
+    return [
+        Figure("learned_gains", caption, figure),
+        "\n\n".join(gains_in_words(own) for own in models),
+    ]
 
 
 def gains_in_words(own: Trained) -> str:
     """What the gains of a linear KS-NN mean, from their values; raises `ConfigurationError` where it is no linear KS-NN."""
     model = _linear(own)
-    sentences = [_of_the_leak(model), _of_the_slip_rate(model), _of_the_speed(model), _of_the_third(model), _of_the_poles(model)]
+    sentences = [
+        _of_the_leak(model),
+        _of_the_slip_rate(model),
+        _of_the_speed(model),
+        _of_the_third(model),
+        _of_the_poles(model),
+    ]
     if np.any(model.bias):
-        first, second = (f"{fixed(float(column.min()), 3)} to {fixed(float(column.max()), 3)} m/s" for column in model.bias.T)
-        sentences.append(f"Learned offsets: b₁₁ {first}, b₁₂ {second}; they belong to this car and its sensors.")
+        first, second = (
+            f"{fixed(float(column.min()), 3)} to {fixed(float(column.max()), 3)} m/s"
+            for column in model.bias.T
+        )
+        sentences.append(
+            f"Learned offsets: b₁₁ {first}, b₁₂ {second}; they belong to this car and its sensors."
+        )
     return f"**{own.described}.** " + " ".join(sentences)
 
 
@@ -132,7 +185,11 @@ def _of_the_leak(model: LpvModel) -> str:
 
 def _of_the_slip_rate(model: LpvModel) -> str:
     lowest, highest = float(model.beta[:, 0].min()), float(model.beta[:, 0].max())
-    span = f"β₁ lies between {fixed(lowest, 2)} and {fixed(highest, 2)}" if len(model.centres) > 1 else f"β₁ is {fixed(lowest, 2)}"
+    span = (
+        f"β₁ lies between {fixed(lowest, 2)} and {fixed(highest, 2)}"
+        if len(model.centres) > 1
+        else f"β₁ is {fixed(lowest, 2)}"
+    )
     if lowest < 0.0:
         return f"{span}: at some yaw rates the slip rate enters with the opposite sign, so this is no longer an integration of Eq. 4a."
     if highest < 1.0:
@@ -149,7 +206,11 @@ def _of_the_speed(model: LpvModel) -> str:
         factor = fixed(abs(gamma - weight), 3)
         return f"{values}: driving straight û − u_m does not settle but grows by a factor of {factor} a sample, which v̂ does not see there."
     share = 100.0 * weight / (1.0 - gamma + weight)
-    meaning = "û is the forward speed" if abs(share - 100.0) < 1.0 else "û is not the forward speed but a state of the network's own"
+    meaning = (
+        "û is the forward speed"
+        if abs(share - 100.0) < 1.0
+        else "û is not the forward speed but a state of the network's own"
+    )
     offsets = ", offsets aside," if np.any(model.bias) else ""
     return f"{values}: driving straight at constant speed û{offsets} settles at {share:.0f} % of u_m, so {meaning}."
 
@@ -185,7 +246,12 @@ def _of_the_poles(model: LpvModel) -> str:
 def _ranges(values: FloatArray, chosen: NDArray[np.bool_]) -> str:
     """Runs of chosen values in words."""
     runs = true_runs(chosen).tolist()
-    return listed([f"{fixed(float(values[first]), 2)} to {fixed(float(values[after - 1]), 2)}" for first, after in runs])
+    return listed(
+        [
+            f"{fixed(float(values[first]), 2)} to {fixed(float(values[after - 1]), 2)}"
+            for first, after in runs
+        ]
+    )
 
 
 def steady_third(model: LpvModel, yaw_rate: float, speed: float) -> float:
@@ -208,7 +274,9 @@ def _poles(model: LpvModel, yaw_rate: FloatArray) -> FloatArray:
 # Sub-models along a drive
 
 
-def sub_models(own: Trained, drive: Recording, stretch: tuple[float, float], source: str) -> list[Block]:
+def sub_models(
+    own: Trained, drive: Recording, stretch: tuple[float, float], source: str
+) -> list[Block]:
     """Parts of an estimate along a drive, and what each adds to its variance; ``stretch`` [s] is drawn; raises as `interpretation` does."""
     estimator = _ksnn(own)
     parts = decomposed_estimate(estimator, drive)
@@ -221,7 +289,11 @@ def sub_models(own: Trained, drive: Recording, stretch: tuple[float, float], sou
         f"with {bits} bits. The start of each window at v = 0, û = u_m is no part of its own: in v̂ and û − u_m the recursion starts "
         "from zero."
     )
-    return [_figure_of_parts(own, drive, parts, stretch, source), f"{_shares_in_words(table.frame)} {sums}", table]
+    return [
+        _figure_of_parts(own, drive, parts, stretch, source),
+        f"{_shares_in_words(table.frame)} {sums}",
+        table,
+    ]
 
 
 def _shares_in_words(frame: pd.DataFrame) -> str:
@@ -238,22 +310,41 @@ def _shares_in_words(frame: pd.DataFrame) -> str:
 
 
 def _shown(own: Trained) -> list[str]:
-    return ["slip_rate", "pseudo_measurement", "speed", *(["bias"] if _ksnn(own).settings.bias else [])]
+    return [
+        "slip_rate",
+        "pseudo_measurement",
+        "speed",
+        *(["bias"] if _ksnn(own).settings.bias else []),
+    ]
 
 
-def _figure_of_parts(own: Trained, drive: Recording, parts: SubModels, stretch: tuple[float, float], source: str) -> Figure:
+def _figure_of_parts(
+    own: Trained, drive: Recording, parts: SubModels, stretch: tuple[float, float], source: str
+) -> Figure:
     drive.cut(*stretch)
     first, last = drive.index_range(*stretch)
     shown, time = np.s_[first:last], drive.time[first:last]
     with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.5, 0.6))
-        top.plot(time, parts.total[shown], color="#c2182b", linewidth=1.3, label="KS-NN, sum of the parts")
-        top.plot(time, drive["vy_ref"][shown], color=REFERENCE_COLOUR, linewidth=0.9, label="measured")
+        top.plot(
+            time,
+            parts.total[shown],
+            color="#c2182b",
+            linewidth=1.3,
+            label="KS-NN, sum of the parts",
+        )
+        top.plot(
+            time, drive["vy_ref"][shown], color=REFERENCE_COLOUR, linewidth=0.9, label="measured"
+        )
         for name in _shown(own):
             looks = {"color": PART_COLOURS[name], "linestyle": PART_DASHES[name]}
             middle.plot(time, getattr(parts, name)[shown], label=PART_TITLES[name], **looks)
         bottom.plot(time, drive["yaw_rate"][shown], color="#444444", linewidth=0.8)
-        for axes, label in zip((top, middle, bottom), ("lateral velocity [m/s]", "parts [m/s]", "$\\omega$ [rad/s]"), strict=True):
+        for axes, label in zip(
+            (top, middle, bottom),
+            ("lateral velocity [m/s]", "parts [m/s]", "$\\omega$ [rad/s]"),
+            strict=True,
+        ):
             axes.set_ylabel(label)
             axes.margins(x=0.0)
         bottom.set_xlabel("time [s]")
@@ -276,8 +367,12 @@ def _table_of_parts(own: Trained, drive: Recording, parts: SubModels, source: st
             {
                 "part": PART_WORDS[name],
                 "rms": float(np.sqrt(np.mean(part**2))),
-                "share_percent": 100.0 * float(np.mean((part - part.mean()) * (total - total.mean()))) / float(np.var(total)),
-                "correlation": float(np.corrcoef(part, reference)[0, 1]) if np.ptp(part) and np.ptp(reference) else math.nan,
+                "share_percent": 100.0
+                * float(np.mean((part - part.mean()) * (total - total.mean())))
+                / float(np.var(total)),
+                "correlation": float(np.corrcoef(part, reference)[0, 1])
+                if np.ptp(part) and np.ptp(reference)
+                else math.nan,
             }
         )
     columns = {
@@ -296,11 +391,15 @@ def _table_of_parts(own: Trained, drive: Recording, parts: SubModels, source: st
 # Nonlinear feedback
 
 
-def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str = "feedback") -> list[Block]:
+def feedback_functions(
+    own: Trained, drive: Recording, source: str, *, name: str = "feedback"
+) -> list[Block]:
     """f₁ and f₂ of each local model over e = û - u_m, and how their gain varies where e lies along a drive; raises `ConfigurationError`."""
     estimator = _ksnn(own)
     if not estimator.settings.n_hidden:
-        raise ConfigurationError(f"{own.named} is linear; its feedback functions are straight lines")
+        raise ConfigurationError(
+            f"{own.named} is linear; its feedback functions are straight lines"
+        )
     models = LocalModels.of(estimator)
     error = decomposed_estimate(estimator, drive).error
     low, middle, high = np.nanquantile(error, [0.01, 0.5, 0.99]).tolist()
@@ -314,9 +413,14 @@ def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str
                 axes.axvspan(low, high, color="#e9e9e9", zorder=0)
                 axes.axvline(0.0, color="#888888", linewidth=0.6)
                 for position in range(len(models.centres)):
-                    colour, dash = LOCAL_COLOURS[position % len(LOCAL_COLOURS)], LOCAL_DASHES[position % len(LOCAL_DASHES)]
+                    colour, dash = (
+                        LOCAL_COLOURS[position % len(LOCAL_COLOURS)],
+                        LOCAL_DASHES[position % len(LOCAL_DASHES)],
+                    )
                     label = f"$|\\omega|$ = {models.centres[position]:.2f} rad/s"
-                    axes.plot(grid, curves[:, position, column], color=colour, linestyle=dash, label=label)
+                    axes.plot(
+                        grid, curves[:, position, column], color=colour, linestyle=dash, label=label
+                    )
             panels[0, column].set_title(f"$f_{column + 1}$ [m/s]", loc="left")
             panels[1, column].set_title(f"$df_{column + 1}/de$", loc="left")
             panels[1, column].set_xlabel("$e = \\hat{u} - u_m$ [m/s]")
@@ -340,7 +444,9 @@ def _feedback_in_words(own: Trained, models: LocalModels, low: float, high: floa
             factor = float(np.max(np.abs(curve)) / max(float(np.min(np.abs(curve))), 1e-12))
             changes_sign = bool(np.any(np.sign(curve) != np.sign(curve[0])))
             spread = f"{significant(float(curve.min()), 2)} to {significant(float(curve.max()), 2)}"
-            words.append(f"slope of f{'₁₂'[column]} {spread} ({'changes sign' if changes_sign else f'factor {fixed(factor, 1)}'})")
+            words.append(
+                f"slope of f{'₁₂'[column]} {spread} ({'changes sign' if changes_sign else f'factor {fixed(factor, 1)}'})"
+            )
         items.append(f"- |ω| = {fixed(centre, 2)} rad/s: {listed(words)}.")
     lead = (
         f"**{own.described}.** Nonlinear feedback is a gain that varies with û − u_m; where that lies along the drive ({fixed(low, 2)} to "
@@ -358,5 +464,7 @@ def _ksnn(own: Trained) -> Ksnn:
 def _linear(own: Trained) -> LpvModel:
     estimator = _ksnn(own)
     if estimator.settings.n_hidden:
-        raise ConfigurationError(f"{own.named} is nonlinear; its gains depend on û - u_m as well as on |ω|")
+        raise ConfigurationError(
+            f"{own.named} is nonlinear; its gains depend on û - u_m as well as on |ω|"
+        )
     return LocalModels.of(estimator).linearised()

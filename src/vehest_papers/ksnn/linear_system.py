@@ -42,7 +42,9 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.ksnn import Ksnn
 
-SMALL_ERROR = 1e-6  # below it the secant of a feedback function is taken to be its tangent at 0 [m/s]
+SMALL_ERROR = (
+    1e-6  # below it the secant of a feedback function is taken to be its tangent at 0 [m/s]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,10 @@ class LocalModels:
     @classmethod
     def of(cls, estimator: Ksnn) -> LocalModels:
         """Copy them out of an estimator."""
-        settings, found = estimator.settings, {name: values.astype(np.float64) for name, values in estimator.weights().items()}
+        settings, found = (
+            estimator.settings,
+            {name: values.astype(np.float64) for name, values in estimator.weights().items()},
+        )
         none = np.zeros((settings.n_local, 2))
         neurons = np.zeros((settings.n_local, 2, settings.n_hidden))
         return cls(
@@ -99,13 +104,19 @@ class LocalModels:
     def feedback(self, error: FloatArray) -> FloatArray:
         """f₁(e) and f₂(e) of every local model (Eq. 8), (...) -> (..., P, 2) [m/s]."""
         spread = np.asarray(error)[..., None, None]
-        neurons = self.output_weight * np.tanh(self.hidden_weight * spread[..., None] + self.hidden_bias)
+        neurons = self.output_weight * np.tanh(
+            self.hidden_weight * spread[..., None] + self.hidden_bias
+        )
         return self.weight * spread + self.bias + neurons.sum(axis=-1)
 
     def slope(self, error: FloatArray) -> FloatArray:
         """df₁/de and df₂/de of every local model, (...) -> (..., P, 2)."""
-        inner = np.tanh(self.hidden_weight * np.asarray(error)[..., None, None, None] + self.hidden_bias)
-        return self.weight + (self.output_weight * self.hidden_weight * (1.0 - inner**2)).sum(axis=-1)
+        inner = np.tanh(
+            self.hidden_weight * np.asarray(error)[..., None, None, None] + self.hidden_bias
+        )
+        return self.weight + (self.output_weight * self.hidden_weight * (1.0 - inner**2)).sum(
+            axis=-1
+        )
 
     def secant(self, error: FloatArray) -> FloatArray:
         """(f(e) - f(0))/e, the gain in force at e, (...) -> (..., P, 2)."""
@@ -118,7 +129,15 @@ class LocalModels:
         """The linear system that this is for linear feedback, and close to ``error`` e₀ [m/s] otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀)."""
         at = np.asarray(error)
         slope = self.slope(at)
-        return LpvModel(self.centres, self.gamma, self.beta, slope, self.feedback(at) - slope * error, self.step, self.n_window)
+        return LpvModel(
+            self.centres,
+            self.gamma,
+            self.beta,
+            slope,
+            self.feedback(at) - slope * error,
+            self.step,
+            self.n_window,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,13 +156,20 @@ class LpvModel:
         """Coefficients at yaw rates of any shape and sign [rad/s]; beyond the last break those of the last."""
         size = np.abs(np.asarray(yaw_rate, dtype=np.float64))
         tables = (self.gamma, self.beta, self.weight, self.bias)
-        return Gains(*(np.stack([np.interp(size, self.centres, table[:, i]) for i in (0, 1)], axis=-1) for table in tables))
+        return Gains(
+            *(
+                np.stack([np.interp(size, self.centres, table[:, i]) for i in (0, 1)], axis=-1)
+                for table in tables
+            )
+        )
 
     def state_matrix(self, yaw_rate: FloatArray | float) -> FloatArray:
         """A(ω) of the state (v, û - u_m), (...) -> (..., 2, 2)."""
         omega, own = np.asarray(yaw_rate, dtype=np.float64), self.gains(yaw_rate)
         above = np.stack([own.gamma[..., 0], -omega * own.weight[..., 0]], axis=-1)
-        below = np.stack([own.beta[..., 1] * self.step * omega, own.gamma[..., 1] - own.weight[..., 1]], axis=-1)
+        below = np.stack(
+            [own.beta[..., 1] * self.step * omega, own.gamma[..., 1] - own.weight[..., 1]], axis=-1
+        )
         return np.stack([above, below], axis=-2)
 
 
@@ -186,12 +212,20 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
     parts, errors = np.empty((*speed.shape, 4)), np.empty_like(speed)
     tau, last = models.step, speed.shape[-1] - 1
     for k in range(last + 1):
-        now, after = np.s_[..., k], np.s_[..., min(k + 1, last)]  # what the last one gives e is no longer read
+        now, after = (
+            np.s_[..., k],
+            np.s_[..., min(k + 1, last)],
+        )  # what the last one gives e is no longer read
         error = e.sum(axis=-1)
         gain = (phi[..., k, :, None] * models.secant(error)).sum(axis=-2)
-        (gamma_1, gamma_2), (beta_1, beta_2) = (np.moveaxis(own[..., k, :], -1, 0) for own in (gamma, beta))
+        (gamma_1, gamma_2), (beta_1, beta_2) = (
+            np.moveaxis(own[..., k, :], -1, 0) for own in (gamma, beta)
+        )
         pseudo = (speed[after] - speed[now]) / tau - ax[now]
-        into_v = np.stack([beta_1 * tau * (ay[now] - omega[now] * speed[now]), *3 * [np.zeros_like(error)]], axis=-1)
+        into_v = np.stack(
+            [beta_1 * tau * (ay[now] - omega[now] * speed[now]), *3 * [np.zeros_like(error)]],
+            axis=-1,
+        )
         into_v[..., 3] = -omega[now] * offset[..., k, 0]
         into_e = np.zeros_like(into_v)
         into_e[..., 1] = -beta_2 * tau * pseudo
@@ -199,7 +233,9 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
         into_e[..., 3] = -offset[..., k, 1]
         v, e = (
             gamma_1[..., None] * v - (omega[now] * gain[..., 0])[..., None] * e + into_v,
-            (gamma_2 - gain[..., 1])[..., None] * e + (beta_2 * tau * omega[now])[..., None] * v + into_e,
+            (gamma_2 - gain[..., 1])[..., None] * e
+            + (beta_2 * tau * omega[now])[..., None] * v
+            + into_e,
         )
         parts[..., k, :], errors[now] = v, error
     return SubModels(parts[..., 0], parts[..., 1], parts[..., 2], parts[..., 3], errors)
@@ -220,11 +256,19 @@ def decomposed_estimate(estimator: Ksnn, recording: Recording) -> SubModels:
     """
     models = LocalModels.of(estimator)
     if abs(recording.rate_hz * models.step - 1.0) > 1e-9:
-        raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, the KS-NN works at {1.0 / models.step:g} Hz")
+        raise DataError(
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, the KS-NN works at {1.0 / models.step:g} Hz"
+        )
     if len(recording) <= models.n_window:
-        raise DataError(f"recording '{recording.id}' has {len(recording)} samples, a window and the one after it {models.n_window + 1}")
+        raise DataError(
+            f"recording '{recording.id}' has {len(recording)} samples, a window and the one after it {models.n_window + 1}"
+        )
     series = recording.stack(estimator.channels)
-    own = decomposed(models, np.moveaxis(sliding_window_view(series, models.n_window, axis=0)[:-1], 1, 2))
+    own = decomposed(
+        models, np.moveaxis(sliding_window_view(series, models.n_window, axis=0)[:-1], 1, 2)
+    )
     padding = np.full(models.n_window, np.nan)
     names = ("slip_rate", "pseudo_measurement", "speed", "bias", "error")
-    return SubModels(**{name: np.concatenate([padding, getattr(own, name)[:, -1]]) for name in names})
+    return SubModels(
+        **{name: np.concatenate([padding, getattr(own, name)[:, -1]]) for name in names}
+    )

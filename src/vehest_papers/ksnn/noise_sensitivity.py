@@ -63,17 +63,24 @@ class NoiseSensitivity:
         if self.memory is None:
             powers = np.stack([z**2, z, np.ones_like(z)], axis=-1)
             below = powers @ self.denominator
-            to_ay, to_ax = (powers @ numerator / below for numerator in (self.numerator_ay, self.numerator_ax))
+            to_ay, to_ax = (
+                powers @ numerator / below for numerator in (self.numerator_ay, self.numerator_ax)
+            )
         else:
             delays = z[..., None] ** -np.arange(self.memory + 1.0)
-            to_ay, to_ax = (delays @ response for response in self.impulse_responses(self.memory + 1))
+            to_ay, to_ax = (
+                delays @ response for response in self.impulse_responses(self.memory + 1)
+            )
         return to_ay.astype(np.complex128), to_ax.astype(np.complex128)
 
     def impulse_responses(self, n_samples: int) -> tuple[FloatArray, FloatArray]:
         """δv̂ after an impulse of one sample of δa_y and of δa_x, lags 0 to ``n_samples - 1``."""
         impulse = np.zeros(n_samples)
         impulse[: 1 if n_samples else 0] = 1.0
-        to_ay, to_ax = (signal.lfilter(numerator, self.denominator, impulse) for numerator in (self.numerator_ay, self.numerator_ax))
+        to_ay, to_ax = (
+            signal.lfilter(numerator, self.denominator, impulse)
+            for numerator in (self.numerator_ay, self.numerator_ax)
+        )
         if self.memory is not None:
             to_ay[self.memory + 1 :] = 0.0
             to_ax[self.memory + 1 :] = 0.0
@@ -84,7 +91,11 @@ class NoiseSensitivity:
         if self.memory is not None:
             return self.impulse_responses(self.memory + 1)
         radius = float(np.abs(self.poles[0])) if np.any(self.denominator[1:]) else 0.0
-        length = LONGEST if radius >= 1.0 else min(100 + math.ceil(math.log(NEGLIGIBLE) / math.log(max(radius, 1e-3))), LONGEST)
+        length = (
+            LONGEST
+            if radius >= 1.0
+            else min(100 + math.ceil(math.log(NEGLIGIBLE) / math.log(max(radius, 1e-3))), LONGEST)
+        )
         return self.impulse_responses(length)
 
     def white_noise_gains(self) -> tuple[float, float]:
@@ -104,7 +115,9 @@ class NoiseSensitivity:
         """
         frequency = np.linspace(0.0, highest_hz, n_lines)
         to_ay, to_ax = self.response(frequency)
-        return float(np.sqrt(np.trapezoid(np.abs(to_ay) ** 2, frequency))), float(np.sqrt(np.trapezoid(np.abs(to_ax) ** 2, frequency)))
+        return float(np.sqrt(np.trapezoid(np.abs(to_ay) ** 2, frequency))), float(
+            np.sqrt(np.trapezoid(np.abs(to_ax) ** 2, frequency))
+        )
 
 
 def ksnn_sensitivity(model: LpvModel, yaw_rate: float) -> NoiseSensitivity:

@@ -13,7 +13,15 @@ FIXED_LAG = "Factor graph (FG), fixed lag of"
 ZERO, STATIC_MAP, KINEMATIC = "v = 0", "Static map", "Kinematic integration"
 BASELINES = (ZERO, STATIC_MAP, KINEMATIC)  # not in the paper; they stand in every table
 
-CATEGORIES = (LUENBERGER, GRU, LSTM, LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)  # in the order of Tables IV and V
+CATEGORIES = (
+    LUENBERGER,
+    GRU,
+    LSTM,
+    LINEAR_BIAS,
+    NONLINEAR_BIAS,
+    LINEAR,
+    NONLINEAR,
+)  # in the order of Tables IV and V
 
 STRUCTURED = (LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
 WITHOUT_BIAS, WITH_BIAS = (LINEAR, NONLINEAR), (LINEAR_BIAS, NONLINEAR_BIAS)
@@ -79,7 +87,14 @@ TABLE_V: Mapping[str, Published] = {
     NONLINEAR: Published("P = 2, Q = 2", 28, 0.182, 0.208, 0.059, 0.171),
 }
 
-TABLE_VI: Mapping[str, float] = {FACTOR_GRAPH: 0.57, KALMAN: 0.87, LUENBERGER: 0.73, GRU: 0.57, LSTM: 0.52, NONLINEAR: 0.40}
+TABLE_VI: Mapping[str, float] = {
+    FACTOR_GRAPH: 0.57,
+    KALMAN: 0.87,
+    LUENBERGER: 0.73,
+    GRU: 0.57,
+    LSTM: 0.52,
+    NONLINEAR: 0.40,
+}
 """RMSE of the sideslip angle on F-2 [deg]."""
 
 TABLE_VII: Mapping[tuple[str, bool], Published] = {

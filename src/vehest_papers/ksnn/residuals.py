@@ -51,7 +51,9 @@ class Panel:
 def residuals(panels: Sequence[Panel]) -> list[Block]:
     """Spectra of v and of the residuals, one panel a test set, and how far they lie apart; raises `DataError` for too short a range."""
     spectra = [_spectra(panel) for panel in panels]
-    frame = pd.DataFrame([row for panel, own in zip(panels, spectra, strict=True) for row in _rows(panel, own)])
+    frame = pd.DataFrame(
+        [row for panel, own in zip(panels, spectra, strict=True) for row in _rows(panel, own)]
+    )
     return [_figure(panels, spectra), _in_words(panels, spectra), _table(frame, panels)]
 
 
@@ -63,17 +65,31 @@ def _spectra(panel: Panel) -> list[Periodogram]:
 
 
 def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]]) -> Figure:
-    lines = lines_of(dict.fromkeys((own.estimator, own.variant) for panel in panels for own in panel.estimators))
+    lines = lines_of(
+        dict.fromkeys((own.estimator, own.variant) for panel in panels for own in panel.estimators)
+    )
     with new_figure(DOUBLE_COLUMN * 0.85, 0.7 + 2.1 * len(panels)) as figure:
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axes, panel, (signal, *errors) in zip(grid, panels, spectra, strict=True):
-            shown = (signal.frequency > 1.5 * signal.frequency[1]) & (signal.frequency <= min(HIGHEST_HZ, 0.4 * panel.rate_hz))
+            shown = (signal.frequency > 1.5 * signal.frequency[1]) & (
+                signal.frequency <= min(HIGHEST_HZ, 0.4 * panel.rate_hz)
+            )
             hz = signal.frequency[shown]
-            axes.semilogx(hz, 10 * np.log10(signal.density[shown]), color=REFERENCE_COLOUR, linewidth=1.5, label="measured v")
+            axes.semilogx(
+                hz,
+                10 * np.log10(signal.density[shown]),
+                color=REFERENCE_COLOUR,
+                linewidth=1.5,
+                label="measured v",
+            )
             for own, error in zip(panel.estimators, errors, strict=True):
                 line = lines[own.estimator, own.variant]
                 axes.semilogx(
-                    hz, 10 * np.log10(error.density[shown]), color=line.colour, linestyle=line.dash, label=f"error of {own.title}"
+                    hz,
+                    10 * np.log10(error.density[shown]),
+                    color=line.colour,
+                    linestyle=line.dash,
+                    label=f"error of {own.title}",
                 )
             axes.set_title(f"{panel.title} ({panel.data})", loc="left")
             axes.set_ylabel("PSD [dB re 1 (m/s)²/Hz]")
@@ -81,7 +97,10 @@ def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]]) -
         grid[-1].set_xlabel("frequency [Hz]")
         plain_frequencies(grid[-1])
         legend_above(figure, *grid, columns=2)
-    models = ". ".join(f"{panel.title}: {'; '.join(own.title for own in panel.estimators)} ({panel.data})" for panel in panels)
+    models = ". ".join(
+        f"{panel.title}: {'; '.join(own.title for own in panel.estimators)} ({panel.data})"
+        for panel in panels
+    )
     caption = (
         f"Power spectral densities of the lateral velocity and of the estimation errors, Figure 8 of the paper. {models}. Welch's method, "
         f"Hann windows of {SEGMENT_SECONDS:g} s, {listed([str(own[0].n_segments) for own in spectra])} segments."
@@ -97,7 +116,10 @@ def _rows(panel: Panel, spectra: Sequence[Periodogram]) -> list[dict[str, object
             "data": panel.data,
             "estimator": own.title,
             **{f"below_v_{hz:g}": decibels(signal.level(hz), error.level(hz)) for hz in READ_AT_HZ},
-            **{f"above_ksnn_{hz:g}": decibels(error.level(hz), errors[0].level(hz)) for hz in READ_AT_HZ},
+            **{
+                f"above_ksnn_{hz:g}": decibels(error.level(hz), errors[0].level(hz))
+                for hz in READ_AT_HZ
+            },
             "exceeds_v_from": exceeding(signal, error),
         }
         for own, error in zip(panel.estimators, errors, strict=True)
@@ -107,9 +129,13 @@ def _rows(panel: Panel, spectra: Sequence[Periodogram]) -> list[dict[str, object
 def exceeding(signal: Periodogram, error: Periodogram) -> float:
     """Frequency from which on the error has more power than the signal in every third of an octave; NaN if nowhere [Hz]."""
     top = min(HIGHEST_HZ, 0.8 * float(signal.frequency[-1]))
-    centres = [own for own in 10.0 ** (np.arange(-20, 21) / 10.0) if signal.frequency[2] <= own <= top]
+    centres = [
+        own for own in 10.0 ** (np.arange(-20, 21) / 10.0) if signal.frequency[2] <= own <= top
+    ]
     above = [error.level(hz) > signal.level(hz) for hz in centres]
-    last_below = max((position for position, is_above in enumerate(above) if not is_above), default=-1)
+    last_below = max(
+        (position for position, is_above in enumerate(above) if not is_above), default=-1
+    )
     return float(centres[last_below + 1]) if last_below + 1 < len(centres) else math.nan
 
 
@@ -118,8 +144,13 @@ def _table(frame: pd.DataFrame, panels: Sequence[Panel]) -> Table:
         "panel": Column("test"),
         "data": Column("data"),
         "estimator": Column("estimator"),
-        **{f"below_v_{hz:g}": Column(f"below v at {hz:g} Hz [dB]", decimals=1) for hz in READ_AT_HZ},
-        **{f"above_ksnn_{hz:g}": Column(f"above KS-NN at {hz:g} Hz [dB]", decimals=1) for hz in READ_AT_HZ},
+        **{
+            f"below_v_{hz:g}": Column(f"below v at {hz:g} Hz [dB]", decimals=1) for hz in READ_AT_HZ
+        },
+        **{
+            f"above_ksnn_{hz:g}": Column(f"above KS-NN at {hz:g} Hz [dB]", decimals=1)
+            for hz in READ_AT_HZ
+        },
         "exceeds_v_from": Column("exceeds v from [Hz]", decimals=2),
     }
     kinds = listed(list(dict.fromkeys(panel.data for panel in panels)))
@@ -130,9 +161,17 @@ def _table(frame: pd.DataFrame, panels: Sequence[Panel]) -> Table:
 def _in_words(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]]) -> str:
     paragraphs = []
     for panel, (signal, *errors) in zip(panels, spectra, strict=True):
-        compared = "; ".join(_beside(panel, own, error, errors[0]) for own, error in zip(panel.estimators[1:], errors[1:], strict=True))
-        crossings = [(own.title, exceeding(signal, error)) for own, error in zip(panel.estimators, errors, strict=True)]
-        noisy = [f"{title} from {fixed(hz, 1)} Hz on" for title, hz in crossings if not math.isnan(hz)]
+        compared = "; ".join(
+            _beside(panel, own, error, errors[0])
+            for own, error in zip(panel.estimators[1:], errors[1:], strict=True)
+        )
+        crossings = [
+            (own.title, exceeding(signal, error))
+            for own, error in zip(panel.estimators, errors, strict=True)
+        ]
+        noisy = [
+            f"{title} from {fixed(hz, 1)} Hz on" for title, hz in crossings if not math.isnan(hz)
+        ]
         quiet = [title for title, hz in crossings if math.isnan(hz)]
         sentences = [f"**{panel.title}** ({panel.data})."]
         if compared:
@@ -149,7 +188,14 @@ def _beside(panel: Panel, own: Residuals, error: Periodogram, first: Periodogram
     """How far one error lies above the first, and above the paper's where it is given."""
     levels = [decibels(error.level(hz), first.level(hz)) for hz in READ_AT_HZ]
     sides = [
-        f"{fixed(abs(level), 1)} dB {'above' if level >= 0 else 'below'} at {hz:g} Hz" for level, hz in zip(levels, READ_AT_HZ, strict=True)
+        f"{fixed(abs(level), 1)} dB {'above' if level >= 0 else 'below'} at {hz:g} Hz"
+        for level, hz in zip(levels, READ_AT_HZ, strict=True)
     ]
-    known = own.estimator == "lstm" and "corvette" in panel.test.lower() and "ferrari" in panel.trained_on.lower()
-    return f"{own.title} {listed(sides)}" + (f" (the paper, on the real cars: {PUBLISHED_ABOVE_KSNN} above)" if known else "")
+    known = (
+        own.estimator == "lstm"
+        and "corvette" in panel.test.lower()
+        and "ferrari" in panel.trained_on.lower()
+    )
+    return f"{own.title} {listed(sides)}" + (
+        f" (the paper, on the real cars: {PUBLISHED_ABOVE_KSNN} above)" if known else ""
+    )

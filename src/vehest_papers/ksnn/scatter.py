@@ -31,7 +31,10 @@ def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
 
 
 def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
-    groups = {name: scheme.runs[scheme.runs["category"] == name] for name in dict.fromkeys(scheme.runs["category"])}
+    groups = {
+        name: scheme.runs[scheme.runs["category"] == name]
+        for name in dict.fromkeys(scheme.runs["category"])
+    }
     x, y = f"{metric}.{scheme.other}", f"{metric}.{scheme.own}"
     shown: list[float] = []
     for name in paper.CATEGORIES:
@@ -39,16 +42,42 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
             continue
         own, first = groups[name], groups[name].iloc[0]
         line = line_of(str(first["estimator"]), str(first["variant"]))
-        axes.scatter(own[x], own[y], s=5, marker=line.marker, color=line.colour, alpha=0.25, linewidths=0, zorder=2)
+        axes.scatter(
+            own[x],
+            own[y],
+            s=5,
+            marker=line.marker,
+            color=line.colour,
+            alpha=0.25,
+            linewidths=0,
+            zorder=2,
+        )
         picked = [chosen(runs) for _, runs in own.groupby(["estimator", "variant"], sort=False)]
         axes.scatter(
-            [run[x] for run in picked], [run[y] for run in picked], s=20, marker=line.marker, color=line.colour, label=name, zorder=4
+            [run[x] for run in picked],
+            [run[y] for run in picked],
+            s=20,
+            marker=line.marker,
+            color=line.colour,
+            label=name,
+            zorder=4,
         )
         shown += [value for run in picked for value in (run[x], run[y])]
         if name in scheme.published:
             theirs = scheme.published[name]
-            point = [1.0 - theirs.fvu(test) if metric == "r2" else theirs.rmse(test) for test in (scheme.other, scheme.own)]
-            axes.scatter(*point, s=34, marker=line.marker, facecolors="none", edgecolors=line.colour, linewidths=1.0, zorder=3)
+            point = [
+                1.0 - theirs.fvu(test) if metric == "r2" else theirs.rmse(test)
+                for test in (scheme.other, scheme.own)
+            ]
+            axes.scatter(
+                *point,
+                s=34,
+                marker=line.marker,
+                facecolors="none",
+                edgecolors=line.colour,
+                linewidths=1.0,
+                zorder=3,
+            )
             shown += point
     low, high = min(shown), max(shown)
     pad = 0.06 * (high - low)

@@ -43,7 +43,9 @@ class Scheme:
     part: PartArtefacts  # what was compared
     own: str  # test set of the car that is learnt on
     other: str  # test set of the car that is stopped on
-    published: Mapping[str, Published] = field(default_factory=dict)  # the paper's table of this scheme; empty where it has none
+    published: Mapping[str, Published] = field(
+        default_factory=dict
+    )  # the paper's table of this scheme; empty where it has none
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -65,12 +67,23 @@ class Scheme:
         run = self.chosen.get(category)
         if run is None:
             return []
-        return [model for model in self.part.models if (model.estimator, model.variant) == (run["estimator"], run["variant"])]
+        return [
+            model
+            for model in self.part.models
+            if (model.estimator, model.variant) == (run["estimator"], run["variant"])
+        ]
 
     def model(self, category: str) -> EvaluatedModel | None:
         """The model of the run that validation chooses."""
         run = self.chosen.get(category)
-        return next((model for model in self.models(category) if run is not None and model.seed == run["seed"]), None)
+        return next(
+            (
+                model
+                for model in self.models(category)
+                if run is not None and model.seed == run["seed"]
+            ),
+            None,
+        )
 
     @cached_property
     def _errors(self) -> dict[str, SegmentErrors]:
@@ -80,7 +93,10 @@ class Scheme:
         """Of all structures on a test set, named as `name_of` names them."""
         if test not in self._errors:
             groups = by_name(self.part.models)
-            segments = {"/".join(name): [segments_on(model, test) for model in models] for name, models in groups.items()}
+            segments = {
+                "/".join(name): [segments_on(model, test) for model in models]
+                for name, models in groups.items()
+            }
             self._errors[test] = SegmentErrors(segments, test)
         return self._errors[test]
 
@@ -105,5 +121,10 @@ class Scheme:
     def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:
         """Name in `errors` -> category, of all structures of these categories."""
         wanted = set(categories)
-        rows = self.runs[self.runs["category"].isin(wanted)].drop_duplicates(["estimator", "variant"])
-        return {f"{row['estimator']}/{row['variant']}": str(row["category"]) for row in rows.to_dict("records")}
+        rows = self.runs[self.runs["category"].isin(wanted)].drop_duplicates(
+            ["estimator", "variant"]
+        )
+        return {
+            f"{row['estimator']}/{row['variant']}": str(row["category"])
+            for row in rows.to_dict("records")
+        }

@@ -19,10 +19,17 @@ from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figur
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import percent_below
 from vehest_papers.ksnn.linear_system import LocalModels
-from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
+from vehest_papers.ksnn.noise_sensitivity import (
+    NoiseSensitivity,
+    ksnn_sensitivity,
+    luenberger_sensitivity,
+)
 from vehest_papers.ksnn.subjects import Trained
 
-YAW_RATES = (0.2, 0.4)  # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
+YAW_RATES = (
+    0.2,
+    0.4,
+)  # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
 LOWEST_HZ, HIGHEST_HZ = 0.01, 10.0
 CHANNELS = ("ay", "ax")
 INJECTED_SAMPLES = 200_000
@@ -46,14 +53,24 @@ def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) ->
     Raises `ConfigurationError` where it is neither a KS-NN nor a Luenberger observer.
     """
     if isinstance(estimator, Ksnn):
-        return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(estimator.settings.window)
+        return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(
+            estimator.settings.window
+        )
     if isinstance(estimator, Luenberger):
         return luenberger_sensitivity(estimator, yaw_rate)
-    raise ConfigurationError(f"noise sensitivities are known of 'ksnn' and 'luenberger', not of '{estimator.name}'")
+    raise ConfigurationError(
+        f"noise sensitivities are known of 'ksnn' and 'luenberger', not of '{estimator.name}'"
+    )
 
 
 def injected(
-    estimator: Estimator, yaw_rate: float, channel: str, *, n_samples: int = INJECTED_SAMPLES, seed: int = 0, error: float = 0.0
+    estimator: Estimator,
+    yaw_rate: float,
+    channel: str,
+    *,
+    n_samples: int = INJECTED_SAMPLES,
+    seed: int = 0,
+    error: float = 0.0,
 ) -> Injected:
     """Run an estimator through a steady turn with and without white noise in one acceleration.
 
@@ -66,23 +83,53 @@ def injected(
     """
     constants = {"yaw_rate": yaw_rate, "vx": SPEED, "ay": yaw_rate * SPEED, "ax": 0.0}
     clean = {name: np.full(n_samples, constants[name]) for name in estimator.channels}
-    noisy = {**clean, channel: clean[channel] + INJECTED_SIZE * np.random.default_rng(seed).standard_normal(n_samples)}
+    noisy = {
+        **clean,
+        channel: clean[channel]
+        + INJECTED_SIZE * np.random.default_rng(seed).standard_normal(n_samples),
+    }
     rate_hz = estimator.settings.rate_hz
-    runs = estimator.estimate([Recording("turn", "none", rate_hz, 0.0, channels, "simulated") for channels in (clean, noisy)])
+    runs = estimator.estimate(
+        [
+            Recording("turn", "none", rate_hz, 0.0, channels, "simulated")
+            for channels in (clean, noisy)
+        ]
+    )
     added = (runs[1]["vy"] - runs[0]["vy"])[SETTLING_SAMPLES:]
-    response = sensitivity_of(estimator, yaw_rate, error).whole_impulse_responses()[CHANNELS.index(channel)]
+    response = sensitivity_of(estimator, yaw_rate, error).whole_impulse_responses()[
+        CHANNELS.index(channel)
+    ]
     energy = float(np.sum(response**2))
-    n_correlated = float(np.sum((np.correlate(response, response, mode="full") / energy) ** 2)) if energy else 0.0
-    return Injected(float(np.sqrt(np.mean(added**2))) / INJECTED_SIZE, math.sqrt(n_correlated / (2 * len(added))))
+    n_correlated = (
+        float(np.sum((np.correlate(response, response, mode="full") / energy) ** 2))
+        if energy
+        else 0.0
+    )
+    return Injected(
+        float(np.sqrt(np.mean(added**2))) / INJECTED_SIZE,
+        math.sqrt(n_correlated / (2 * len(added))),
+    )
 
 
-def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES, error: float = 0.0) -> list[Block]:
+def sensitivities(
+    columns: Sequence[tuple[Trained, Trained]],
+    *,
+    n_samples: int = INJECTED_SAMPLES,
+    error: float = 0.0,
+) -> list[Block]:
     """Magnitudes of H_Y and H_X, a column a training vehicle (KS-NN and Luenberger observer), with the check by injection.
 
     ``error`` [m/s] is the û - u_m at which nonlinear networks are linearised. Raises `ConfigurationError` for estimators of another kind.
     """
-    frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)]) for pair in columns]
-    return [_figure(columns, error), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
+    frames = [
+        pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)])
+        for pair in columns
+    ]
+    return [
+        _figure(columns, error),
+        _in_words(columns, frames),
+        _table(pd.concat(frames, ignore_index=True), n_samples),
+    ]
 
 
 def _rows(own: Trained, n_samples: int, error: float) -> list[dict[str, object]]:
@@ -90,8 +137,13 @@ def _rows(own: Trained, n_samples: int, error: float) -> list[dict[str, object]]
     for yaw_rate in YAW_RATES:
         closed = sensitivity_of(own.estimator, yaw_rate, error)
         for position, channel in enumerate(CHANNELS):
-            gain, band = closed.white_noise_gains()[position], closed.band_gains(HIGHEST_HZ)[position]
-            found = injected(own.estimator, yaw_rate, channel, n_samples=n_samples, seed=len(rows), error=error)
+            gain, band = (
+                closed.white_noise_gains()[position],
+                closed.band_gains(HIGHEST_HZ)[position],
+            )
+            found = injected(
+                own.estimator, yaw_rate, channel, n_samples=n_samples, seed=len(rows), error=error
+            )
             rows.append(
                 {
                     "trained_on": own.trained_on,
@@ -143,20 +195,53 @@ def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
                     windowed = sensitivity_of(own.estimator, yaw_rate, error)
                     strong = replace(windowed, memory=None) if _settles(windowed) else windowed
                     label = f"{own.estimator.title}, |ω| = {yaw_rate:g} rad/s"
-                    for axes, response, cut in zip(column, strong.response(frequency), windowed.response(frequency), strict=True):
-                        axes.loglog(frequency, np.abs(response), color=line.colour, linestyle=dash, label=label)
+                    for axes, response, cut in zip(
+                        column,
+                        strong.response(frequency),
+                        windowed.response(frequency),
+                        strict=True,
+                    ):
+                        axes.loglog(
+                            frequency,
+                            np.abs(response),
+                            color=line.colour,
+                            linestyle=dash,
+                            label=label,
+                        )
                         if strong is not windowed and windowed.memory is not None:
-                            axes.loglog(frequency, np.abs(cut), color=line.colour, linestyle=dash, linewidth=0.6, alpha=0.75)
+                            axes.loglog(
+                                frequency,
+                                np.abs(cut),
+                                color=line.colour,
+                                linestyle=dash,
+                                linewidth=0.6,
+                                alpha=0.75,
+                            )
             column[0].set_title(f"trained on {pair[0].trained_on}", loc="left")
             column[1].set_xlabel("frequency [Hz]")
-        for row, label in zip(grid, ("|$H_Y$| [(m/s)/(m/s²)]", "|$H_X$| [(m/s)/(m/s²)]"), strict=True):
+        for row, label in zip(
+            grid, ("|$H_Y$| [(m/s)/(m/s²)]", "|$H_X$| [(m/s)/(m/s²)]"), strict=True
+        ):
             row[0].set_ylabel(label)
-            top = max(float(np.max(line.get_ydata())) for axes in row for line in axes.lines if len(line.get_ydata()))
+            top = max(
+                float(np.max(line.get_ydata()))
+                for axes in row
+                for line in axes.lines
+                if len(line.get_ydata())
+            )
             row[0].set_ylim(top / 5000.0, 1.6 * top)
         grid[0, 0].set_xlim(LOWEST_HZ, HIGHEST_HZ)
         legend_above(figure, grid[0, 0], columns=2)
-    nonlinear = [own for own, _ in columns if isinstance(own.estimator, Ksnn) and own.estimator.settings.n_hidden]
-    linearised = f" The KS-NN is nonlinear: shown is its linearisation at û − u_m = {error:g} m/s." if nonlinear else ""
+    nonlinear = [
+        own
+        for own, _ in columns
+        if isinstance(own.estimator, Ksnn) and own.estimator.settings.n_hidden
+    ]
+    linearised = (
+        f" The KS-NN is nonlinear: shown is its linearisation at û − u_m = {error:g} m/s."
+        if nonlinear
+        else ""
+    )
     unstable = [
         (own, yaw_rate)
         for pair in columns
@@ -184,15 +269,28 @@ def _settles(sensitivity: NoiseSensitivity) -> bool:
 def _in_words(columns: Sequence[tuple[Trained, Trained]], frames: Sequence[pd.DataFrame]) -> str:
     sentences = []
     for (ksnn, luenberger), frame in zip(columns, frames, strict=True):
-        bands = {(row["estimator"], row["yaw_rate"], row["channel"]): float(row["band"]) for row in frame.to_dict("records")}
+        bands = {
+            (row["estimator"], row["yaw_rate"], row["channel"]): float(row["band"])
+            for row in frame.to_dict("records")
+        }
         words = []
         for yaw_rate in YAW_RATES:
-            own, other = ([bands[title, yaw_rate, channel] for channel in CHANNELS] for title in (ksnn.named, luenberger.named))
+            own, other = (
+                [bands[title, yaw_rate, channel] for channel in CHANNELS]
+                for title in (ksnn.named, luenberger.named)
+            )
             if not any(other):
-                words.append(f"At |ω| = {yaw_rate:g} rad/s the Luenberger observer is reset and passes nothing.")
+                words.append(
+                    f"At |ω| = {yaw_rate:g} rad/s the Luenberger observer is reset and passes nothing."
+                )
                 continue
-            compared = [f"{_compared(*sizes)} of a_{channel[1]}" for channel, *sizes in zip(CHANNELS, own, other, strict=True)]
-            words.append(f"At |ω| = {yaw_rate:g} rad/s the KS-NN passes {listed(compared)} than the Luenberger observer.")
+            compared = [
+                f"{_compared(*sizes)} of a_{channel[1]}"
+                for channel, *sizes in zip(CHANNELS, own, other, strict=True)
+            ]
+            words.append(
+                f"At |ω| = {yaw_rate:g} rad/s the KS-NN passes {listed(compared)} than the Luenberger observer."
+            )
         sentences.append(f"**Trained on {ksnn.trained_on}.** {' '.join(words)}")
     everything = pd.concat(frames)
     deviations = (everything["difference_percent"].abs() / everything["scatter_percent"]).dropna()
@@ -205,4 +303,8 @@ def _in_words(columns: Sequence[tuple[Trained, Trained]], frames: Sequence[pd.Da
 
 
 def _compared(value: float, other: float) -> str:
-    return f"{percent_below(value, other)} less" if value <= other else f"{100 * (value / other - 1):.0f} % more"
+    return (
+        f"{percent_below(value, other)} less"
+        if value <= other
+        else f"{100 * (value / other - 1):.0f} % more"
+    )

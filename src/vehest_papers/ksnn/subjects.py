@@ -19,7 +19,11 @@ CAR_COLOURS = {
     ("ferrari", "simulated"): "#ee8a4c",
 }
 OTHER_CARS = ("#00876c", "#a6761d", "#5b8c00", "#6d4c41")
-CAR_TITLES = {"corvette_grand_sport": "Corvette Grand Sport", "ferrari_250_lm": "Ferrari 250 LM", "ferrari_250lm": "Ferrari 250 LM"}
+CAR_TITLES = {
+    "corvette_grand_sport": "Corvette Grand Sport",
+    "ferrari_250_lm": "Ferrari 250 LM",
+    "ferrari_250lm": "Ferrari 250 LM",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,12 @@ class Trained:
     def of(cls, model: EvaluatedModel, trained_on: str) -> Trained:
         """Load it from the folder of an evaluated model; raises `MissingError` where there is no model, `DataError` where it is damaged."""
         estimator = load_model(model.model_folder)
-        return cls(estimator, model.title, trained_on, model.seed if estimator.name != "luenberger" else None)
+        return cls(
+            estimator,
+            model.title,
+            trained_on,
+            model.seed if estimator.name != "luenberger" else None,
+        )
 
     @property
     def named(self) -> str:
@@ -56,7 +65,10 @@ def car_title(vehicle: str) -> str:
 def car_colours(groups: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
     """A colour a car and kind: blues for the Corvette, red and orange for the Ferrari, others in the order of their names."""
     others = iter(OTHER_CARS * 8)
-    known = {(vehicle, kind): CAR_COLOURS.get((_make(vehicle), kind)) for vehicle, kind in sorted(set(groups))}
+    known = {
+        (vehicle, kind): CAR_COLOURS.get((_make(vehicle), kind))
+        for vehicle, kind in sorted(set(groups))
+    }
     return {group: colour or next(others) for group, colour in known.items()}
 
 

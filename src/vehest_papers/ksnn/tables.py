@@ -48,29 +48,61 @@ def instances(runs: pd.DataFrame) -> Table:
     return Table("table_3", "Candidates (Table III of the paper).", pd.DataFrame(rows), columns)
 
 
-def across_cars(schemes: Sequence[Scheme], name: str, caption: str, without: Sequence[str] = ()) -> Table:
+def across_cars(
+    schemes: Sequence[Scheme], name: str, caption: str, without: Sequence[str] = ()
+) -> Table:
     """Tables IV and V and Figure 6 in one: of each category the structure chosen by validation, over all seeds, with 95 % intervals."""
     rows = []
-    third, published = any(THIRD in scheme.part.split.tests for scheme in schemes), any(scheme.published for scheme in schemes)
+    third, published = (
+        any(THIRD in scheme.part.split.tests for scheme in schemes),
+        any(scheme.published for scheme in schemes),
+    )
     for scheme in schemes:
-        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if THIRD in scheme.part.split.tests else {})
+        tests = {"own": scheme.own, "other": scheme.other} | (
+            {"third": THIRD} if THIRD in scheme.part.split.tests else {}
+        )
         for category, run in scheme.chosen.items():
             if category in without:
                 continue
-            key, known, structure = scheme.name_of(category), scheme.published.get(category), str(run["structure"])
-            row: dict[str, object] = {"scheme": scheme.title, "model": category, "structure": structure}
+            key, known, structure = (
+                scheme.name_of(category),
+                scheme.published.get(category),
+                str(run["structure"]),
+            )
+            row: dict[str, object] = {
+                "scheme": scheme.title,
+                "model": category,
+                "structure": structure,
+            }
             row["candidate"] = category if structure == MISSING else f"{category}, {structure}"
-            row |= {"n_seeds": len(scheme.models(category)), "n_parameters": int(run["n_parameters"])}
-            row |= {f"paper_fvu_{word}": known.fvu(tests[word]) if known else math.nan for word in ("own", "other")}
+            row |= {
+                "n_seeds": len(scheme.models(category)),
+                "n_parameters": int(run["n_parameters"]),
+            }
+            row |= {
+                f"paper_fvu_{word}": known.fvu(tests[word]) if known else math.nan
+                for word in ("own", "other")
+            }
             for word, test in tests.items():
                 errors = scheme.errors(test)
-                row |= {f"{metric}_{word}": errors.value(key, metric) for metric in ("fvu", "rmse_vy")}
-                row |= {f"{metric}_{word}_shown": errors.in_words(key, metric) for metric in ("fvu", "rmse_vy")}
+                row |= {
+                    f"{metric}_{word}": errors.value(key, metric) for metric in ("fvu", "rmse_vy")
+                }
+                row |= {
+                    f"{metric}_{word}_shown": errors.in_words(key, metric)
+                    for metric in ("fvu", "rmse_vy")
+                }
             rows.append(row)
     columns = {"scheme": Column("scheme"), "candidate": Column("model")}
     for word, title in (("own", "own car"), ("other", "other car")):
-        columns |= {f"paper_fvu_{word}": Column(f"FVU, {title}, paper", decimals=3)} if published else {}
-        columns |= {f"fvu_{word}_shown" if word == "other" else f"fvu_{word}": Column(f"FVU, {title}", decimals=3)}
+        columns |= (
+            {f"paper_fvu_{word}": Column(f"FVU, {title}, paper", decimals=3)} if published else {}
+        )
+        columns |= {
+            f"fvu_{word}_shown" if word == "other" else f"fvu_{word}": Column(
+                f"FVU, {title}", decimals=3
+            )
+        }
     columns |= {"rmse_vy_other": Column("RMSE(v), other car [m/s]", decimals=3)}
     if third:
         columns |= {"fvu_third_shown": Column("FVU, third car")}
@@ -95,11 +127,18 @@ def chosen_runs(scheme: Scheme, name: str, caption: str) -> Table:
             row[f"rmse_vy_{test}"] = run[f"rmse_vy.{test}"]
         row["epochs"] = run["epochs"] if run["epochs"] > 0 else math.nan
         rows.append(row)
-    columns = {"model": Column("model"), "paper_structure": Column("in the paper"), "structure": Column("structure")}
+    columns = {
+        "model": Column("model"),
+        "paper_structure": Column("in the paper"),
+        "structure": Column("structure"),
+    }
     columns |= {"n_parameters": Column("params", decimals=0), "seed": Column("seed", decimals=0)}
     for test in (scheme.own, scheme.other):
         title = SET_TITLES.get(test, test)
-        columns |= {f"paper_fvu_{test}": Column(f"{title} FVU, paper", decimals=3), f"fvu_{test}": Column("ours", decimals=3)}
+        columns |= {
+            f"paper_fvu_{test}": Column(f"{title} FVU, paper", decimals=3),
+            f"fvu_{test}": Column("ours", decimals=3),
+        }
         columns |= {f"paper_rmse_vy_{test}": Column(f"{title} RMSE(v) [m/s], paper", decimals=3)}
         columns |= {f"rmse_vy_{test}": Column("ours", decimals=3)}
     columns["epochs"] = Column("epochs", decimals=0)
@@ -110,7 +149,11 @@ def small_cars(pairs: Sequence[Scheme]) -> Table:
     """Pairs of small cars: FVU on the car that was stopped on, a row a category."""
     categories = dict.fromkeys(category for scheme in pairs for category in scheme.chosen)
     rows = [
-        {"model": category} | {scheme.name: scheme.errors(scheme.other).in_words(scheme.name_of(category), "fvu") for scheme in pairs}
+        {"model": category}
+        | {
+            scheme.name: scheme.errors(scheme.other).in_words(scheme.name_of(category), "fvu")
+            for scheme in pairs
+        }
         for category in categories
     ]
     rmse = {scheme.name: f"{scheme.title}" for scheme in pairs}
@@ -119,17 +162,33 @@ def small_cars(pairs: Sequence[Scheme]) -> Table:
         "and RMSE(v) stand in [this table](tables/small_cars_all.csv)."
     )
     return Table(
-        "small_cars", caption, pd.DataFrame(rows), {"model": Column("model"), **{name: Column(title) for name, title in rmse.items()}}
+        "small_cars",
+        caption,
+        pd.DataFrame(rows),
+        {"model": Column("model"), **{name: Column(title) for name, title in rmse.items()}},
     )
 
 
-def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str) -> Table:
+def sideslip(
+    schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str
+) -> Table:
     """Table VI: RMSE of the sideslip angle: F-2 of scheme 2, one drive of the real Ferrari, and its whole drive by what learns nothing."""
     rows = []
-    lags = [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)] if whole is not None else []
+    lags = (
+        [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)]
+        if whole is not None
+        else []
+    )
     for category in [*paper.BASELINES, *paper.TABLE_VI, *lags]:
-        row: dict[str, object] = {"model": category, "paper": paper.TABLE_VI.get(category, math.nan)}
-        for column, runs, test in (("real_drive", drive, "test"), ("real_whole", whole, "test"), ("scheme_2", schemes, "f2")):
+        row: dict[str, object] = {
+            "model": category,
+            "paper": paper.TABLE_VI.get(category, math.nan),
+        }
+        for column, runs, test in (
+            ("real_drive", drive, "test"),
+            ("real_whole", whole, "test"),
+            ("scheme_2", schemes, "f2"),
+        ):
             own = runs[runs["category"] == category] if runs is not None else pd.DataFrame()
             row[column] = chosen(own)[f"rmse_sideslip.{test}"] if len(own) else math.nan
         rows.append(row)
@@ -155,23 +214,40 @@ def regularisation(with_it: pd.DataFrame, without: pd.DataFrame) -> Table:
     plain = {(name, True): None for name in paper.BASELINES}
     for (category, regularised), published in {**plain, **paper.TABLE_VII}.items():
         runs = with_it if regularised else without
-        own = runs[(runs["category"] == category) & ((published is None) | (runs["structure"] == getattr(published, "structure", "")))]
+        own = runs[
+            (runs["category"] == category)
+            & ((published is None) | (runs["structure"] == getattr(published, "structure", "")))
+        ]
         if own.empty:
             continue
         run = chosen(own)
         row: dict[str, object] = {
             "model": category if published is None else f"{category}, {published.structure}",
-            "regularisation": MISSING if published is None else "with" if regularised else "without",
+            "regularisation": MISSING
+            if published is None
+            else "with"
+            if regularised
+            else "without",
             "n_parameters": int(run["n_parameters"]),
             "epochs": run["epochs"] if run["epochs"] > 0 else math.nan,
         }
         for test in SETS:
             mean, half = interval(own[f"fvu.{test}"].to_numpy(dtype=float))
-            row |= {f"paper_fvu_{test}": published.fvu(test) if published else math.nan, f"fvu_{test}": run[f"fvu.{test}"]}
+            row |= {
+                f"paper_fvu_{test}": published.fvu(test) if published else math.nan,
+                f"fvu_{test}": run[f"fvu.{test}"],
+            }
             row |= {f"fvu_seeds_{test}": mean_and_half(mean, half, 3)}
-            row |= {f"paper_rmse_vy_{test}": published.rmse(test) if published else math.nan, f"rmse_vy_{test}": run[f"rmse_vy.{test}"]}
+            row |= {
+                f"paper_rmse_vy_{test}": published.rmse(test) if published else math.nan,
+                f"rmse_vy_{test}": run[f"rmse_vy.{test}"],
+            }
         rows.append(row)
-    columns = {"model": Column("model"), "regularisation": Column("regularisation"), "n_parameters": Column("params", decimals=0)}
+    columns = {
+        "model": Column("model"),
+        "regularisation": Column("regularisation"),
+        "n_parameters": Column("params", decimals=0),
+    }
     for test, title in SETS.items():
         columns[f"paper_fvu_{test}"] = Column(f"{title} FVU, paper", decimals=3)
         columns[f"fvu_{test}"] = Column(f"{title} FVU, ours", decimals=3)
@@ -195,7 +271,11 @@ def stopping(parts: Mapping[str, pd.DataFrame], titles: Mapping[str, str]) -> Ta
             if own.empty:
                 continue
             row: dict[str, object] = {"part": titles[name], "model": category, "fits": len(own)}
-            row |= {"least": own["epochs"].min(), "median": own["epochs"].median(), "most": own["epochs"].max()}
+            row |= {
+                "least": own["epochs"].min(),
+                "median": own["epochs"].median(),
+                "most": own["epochs"].max(),
+            }
             rows.append(row)
     columns = {
         "part": Column("part"),
@@ -214,13 +294,26 @@ def candidates(runs: pd.DataFrame, tests: Sequence[str]) -> pd.DataFrame:
     rows = []
     for (estimator, variant), own in runs.groupby(["estimator", "variant"], sort=False):
         run = chosen(own)
-        row = {"estimator": estimator, "variant": variant, "category": run["category"], "n_parameters": int(run["n_parameters"])}
-        row |= {"n_seeds": len(own), "seed": int(run["seed"]), "rmse_vy_validation": run["rmse_vy.validation"]}
-        row |= {f"epochs_{what}": getattr(own["epochs"], what)() for what in ("min", "median", "max")}
+        row = {
+            "estimator": estimator,
+            "variant": variant,
+            "category": run["category"],
+            "n_parameters": int(run["n_parameters"]),
+        }
+        row |= {
+            "n_seeds": len(own),
+            "seed": int(run["seed"]),
+            "rmse_vy_validation": run["rmse_vy.validation"],
+        }
+        row |= {
+            f"epochs_{what}": getattr(own["epochs"], what)() for what in ("min", "median", "max")
+        }
         for test in tests:
             for metric in ("fvu", "r2", "rmse_vy", "rmse_sideslip"):
                 row[f"{metric}_{test}"] = run[f"{metric}.{test}"]
-            row[f"fvu_mean_{test}"], row[f"fvu_half_{test}"] = interval(own[f"fvu.{test}"].to_numpy(dtype=float))
+            row[f"fvu_mean_{test}"], row[f"fvu_half_{test}"] = interval(
+                own[f"fvu.{test}"].to_numpy(dtype=float)
+            )
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -236,13 +329,28 @@ def whether_an_order_means_anything(scheme: Scheme) -> str:
     does not depend on structure alone.
     """
     own, other = scheme.errors(scheme.own), scheme.errors(scheme.other)
-    names = {category: scheme.name_of(category) for category in scheme.chosen if category not in paper.BASELINES}
-    limit = min((1.0, *(own.value(scheme.name_of(name), "fvu") for name in paper.BASELINES if name in scheme.chosen)))
+    names = {
+        category: scheme.name_of(category)
+        for category in scheme.chosen
+        if category not in paper.BASELINES
+    }
+    limit = min(
+        (
+            1.0,
+            *(
+                own.value(scheme.name_of(name), "fvu")
+                for name in paper.BASELINES
+                if name in scheme.chosen
+            ),
+        )
+    )
     failed = [category for category, name in names.items() if not own.value(name, "fvu") <= limit]
     fvu = {category: other.value(name, "fvu") for category, name in names.items()}
     order = sorted((name for name in fvu if math.isfinite(fvu[name])), key=fvu.__getitem__)
     listing = ", ".join(f"{name} ({fixed(fvu[name], 3)})" for name in order)
-    words = f"**{scheme.title}.** Order by FVU on the car that was stopped on, best first: {listing}."
+    words = (
+        f"**{scheme.title}.** Order by FVU on the car that was stopped on, best first: {listing}."
+    )
     if failed:
         where = f"on the car that they learnt on themselves {listed(failed)} do no better than the baselines"
         return f"{words} No order of families is read off this: {where}."
@@ -250,6 +358,10 @@ def whether_an_order_means_anything(scheme: Scheme) -> str:
         return f"{words} All leave more than the whole variance of v: none knows that car."
     if {paper.LUENBERGER, *paper.PLAIN, *paper.WITHOUT_BIAS} <= set(fvu):
         middle = fvu[paper.LUENBERGER]
-        if max(fvu[name] for name in paper.WITHOUT_BIAS) < middle < min(fvu[name] for name in paper.PLAIN):
+        if (
+            max(fvu[name] for name in paper.WITHOUT_BIAS)
+            < middle
+            < min(fvu[name] for name in paper.PLAIN)
+        ):
             words += " KS-NN without biases before the observer, the observer before GRU and LSTM: the paper's order of families."
     return words

@@ -25,7 +25,9 @@ from vehest_papers.learned_ukf.lengths import epoch_claim, figure_7, length_comp
 
 DIAGONAL, CURVATURE, SCRATCH, LENGTH = "diagonal", "curvature", "scratch", "length_"
 SHOWN = "Added after the tests had been seen for the methods above; rules fixed before these candidates were trained (docs/learned_ukf.md)."
-CELLS = "Cells: both MSE, then their difference with its interval, corrected by Holm within each tyre."
+CELLS = (
+    "Cells: both MSE, then their difference with its interval, corrected by Holm within each tyre."
+)
 A = "tyre_a"
 
 
@@ -42,25 +44,59 @@ class Additions:
     def front(self) -> list[Table]:
         """The table of claims, if there are any."""
         table = claims_table(self.claims)
-        counts = table.caption.split(". ")[0].removeprefix("What the paper claims and what came out here: ")
-        return [replace(table, name="claims_added", caption=f"{SHOWN} {counts.capitalize()}. {CELLS}")] if self.claims else []
+        counts = table.caption.split(". ")[0].removeprefix(
+            "What the paper claims and what came out here: "
+        )
+        return (
+            [replace(table, name="claims_added", caption=f"{SHOWN} {counts.capitalize()}. {CELLS}")]
+            if self.claims
+            else []
+        )
 
 
-def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Losses], kind: str) -> Additions:
+def additions(
+    name: str,
+    part: PartArtefacts,
+    beside: Mapping[str, PartArtefacts],
+    errors: Mapping[str, Losses],
+    kind: str,
+) -> Additions:
     """All comparisons of the parts that are there."""
     own, groups = Additions(), models_by_candidate(part)
     main = {title: Subject.of(part, title, errors=errors) for title in groups}
     scratch = _alone(beside, SCRATCH)
     if paper.NNTF_UH in main:
         trained = main[paper.NNTF_UH]
-        _against(own, trained, _alone(beside, DIAGONAL), "full noise below diagonal noise", "diagonal too simple (III-B.3)")
-        _against(own, trained, scratch, f"{trained.title} below the same from scratch", "inefficient (III-B.4)", shared=False)
+        _against(
+            own,
+            trained,
+            _alone(beside, DIAGONAL),
+            "full noise below diagonal noise",
+            "diagonal too simple (III-B.3)",
+        )
+        _against(
+            own,
+            trained,
+            scratch,
+            f"{trained.title} below the same from scratch",
+            "inefficient (III-B.4)",
+            shared=False,
+        )
     curved = _alone(beside, CURVATURE)
     if curved and paper.PC in main:
         own.comparisons.append(Comparison(curved, main[paper.PC]))
         own.subjects += [main[paper.PC], curved]
         if paper.NNTF in main:
-            own.comparisons.append(Comparison(main[paper.NNTF], curved, "NNTF below PC with the E terms", "0.0085 and 0.0654", (A,), False))
+            own.comparisons.append(
+                Comparison(
+                    main[paper.NNTF],
+                    curved,
+                    "NNTF below PC with the E terms",
+                    "0.0085 and 0.0654",
+                    (A,),
+                    False,
+                )
+            )
     lasting = {title: other for title, other in beside.items() if title.startswith(LENGTH)}
     found = lengths(lasting) if lasting else []
     own.comparisons += length_comparisons(found) if found else []
@@ -71,7 +107,11 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
     own.claims += comparison_claims(own.comparisons, differences, kind)
     if scratch and paper.NNTF_UH in main:
         pre_trained = main[paper.NNTF_UH]
-        own.claims.append(minima_claim(scratch, pre_trained, kind, samples_seen(scratch) / samples_seen(pre_trained)))
+        own.claims.append(
+            minima_claim(
+                scratch, pre_trained, kind, samples_seen(scratch) / samples_seen(pre_trained)
+            )
+        )
     own.appendix += [
         "## Appendix: comparisons that were added",
         differences_table(own.comparisons, differences, name, kind.upper()),
@@ -80,7 +120,10 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
     if found:
         own.timed = True
         own.claims.append(epoch_claim(found))
-        own.appendix += ["## Appendix: length of the training sequences", *figure_7(found, kind.upper())]
+        own.appendix += [
+            "## Appendix: length of the training sequences",
+            *figure_7(found, kind.upper()),
+        ]
     return own
 
 
@@ -91,7 +134,15 @@ def _alone(beside: Mapping[str, PartArtefacts], name: str) -> Subject | None:
     return Subject.of(beside[name], candidate)
 
 
-def _against(own: Additions, lower: Subject, higher: Subject | None, claim: str, words: str, *, shared: bool = True) -> None:
+def _against(
+    own: Additions,
+    lower: Subject,
+    higher: Subject | None,
+    claim: str,
+    words: str,
+    *,
+    shared: bool = True,
+) -> None:
     if higher is not None:
         own.comparisons.append(Comparison(lower, higher, claim, words, shared=shared))
         own.subjects += [lower, higher]

@@ -40,7 +40,13 @@ class Subject:
     candidate: str  # what the part calls it
 
     @classmethod
-    def of(cls, part: PartArtefacts, candidate: str, title: str = "", errors: Mapping[str, Losses] | None = None) -> Subject:
+    def of(
+        cls,
+        part: PartArtefacts,
+        candidate: str,
+        title: str = "",
+        errors: Mapping[str, Losses] | None = None,
+    ) -> Subject:
         """A candidate of a part, whose losses are read unless they are given."""
         found = errors or {test: losses(part, test) for test in SETS}
         return cls(title or candidate, part, models_by_candidate(part)[candidate], found, candidate)
@@ -58,7 +64,12 @@ class Subject:
     def validation(self) -> FloatArray:
         """Weighted MSE on the validation range, one a seed."""
         known = metric_values(self.part)
-        return np.array([known[(own.estimator, own.variant, own.seed, VALIDATION, "mse_weighted")] for own in self.models])
+        return np.array(
+            [
+                known[(own.estimator, own.variant, own.seed, VALIDATION, "mse_weighted")]
+                for own in self.models
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,9 @@ class Comparison:
 
     lower: Subject  # the one that is claimed to have the lower error
     higher: Subject  # the other one
-    claim: str = ""  # in a few words; empty where the paper claims nothing, and only the difference is shown
+    claim: str = (
+        ""  # in a few words; empty where the paper claims nothing, and only the difference is shown
+    )
     paper: str = ""  # its words or figures
     tests: Sequence[str] = tuple(SETS)  # on which
     shared: bool = True  # whether seeds of one number share initial weights and pre-training, so that they are compared seed by seed
@@ -88,7 +101,9 @@ class Comparison:
     def means(self, test: str) -> tuple[float, float]:
         """Weighted MSE of both over the seeds that are compared."""
         seeds = self.common if self.shared else None
-        return float(self.lower.squared(test, seeds).mean()), float(self.higher.squared(test, seeds).mean())
+        return float(self.lower.squared(test, seeds).mean()), float(
+            self.higher.squared(test, seeds).mean()
+        )
 
 
 Corrected = dict[tuple[int, str], tuple[float, float, float]]
@@ -101,11 +116,16 @@ def corrected(comparisons: Sequence[Comparison]) -> Corrected:
     for test in SETS:
         places = [place for place, own in enumerate(comparisons) if test in own.tests]
         intervals = statements.corrected([comparisons[place].difference(test) for place in places])
-        found |= {(place, test): (own.value, own.low, own.high) for place, (own, _) in zip(places, intervals, strict=True)}
+        found |= {
+            (place, test): (own.value, own.low, own.high)
+            for place, (own, _) in zip(places, intervals, strict=True)
+        }
     return found
 
 
-def comparison_claims(comparisons: Sequence[Comparison], found: Corrected, data: str) -> list[Claim]:
+def comparison_claims(
+    comparisons: Sequence[Comparison], found: Corrected, data: str
+) -> list[Claim]:
     """A claim each, but for those that only show a difference."""
     claims = []
     for place, own in enumerate(comparisons):
@@ -116,9 +136,15 @@ def comparison_claims(comparisons: Sequence[Comparison], found: Corrected, data:
             value, low, high = found[place, test]
             verdicts.append(verdict_below(low, high))
             tyre = f"{SETS[test]}: " if len(own.tests) > 1 else ""
-            words.append(f"{tyre}{' and '.join(fixed(mean, 4) for mean in own.means(test))}, {with_interval(value, low, high, 4)}")
+            words.append(
+                f"{tyre}{' and '.join(fixed(mean, 4) for mean in own.means(test))}, {with_interval(value, low, high, 4)}"
+            )
         verdict = verdict_of_all(verdicts)
-        why = {"reproduced": "below zero", "not reproduced": "above zero", "undecided": "holds zero"}[verdict]
+        why = {
+            "reproduced": "below zero",
+            "not reproduced": "above zero",
+            "undecided": "holds zero",
+        }[verdict]
         where = f"{data}, {SETS[own.tests[0]]}" if len(own.tests) == 1 else data
         claims.append(Claim(own.claim, own.paper, "; ".join(words), where, verdict, why))
     return claims
@@ -129,25 +155,50 @@ def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) ->
     limit = float(trained.validation().max())
     k, n = int((scratch.validation() > limit).sum()), len(scratch.seeds)
     ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)
-    verdict: Verdict = "not reproduced" if not k else "reproduced" if 2 * k >= n and share >= 1.0 else "undecided"
+    verdict: Verdict = (
+        "not reproduced" if not k else "reproduced" if 2 * k >= n and share >= 1.0 else "undecided"
+    )
     ours = f"{k} of {n} seeds, {100 * k / n:.0f} % [{100 * ends.low:.0f}, {100 * ends.high:.0f}]"
     why = f"validation MSE above {fixed(limit, 4)}, the worst of {len(trained.seeds)} pre-trained"
     why += f"; {100 * share:.0f} % of their samples" if share < 1.0 else ""
-    return Claim("from scratch is prone to local minima", "Section III-B", ours, f"{data}, validation", verdict, why)
+    return Claim(
+        "from scratch is prone to local minima",
+        "Section III-B",
+        ours,
+        f"{data}, validation",
+        verdict,
+        why,
+    )
 
 
-def differences_table(comparisons: Sequence[Comparison], found: Corrected, name: str, data: str) -> Table:
+def differences_table(
+    comparisons: Sequence[Comparison], found: Corrected, name: str, data: str
+) -> Table:
     """Every comparison on every test, with the means that it compares."""
     rows: list[dict[str, object]] = []
     for place, own in enumerate(comparisons):
         for test in own.tests:
             value, low, high = found[place, test]
             one, other = own.means(test)
-            row: dict[str, object] = {"lower": own.lower.title, "higher": own.higher.title, "tyre": SETS[test]}
-            row |= {"mse_lower": one, "mse_higher": other, "difference": value, "low": low, "high": high}
+            row: dict[str, object] = {
+                "lower": own.lower.title,
+                "higher": own.higher.title,
+                "tyre": SETS[test],
+            }
+            row |= {
+                "mse_lower": one,
+                "mse_higher": other,
+                "difference": value,
+                "low": low,
+                "high": high,
+            }
             row["words"] = with_interval(value, low, high, 4)
             row["change"] = 100.0 * value / other
-            row["seeds"] = f"{len(own.common)}, paired" if own.shared else f"{len(own.lower.seeds)} and {len(own.higher.seeds)}"
+            row["seeds"] = (
+                f"{len(own.common)}, paired"
+                if own.shared
+                else f"{len(own.lower.seeds)} and {len(own.higher.seeds)}"
+            )
             rows.append(row)
     columns = {
         "lower": Column("first"),
@@ -171,7 +222,9 @@ def budgets_table(subjects: Sequence[Subject], name: str, data: str) -> Table:
     rows: list[dict[str, object]] = []
     for own in subjects:
         training = own.models[0].training
-        through = training["through" if own.models[0].variant.find("_u") >= 0 else "noise"]["max_epochs"]
+        through = training["through" if own.models[0].variant.find("_u") >= 0 else "noise"][
+            "max_epochs"
+        ]
         losses_of = own.validation()
         row: dict[str, object] = {"title": own.title, "seeds": len(own.seeds)}
         row |= {"one_step": int(training["one_step"]["max_epochs"]), "through": int(through)}
@@ -179,7 +232,10 @@ def budgets_table(subjects: Sequence[Subject], name: str, data: str) -> Table:
         row["step_size"] = float(training["through"]["learning_rate"])
         row["samples"] = samples_seen(own)
         row["validation"] = median_and_range(losses_of, 4)
-        row |= {f"validation_seed_{seed}": float(loss) for seed, loss in zip(own.seeds, losses_of, strict=True)}
+        row |= {
+            f"validation_seed_{seed}": float(loss)
+            for seed, loss in zip(own.seeds, losses_of, strict=True)
+        }
         rows.append(row)
     columns = {
         "title": Column("candidate"),
@@ -205,5 +261,8 @@ def samples_seen(own: Subject) -> int:
     drives = lengths_of(own.part, own.part.split.train)
     through = training["through" if own.models[0].variant.find("_u") >= 0 else "noise"]
     steps = int(training["steps"])
-    pairs, samples = sum(length - 1 for length in drives), sum(length // steps * steps for length in drives)
+    pairs, samples = (
+        sum(length - 1 for length in drives),
+        sum(length // steps * steps for length in drives),
+    )
     return int(training["one_step"]["max_epochs"]) * pairs + int(through["max_epochs"]) * samples

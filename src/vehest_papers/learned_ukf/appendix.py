@@ -24,14 +24,22 @@ from vehest_papers.learned_ukf.trials import step_size, trials_table
 
 
 def appendix_of_part(
-    title: str, name: str, part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Losses], where: str, data: dict[str, pd.DataFrame]
+    title: str,
+    name: str,
+    part: PartArtefacts,
+    runs: pd.DataFrame,
+    errors: Mapping[str, Losses],
+    where: str,
+    data: dict[str, pd.DataFrame],
 ) -> list[Block]:
     """Orders of all pairs, errors by state, consistency, slip angles and budgets of a main part."""
     kind = words_of_kinds(part).upper()
     blocks: list[Block] = [f"## Appendix: the paper's order\n\n{title}, {kind}."]
     for test, tyre in SETS.items():
         published = {candidate: own.mse for candidate, own in paper.TABLES[test].items()}
-        pairs = differences(errors[test].squared, errors[test].sequence, published, part.protocol.rate_hz)
+        pairs = differences(
+            errors[test].squared, errors[test].sequence, published, part.protocol.rate_hz
+        )
         data[f"pairs_{test}_{name}"] = pairs
         if pairs.empty:
             continue
@@ -44,9 +52,7 @@ def appendix_of_part(
                 f"All pairs: [CSV](tables/pairs_{test}_{name}.csv). Data: {kind}.",
             ),
         ]
-    state = (
-        f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
-    )
+    state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
         f"Consistency of the filters: normalised estimation errors squared over vx, vy and yaw rate (NEES) and normalised innovations "
         f"squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of vy's errors within one and two of "
@@ -68,7 +74,10 @@ def appendix_of_part(
 
 
 def how_it_was_made(
-    artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts], trials: Mapping[str, PartArtefacts], data: dict[str, pd.DataFrame]
+    artefacts: StudyArtefacts,
+    main: Mapping[str, PartArtefacts],
+    trials: Mapping[str, PartArtefacts],
+    data: dict[str, pd.DataFrame],
 ) -> list[Block]:
     """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
     protocol = next(iter(main.values())).protocol
@@ -96,9 +105,16 @@ def how_it_was_made(
             if candidate in (paper.NNTF_UH, paper.GRU, paper.LSTM)
         }
         if SCRATCH in artefacts.parts:
-            used |= {candidate: step_size(own[0]) for candidate, own in models_by_candidate(artefacts.parts[SCRATCH]).items()}
+            used |= {
+                candidate: step_size(own[0])
+                for candidate, own in models_by_candidate(artefacts.parts[SCRATCH]).items()
+            }
         table, other = trials_table(trials, used)
-        words = "" if not other else f"The tables do not use what validation chose for {', '.join(other)}."
+        words = (
+            ""
+            if not other
+            else f"The tables do not use what validation chose for {', '.join(other)}."
+        )
         blocks += ["## Appendix: trials", *([words] if words else []), table]
     return [
         *blocks,
@@ -112,7 +128,9 @@ def _authors_code(main: Mapping[str, PartArtefacts]) -> list[str]:
     """How the authors' code was measured, on the files that it was run on."""
     if "real" not in main:
         return []
-    values = " and ".join(f"{fixed(value, 4)} on {SETS[test]}" for test, value in paper.AUTHORS_CODE.items())
+    values = " and ".join(
+        f"{fixed(value, 4)} on {SETS[test]}" for test, value in paper.AUTHORS_CODE.items()
+    )
     return [
         f"Beside this study stands the authors' public code, run once on the same split: {paper.NNTF_UH}, 1000 epochs one-step and 1000 "
         f"through the filter, one seed, on a CPU, gave {values}. No interval, so no comparison is made."
@@ -122,11 +140,25 @@ def _authors_code(main: Mapping[str, PartArtefacts]) -> list[str]:
 def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Table:
     rows: list[dict[str, object]] = []
     for name, part in main.items():
-        row: dict[str, object] = {"part": artefacts.titles[name], "kind": words_of_kinds(part).upper()}
-        for label, spans in (("train", part.split.train), ("validation", part.split.validation), *part.split.tests.items()):
-            row[label] = f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} min{_sequences(part, label)}"
+        row: dict[str, object] = {
+            "part": artefacts.titles[name],
+            "kind": words_of_kinds(part).upper(),
+        }
+        for label, spans in (
+            ("train", part.split.train),
+            ("validation", part.split.validation),
+            *part.split.tests.items(),
+        ):
+            row[label] = (
+                f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} min{_sequences(part, label)}"
+            )
         rows.append(row)
-    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
+    columns = {
+        "part": Column("part"),
+        "kind": Column("data"),
+        "train": Column("training"),
+        "validation": Column("validation"),
+    }
     columns |= {test: Column(f"test, {tyre}") for test, tyre in SETS.items()}
     caption = (
         f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in all and learns on about "
@@ -141,17 +173,30 @@ def minutes(part: PartArtefacts, spans: Sequence[Span]) -> float:
 
 
 def _sequences(part: PartArtefacts, test: str) -> str:
-    counted = part.metrics[(part.metrics["test_set"] == test) & (part.metrics["metric"] == "n_sequences")]["value"]
-    return f"; {int(counted.iloc[0])} sequences" if len(counted) and math.isfinite(counted.iloc[0]) else ""
+    counted = part.metrics[
+        (part.metrics["test_set"] == test) & (part.metrics["metric"] == "n_sequences")
+    ]["value"]
+    return (
+        f"; {int(counted.iloc[0])} sequences"
+        if len(counted) and math.isfinite(counted.iloc[0])
+        else ""
+    )
 
 
-def _slips(part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _slips(
+    part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]
+) -> list[Block]:
     filters = [model for model in part.models if model.estimator == "learned_ukf"]
     if not filters:
         return []
     distance = loaded(filters[0]).settings.car.cg_to_rear_axle
-    sets = {"training": part.split.train, **{f"test, {tyre}": part.split.tests[test] for test, tyre in SETS.items()}}
-    angles = {label: slips.rear_slip(recordings_of(part, own), distance) for label, own in sets.items()}
+    sets = {
+        "training": part.split.train,
+        **{f"test, {tyre}": part.split.tests[test] for test, tyre in SETS.items()},
+    }
+    angles = {
+        label: slips.rear_slip(recordings_of(part, own), distance) for label, own in sets.items()
+    }
     note = f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts from."
     figure, table, drawn = slips.distribution(angles, name, where, note)
     data[f"slip_density_{name}"] = drawn

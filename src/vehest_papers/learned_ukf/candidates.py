@@ -79,7 +79,11 @@ def runs_of(part: PartArtefacts) -> pd.DataFrame:
     for candidate, models in models_by_candidate(part).items():
         for model in models:
             own = (model.estimator, model.variant, model.seed)
-            needed = {f"{metric}.{test}": (*own, test, metric) for test in part.split.tests for metric in ACCURACY}
+            needed = {
+                f"{metric}.{test}": (*own, test, metric)
+                for test in part.split.tests
+                for metric in ACCURACY
+            }
             needed |= {f"mse_weighted.{VALIDATION}": (*own, VALIDATION, "mse_weighted")}
             needed |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
             if candidate in paper.BASELINES:
@@ -89,8 +93,14 @@ def runs_of(part: PartArtefacts) -> pd.DataFrame:
                 known |= {(*own, next(iter(part.split.tests)), "epochs"): math.nan}
             missing = [column for column, key in needed.items() if key not in known]
             if missing:
-                raise DataError(f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again")
-            wanted = needed | {f"{metric}.{test}": (*own, test, metric) for test in part.split.tests for metric in CONSISTENCY}
+                raise DataError(
+                    f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again"
+                )
+            wanted = needed | {
+                f"{metric}.{test}": (*own, test, metric)
+                for test in part.split.tests
+                for metric in CONSISTENCY
+            }
             row = {"candidate": candidate, "estimator": own[0], "variant": own[1], "seed": own[2]}
             rows.append(row | {column: known.get(key, math.nan) for column, key in wanted.items()})
     return pd.DataFrame(rows)
@@ -105,11 +115,18 @@ def scored_of(part: PartArtefacts, model: EvaluatedModel, test: str) -> list[Sco
     if model.estimator not in _BASELINES:
         return scored
     spans = part.split.validation if test == VALIDATION else part.split.tests[test]
-    pieces = pieces_of(spans, lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol)
+    pieces = pieces_of(
+        spans,
+        lambda span: read_recording(part.references[span.dataset, span.recording]),
+        part.protocol,
+    )
     completed = []
     for own, (reference, piece) in zip(scored, pieces, strict=True):
         first, end = scored_range(reference, piece, part.protocol)
-        others = {name: (reference[name][first:end], reference[REFERENCES[name]][first:end]) for name in ("vx", "yaw_rate")}
+        others = {
+            name: (reference[name][first:end], reference[REFERENCES[name]][first:end])
+            for name in ("vx", "yaw_rate")
+        }
         completed.append(replace(own, others=others))
     return completed
 
@@ -122,7 +139,9 @@ def of_candidate(runs: pd.DataFrame, candidate: str, column: str) -> FloatArray:
 def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> EvaluatedModel:
     """The seed with the lowest weighted MSE on the validation range. Test sets choose nothing."""
     own = of_candidate(runs, candidate, f"mse_weighted.{VALIDATION}")
-    return models_by_candidate(part)[candidate][int(np.argmin(np.where(np.isfinite(own), own, np.inf)))]
+    return models_by_candidate(part)[candidate][
+        int(np.argmin(np.where(np.isfinite(own), own, np.inf)))
+    ]
 
 
 def losses(part: PartArtefacts, test: str) -> Losses:
@@ -133,6 +152,10 @@ def losses(part: PartArtefacts, test: str) -> Losses:
     for candidate, models in models_by_candidate(part).items():
         scored = [scored_of(part, model, test) for model in models]
         lengths = [len(piece.vy) for piece in scored[0]]
-        squared[candidate] = np.stack([np.concatenate([weighted_errors(piece, np.square) for piece in own]) for own in scored])
-        absolute[candidate] = np.stack([np.concatenate([weighted_errors(piece, np.abs) for piece in own]) for own in scored])
+        squared[candidate] = np.stack(
+            [np.concatenate([weighted_errors(piece, np.square) for piece in own]) for own in scored]
+        )
+        absolute[candidate] = np.stack(
+            [np.concatenate([weighted_errors(piece, np.abs) for piece in own]) for own in scored]
+        )
     return Losses(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)

@@ -68,14 +68,21 @@ FACTORS: Sequence[tuple[str, str, str, float, str]] = (
 )
 """Test set, method, other method, largest ratio of their MSE, the paper's words."""
 
-PERCENTILES: Sequence[tuple[str, str, str]] = ((A, paper.NNTF_UH, paper.GRU), (A, paper.NNTF_UH, paper.LSTM))
+PERCENTILES: Sequence[tuple[str, str, str]] = (
+    (A, paper.NNTF_UH, paper.GRU),
+    (A, paper.NNTF_UH, paper.LSTM),
+)
 """Test set, lower and higher 99th percentile of the weighted absolute error."""
 
 
 def verdict_of(low: float, high: float, limit: float = 0.0) -> tuple[Verdict, str]:
     """Of a figure that the paper has below a limit."""
     verdict = verdict_below(low, high, limit)
-    words = {"reproduced": "below", "not reproduced": "above", "undecided": "holds" if not limit else "holds the limit"}[verdict]
+    words = {
+        "reproduced": "below",
+        "not reproduced": "above",
+        "undecided": "holds" if not limit else "holds the limit",
+    }[verdict]
     return verdict, f"interval {words}{'' if limit else ' zero'}"
 
 
@@ -87,10 +94,25 @@ def pair_claims(errors: Losses, test: str, data: str) -> list[Claim]:
     for (first, second), (own, _) in zip(pairs, found, strict=True):
         verdict, why = verdict_of(own.low, own.high)
         known = paper.TABLES[test]
-        words = f"{fixed(known[first].mse, 4)} and {fixed(known[second].mse, 4)}" if first in known and second in known else "–"
-        values = " and ".join(fixed(float(errors.squared[name].mean()), 4) for name in (first, second))
+        words = (
+            f"{fixed(known[first].mse, 4)} and {fixed(known[second].mse, 4)}"
+            if first in known and second in known
+            else "–"
+        )
+        values = " and ".join(
+            fixed(float(errors.squared[name].mean()), 4) for name in (first, second)
+        )
         ours = f"{values}; difference {with_interval(own.value, own.low, own.high, 4)}"
-        claims.append(Claim(f"{first} below {second}", words + _tyre_c(test), ours, f"{data}, {SETS[test]}", verdict, why))
+        claims.append(
+            Claim(
+                f"{first} below {second}",
+                words + _tyre_c(test),
+                ours,
+                f"{data}, {SETS[test]}",
+                verdict,
+                why,
+            )
+        )
     return claims
 
 
@@ -103,7 +125,16 @@ def factor_claims(errors: Mapping[str, Losses], data: str) -> list[Claim]:
         value, low, high = errors[test].ratio(first, second)
         verdict, why = verdict_of(low, high, limit)
         claim = f"{first}'s MSE at most {fixed(limit, 2)} of {second}'s"
-        claims.append(Claim(claim, words + _tyre_c(test), with_interval(value, low, high, 2), f"{data}, {SETS[test]}", verdict, why))
+        claims.append(
+            Claim(
+                claim,
+                words + _tyre_c(test),
+                with_interval(value, low, high, 2),
+                f"{data}, {SETS[test]}",
+                verdict,
+                why,
+            )
+        )
     return claims
 
 
@@ -118,7 +149,16 @@ def percentile_claims(errors: Mapping[str, Losses], data: str) -> list[Claim]:
         known = [paper.TABLES[test][name].ae99 for name in (first, second)]
         words = " and ".join(fixed(value, 3) for value in known)
         ours = f"difference {with_interval(own.value, own.low, own.high, 3)}"
-        claims.append(Claim(f"99%-AE of {first} below {second}'s", words, ours, f"{data}, {SETS[test]}", verdict, why))
+        claims.append(
+            Claim(
+                f"99%-AE of {first} below {second}'s",
+                words,
+                ours,
+                f"{data}, {SETS[test]}",
+                verdict,
+                why,
+            )
+        )
     return claims
 
 
@@ -132,13 +172,31 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
         near = "reproduced"
     elif final.high < low or final.low > high:
         near = "not reproduced"
-    words = {"reproduced": "interval within", "not reproduced": "interval beyond", "undecided": "interval holds a limit"}
+    words = {
+        "reproduced": "interval within",
+        "not reproduced": "interval beyond",
+        "undecided": "interval holds a limit",
+    }
     time = f"{with_interval(median.value, median.low, median.high, 2)} s"
     end = with_interval(final.value, final.low, final.high, 2)
     where = f"{data}, tyre D"
     return [
-        Claim("friction converges rapidly: median time below 2 s", "Figure 4, tyre C", time, where, fast, why),
-        Claim(f"friction ends within {NEAR:g} of its nominal {nominal:g}", "Figure 4, tyre C, 0.43", end, where, near, words[near]),
+        Claim(
+            "friction converges rapidly: median time below 2 s",
+            "Figure 4, tyre C",
+            time,
+            where,
+            fast,
+            why,
+        ),
+        Claim(
+            f"friction ends within {NEAR:g} of its nominal {nominal:g}",
+            "Figure 4, tyre C, 0.43",
+            end,
+            where,
+            near,
+            words[near],
+        ),
     ]
 
 
@@ -146,20 +204,39 @@ def instability_claims(lost: Mapping[str, Sequence[tuple[int, int]]], data: str)
     """That the tyre network without friction becomes unstable on the unseen tyre; ``lost``: sequences lost without repair, and all."""
     claims = []
     for method, seeds in lost.items():
-        bad, k, n = sum(own > 0 for own, _ in seeds), sum(own for own, _ in seeds), sum(own for _, own in seeds)
+        bad, k, n = (
+            sum(own > 0 for own, _ in seeds),
+            sum(own for own, _ in seeds),
+            sum(own for _, own in seeds),
+        )
         ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)
-        verdict: Verdict = "reproduced" if 2 * bad >= len(seeds) else "not reproduced" if not bad else "undecided"
+        verdict: Verdict = (
+            "reproduced" if 2 * bad >= len(seeds) else "not reproduced" if not bad else "undecided"
+        )
         ours = f"{k} of {n} sequences lost, {100 * k / n:.0f} % [{100 * ends.low:.0f}, {100 * ends.high:.0f}]"
         why = f"{bad} of {len(seeds)} seeds lose one, unrepaired"
-        claims.append(Claim(f"{method} becomes unstable", "a dash, tyre C", ours, f"{data}, tyre D", verdict, why))
+        claims.append(
+            Claim(
+                f"{method} becomes unstable",
+                "a dash, tyre C",
+                ours,
+                f"{data}, tyre D",
+                verdict,
+                why,
+            )
+        )
     return claims
 
 
-def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, float, bool]], data: str) -> Claim:
+def states_claim(
+    claim: str, words: str, expected: Mapping[str, tuple[Interval, float, bool]], data: str
+) -> Claim:
     """About several states of Figure 5: difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower."""
     verdicts, shown = [], []
     for state, (own, before, lower) in expected.items():
-        verdicts.append(verdict_below(own.low, own.high) if lower else verdict_below(-own.high, -own.low))
+        verdicts.append(
+            verdict_below(own.low, own.high) if lower else verdict_below(-own.high, -own.low)
+        )
         low, value, high = (100.0 * end / before for end in (own.low, own.value, own.high))
         shown.append(f"{state.replace('_', ' ')} {with_interval(value, low, high, 0)} %")
     verdict = verdict_of_all(verdicts)
@@ -171,11 +248,20 @@ def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, 
     return Claim(claim, words, "; ".join(shown), data, verdict, words_of[verdict])
 
 
-def difference_claim(claim: str, words: str, own: Interval, values: tuple[float, float], data: str) -> Claim:
+def difference_claim(
+    claim: str, words: str, own: Interval, values: tuple[float, float], data: str
+) -> Claim:
     """That the first of two mean losses is the lower one, by the 95 % interval of the difference."""
     verdict, why = verdict_of(own.low, own.high)
     shown = " and ".join(fixed(value, 4) for value in values)
-    return Claim(claim, words, f"{shown}; difference {with_interval(own.value, own.low, own.high, 4)}", data, verdict, why)
+    return Claim(
+        claim,
+        words,
+        f"{shown}; difference {with_interval(own.value, own.low, own.high, 4)}",
+        data,
+        verdict,
+        why,
+    )
 
 
 def not_testable(*, timed: bool = False) -> list[Claim]:
@@ -183,9 +269,23 @@ def not_testable(*, timed: bool = False) -> list[Claim]:
     untestable: Verdict = "not testable on this data"
     rows = (
         ("every figure of Table II itself", "tyre C", "no recordings of tyre C; tyre D stands in"),
-        ("RMS errors 0.062 and 0.070 m/s on tyre A", "0.062; 0.070 m/s", "the test is another part of tyre A's recordings"),
+        (
+            "RMS errors 0.062 and 0.070 m/s on tyre A",
+            "0.062; 0.070 m/s",
+            "the test is another part of tyre A's recordings",
+        ),
         ("99th percentile of rear slip beyond 40°", "40°", "only 3 of the data set's files"),
-        *(() if timed else (("longer training sequences take longer an epoch", "Figure 7", "times are in no published file"),)),
+        *(
+            ()
+            if timed
+            else (
+                (
+                    "longer training sequences take longer an epoch",
+                    "Figure 7",
+                    "times are in no published file",
+                ),
+            )
+        ),
     )
     return [Claim(claim, words, "–", "none", untestable, why) for claim, words, why in rows]
 

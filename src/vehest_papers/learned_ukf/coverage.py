@@ -14,7 +14,12 @@ from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf.candidates import SETS, losses, scored_of
 
 
-def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedModel]]], candidate: str, name: str, data: str) -> Table:
+def coverage_table(
+    trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedModel]]],
+    candidate: str,
+    name: str,
+    data: str,
+) -> Table:
     """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two deviations, with 95 % intervals."""
     rows: list[dict[str, object]] = []
     for test, tyre in SETS.items():
@@ -28,20 +33,29 @@ def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedMode
             }
             scored = [scored_of(part, model, test) for model in models]
             for sigma, expected in COVERAGE.items():
-                inside = np.stack([np.concatenate([_within(piece, sigma) for piece in own]) for own in scored])
+                inside = np.stack(
+                    [np.concatenate([_within(piece, sigma) for piece in own]) for own in scored]
+                )
                 share = errors.mean(inside)
                 row |= {
                     f"inside_{sigma}": share.value,
-                    f"words_{sigma}": with_interval(share.value, max(share.low, 0.0), min(share.high, 1.0), 3),
+                    f"words_{sigma}": with_interval(
+                        share.value, max(share.low, 0.0), min(share.high, 1.0), 3
+                    ),
                 }
                 row[f"expected_{sigma}"] = expected
-            row["width"] = float(np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own]))
+            row["width"] = float(
+                np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own])
+            )
             rows.append(row)
     columns = {
         "tyre": Column("tyre"),
         "training": Column("training"),
         "mse_words": Column("MSE (weighted)"),
-        **{f"words_{sigma}": Column(f"within {sigma}σ (Gaussian: {expected:.3f})") for sigma, expected in COVERAGE.items()},
+        **{
+            f"words_{sigma}": Column(f"within {sigma}σ (Gaussian: {expected:.3f})")
+            for sigma, expected in COVERAGE.items()
+        },
         "width": Column("mean σ of vy [m/s]", decimals=3),
     }
     caption = (

@@ -32,7 +32,12 @@ def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
 
 def departures(parts: Mapping[str, PartArtefacts]) -> list[str]:
     """Sentences, of what departs only."""
-    filters = [model for part in parts.values() for model in part.models if model.estimator == "learned_ukf"]
+    filters = [
+        model
+        for part in parts.values()
+        for model in part.models
+        if model.estimator == "learned_ukf"
+    ]
     lines = [
         "Data: the paper learns on 70 % of all it recorded on tyre A, stops on 20 % and tests on 10 %; what is used here stands in the "
         "table above. Its unseen tyre is C, here it is D.",
@@ -43,10 +48,17 @@ def departures(parts: Mapping[str, PartArtefacts]) -> list[str]:
     absent = [name for name in paper.CANDIDATES if name not in shown]
     if absent:
         lines.append(f"Not part of this run: {listed(absent)}, which the paper compares as well.")
-    networks = [model for part in parts.values() for model in part.models if model.estimator.startswith("velocity_")]
+    networks = [
+        model
+        for part in parts.values()
+        for model in part.models
+        if model.estimator.startswith("velocity_")
+    ]
     lines += _of_networks(networks)
     if networks:
-        lines.append("GRU and LSTM: what their papers leave open (the LSTM's sizes, the leaky rectifier's slope) is assumed.")
+        lines.append(
+            "GRU and LSTM: what their papers leave open (the LSTM's sizes, the leaky rectifier's slope) is assumed."
+        )
     return lines
 
 
@@ -73,23 +85,33 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
         differing = []
         epochs = values(phase, "max_epochs")
         if epochs != [PAPER_EPOCHS]:
-            differing.append(f"{_either(sorted(epochs))} epochs (paper: {PAPER_EPOCHS}{', of one batch each' * (phase != 'one_step')})")
+            differing.append(
+                f"{_either(sorted(epochs))} epochs (paper: {PAPER_EPOCHS}{', of one batch each' * (phase != 'one_step')})"
+            )
         sizes, falling = values(phase, "learning_rate"), "cosine" in values(phase, "schedule")
         if sizes != [PAPER_STEP_SIZE] or falling:
             size = f"a step size of {_either(sizes)}{' that falls to zero along a cosine' if falling else ''}"
-            differing.append(f"{size} (paper: {PAPER_STEP_SIZE:g}{', constant' if falling else ''})")
+            differing.append(
+                f"{size} (paper: {PAPER_STEP_SIZE:g}{', constant' if falling else ''})"
+            )
         if differing:
             lines.append(f"{words}: {'; '.join(differing)}.")
     if values("batch_size") != [PAPER_BATCH]:
-        lines.append(f"Batches of {_either(values('batch_size'))} sequences (the authors' code: {PAPER_BATCH}).")
+        lines.append(
+            f"Batches of {_either(values('batch_size'))} sequences (the authors' code: {PAPER_BATCH})."
+        )
     if "random" in values("placing"):
-        lines.append("Training sequences start at random places in the drives, drawn anew each epoch (paper: fixed).")
+        lines.append(
+            "Training sequences start at random places in the drives, drawn anew each epoch (paper: fixed)."
+        )
     if any(values("start_spread")):
         lines.append(
             f"In training sequences start with the friction off by up to {_either(values('start_spread'))} (paper: at its nominal value)."
         )
     if any(values("mirrored")):
-        lines.append(f"A share of {_either(values('mirrored'))} of sequences and pairs is seen in a mirror, left for right (paper: none).")
+        lines.append(
+            f"A share of {_either(values('mirrored'))} of sequences and pairs is seen in a mirror, left for right (paper: none)."
+        )
     if "residuals" in values("start_noise"):
         lines.append(
             "Noise starts from what the pre-trained dynamics leave unexplained in the training drives, and is learnt in units of that (the "
@@ -115,7 +137,9 @@ def _of_networks(models: list[EvaluatedModel]) -> list[str]:
             f"carried on (their papers: sequences of 300, the first 200 of which do not count)."
         )
     if any(own.get("mirrored") for own in trainings):
-        lines.append("GRU and LSTM see as many sequences in a mirror as the filters do (their papers: none).")
+        lines.append(
+            "GRU and LSTM see as many sequences in a mirror as the filters do (their papers: none)."
+        )
     if any(own["phase"]["schedule"] == "cosine" for own in trainings):
         epochs = _either(sorted({own["phase"]["max_epochs"] for own in trainings}))
         sizes = _either(sorted({own["phase"]["learning_rate"] for own in trainings}))
@@ -130,15 +154,21 @@ def _of_settings(models: list[EvaluatedModel]) -> list[str]:
     settings: list[Any] = [load_model(model.model_folder).settings for model in models]
     lines = []
     if any(own.scaled for own in settings):
-        lines.append("Networks see and give numbers of about 1, by scales from the training drives (the authors' code: SI units).")
+        lines.append(
+            "Networks see and give numbers of about 1, by scales from the training drives (the authors' code: SI units)."
+        )
     widths = sorted({own.width for own in settings if own.width})
     if widths:
-        lines.append(f"Hidden layers of some candidates are {_either(widths)} wide (paper: 64 for tyres, 256 for rates).")
+        lines.append(
+            f"Hidden layers of some candidates are {_either(widths)} wide (paper: 64 for tyres, 256 for rates)."
+        )
     return lines
 
 
 def _either(values: list[Any]) -> str:
-    return listed([f"{value:g}" if isinstance(value, (int, float)) else str(value) for value in values])
+    return listed(
+        [f"{value:g}" if isinstance(value, (int, float)) else str(value) for value in values]
+    )
 
 
 def _flat(settings: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, Any]]:

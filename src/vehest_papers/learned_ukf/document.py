@@ -15,7 +15,16 @@ from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.methods import absent_parts, kinds_of_parts
 from vehest_papers.kit.reading import with_interval, words_of_kinds
 from vehest_papers.kit.statements import corrected
-from vehest_papers.learned_ukf import ablations, claims, coverage, friction, paper, prediction, tables, traces
+from vehest_papers.learned_ukf import (
+    ablations,
+    claims,
+    coverage,
+    friction,
+    paper,
+    prediction,
+    tables,
+    traces,
+)
 from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCRATCH
 from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
 from vehest_papers.learned_ukf.candidates import SETS, chosen, losses, models_by_candidate, runs_of
@@ -57,10 +66,14 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         raise DataError(f"study '{artefacts.study}' needs one of the parts: {', '.join(MAIN)}")
     for name, part in main.items():
         if set(part.split.tests) != set(SETS):
-            raise DataError(f"study '{artefacts.study}': the test sets of part '{name}' must be called {' and '.join(SETS)}")
+            raise DataError(
+                f"study '{artefacts.study}': the test sets of part '{name}' must be called {' and '.join(SETS)}"
+            )
     data: dict[str, pd.DataFrame] = {}
     found = {name: _outcome(name, part, artefacts, data) for name, part in main.items()}
-    every = [claim for own in found.values() for claim in own.claims] + claims.not_testable(timed=any(own.timed for own in found.values()))
+    every = [claim for own in found.values() for claim in own.claims] + claims.not_testable(
+        timed=any(own.timed for own in found.values())
+    )
     blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE)]
     for own in found.values():
         blocks += own.added
@@ -69,13 +82,18 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks += [*own.picture, *own.front]
     for own in found.values():
         blocks += own.appendix
-    blocks += how_it_was_made(artefacts, main, {n: p for n, p in artefacts.parts.items() if n.startswith(TRIAL)}, data)
+    blocks += how_it_was_made(
+        artefacts, main, {n: p for n, p in artefacts.parts.items() if n.startswith(TRIAL)}, data
+    )
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
 def _asked(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> list[Block]:
     words = f"{kinds_of_parts(artefacts, main)}. The paper's are real.{absent_parts(artefacts)}"
-    learnt = "; ".join(f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})" for part in main.values())
+    learnt = "; ".join(
+        f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})"
+        for part in main.values()
+    )
     words += f" Learnt on: {learnt}; in the paper about {fixed(paper.MINUTES_LEARNT, 1)} min of the same tyre."
     return [words, artefacts.about]
 
@@ -88,7 +106,11 @@ def _left_out(artefacts: StudyArtefacts) -> str:
         CURVATURE: "the E terms of Equation 3",
         DIAGONAL: "diagonal noise, which the paper leaves out as well",
     }
-    absent = [words for part, words in known.items() if not any(name.startswith(part) for name in artefacts.parts)]
+    absent = [
+        words
+        for part, words in known.items()
+        if not any(name.startswith(part) for name in artefacts.parts)
+    ]
     return f"Not run here, for their budget: {listed(absent)}." if absent else ""
 
 
@@ -101,20 +123,28 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
         if paper.NNTF_UH in groups and groups[paper.NNTF_UH][0].training:
             training = groups[paper.NNTF_UH][0].training
             one_step, through = (training[phase]["max_epochs"] for phase in ("one_step", "through"))
-            words.append(f"{paper.NNTF_UH} has {one_step} epochs one-step and {through} through the filter (paper: 1000 and 1000)")
+            words.append(
+                f"{paper.NNTF_UH} has {one_step} epochs one-step and {through} through the filter (paper: 1000 and 1000)"
+            )
         words += [
             f"{name} {groups[name][0].training['phase']['max_epochs']}"
             for name in (paper.GRU, paper.LSTM)
             if name in groups and groups[name][0].training
         ]
         if paper.NN in groups and groups[paper.NN][0].training:
-            words.append(f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it")
+            words.append(
+                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it"
+            )
         if words:
-            sentences.append(f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md.")
+            sentences.append(
+                f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md."
+            )
     return " ".join(sentences)
 
 
-def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: dict[str, pd.DataFrame]) -> Outcome:
+def _outcome(
+    name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: dict[str, pd.DataFrame]
+) -> Outcome:
     """Everything of a main part; parts beside it belong to the real one, or to whichever there is."""
     runs, kind = runs_of(part), words_of_kinds(part)
     where = f"{kind.upper()}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
@@ -127,14 +157,18 @@ def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: di
     _accuracy(own, name, errors, kind, summary=name == MAIN[0] or MAIN[0] not in artefacts.parts)
     _friction(own, name, part, where, kind)
     _instability(own, part, kind)
-    beside = {title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind}
+    beside = {
+        title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind
+    }
     _likelihood(own, name, part, beside, kind)
     _prediction(own, name, part, where, kind, data)
     added = ablations.additions(name, part, beside, errors, kind)
     own.added, own.timed = [*added.front()], added.timed
     own.appendix += added.appendix
     groups = models_by_candidate(part)
-    shown: dict[str, EvaluatedModel] = {method: chosen(part, runs, method) for method in SHOWN_IN_FIGURE_4 if method in groups}
+    shown: dict[str, EvaluatedModel] = {
+        method: chosen(part, runs, method) for method in SHOWN_IN_FIGURE_4 if method in groups
+    }
     if shown:
         figure, drawn = traces.hard_sequence(part, shown, "tyre_d", name, where)
         data[f"traces_{name}"] = drawn
@@ -156,42 +190,65 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Lo
         own.add(paper.ORACLE, error)
 
 
-def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool) -> None:
-    own.front.append("## Tables I and II\n\n" + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items()))
+def _accuracy(
+    own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool
+) -> None:
+    own.front.append(
+        "## Tables I and II\n\n"
+        + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items())
+    )
     if summary:
         own.front.append(tables.overview(errors, kind))
     own.appendix.append(f"## Appendix: Tables I and II, {kind}")
     for test, tyre in SETS.items():
-        learnt = "which was learnt on" if test == "tyre_a" else "unseen; the paper's are of tyre C and do not compare"
+        learnt = (
+            "which was learnt on"
+            if test == "tyre_a"
+            else "unseen; the paper's are of tyre C and do not compare"
+        )
         caption = (
             f"Table {ROMAN[test]} of the paper: {tyre}, {learnt}. Ours: {kind.upper()}, means over seeds, 95 % intervals over sequences "
             f"and seeds. {paper.ORACLE}: {paper.NNTF_UH} trained on, {EPOCHS} epochs, on the test itself. Baselines take vx from "
             f"the rims and the yaw rate from the gyroscope."
         )
-        own.appendix.append(tables.accuracy(errors[test], test, f"table_{1 if test == 'tyre_a' else 2}_{name}", caption))
+        own.appendix.append(
+            tables.accuracy(
+                errors[test], test, f"table_{1 if test == 'tyre_a' else 2}_{name}", caption
+            )
+        )
 
 
 def _standing(errors: Losses, tyre: str) -> str:
     """Method with the lowest error, whether the difference is significant, and methods below the baselines."""
-    means = {name: float(own.mean()) for name, own in errors.squared.items() if name != paper.ORACLE}
+    means = {
+        name: float(own.mean()) for name, own in errors.squared.items() if name != paper.ORACLE
+    }
     order = sorted(means, key=means.__getitem__)
     best = order[0]
     against = [errors.of_pair(best, name) for name in order[1:]]
-    level = [name for name, (_, apart) in zip(order[1:], corrected(against), strict=True) if not apart]
+    level = [
+        name for name, (_, apart) in zip(order[1:], corrected(against), strict=True) if not apart
+    ]
     interval = errors.mean(errors.squared[best])
     figure = with_interval(interval.value, interval.low, interval.high, 4)
     if not level and best not in paper.BASELINES:
         words = f"On {tyre} **{best}** has the lowest MSE, {figure}: below every other method and the baselines, each by more than chance."
     else:
-        words = (
-            f"On {tyre} **no method can be called best**: the lowest MSE is that of {best}, {figure}, not told apart from {listed(level)}."
-        )
+        words = f"On {tyre} **no method can be called best**: the lowest MSE is that of {best}, {figure}, not told apart from {listed(level)}."
     baselines = [name for name in paper.BASELINES if name in means]
     if baselines:
         pairs = [(name, other) for name in order if name not in baselines for other in baselines]
         tested = corrected([errors.of_pair(*pair) for pair in pairs])
-        lower = {pair for pair, (own, apart) in zip(pairs, tested, strict=True) if own.value < 0 and apart}
-        weak = [name for name in order if name not in baselines and not all((name, other) in lower for other in baselines)]
+        lower = {
+            pair
+            for pair, (own, apart) in zip(pairs, tested, strict=True)
+            if own.value < 0 and apart
+        }
+        weak = [
+            name
+            for name in order
+            if name not in baselines and not all((name, other) in lower for other in baselines)
+        ]
         if len(weak) == len(order) - len(baselines):
             words += f" No method is below all of {listed(baselines)} by more than chance."
         else:
@@ -208,10 +265,14 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     drives = {test: drives_of(part, filters[0], test) for test in SETS}
     skip = part.protocol.skip_seconds
     tracks = {
-        test: {start: friction.tracks_of(filters, own_drives, start) for start in friction.STARTS} for test, own_drives in drives.items()
+        test: {start: friction.tracks_of(filters, own_drives, start) for start in friction.STARTS}
+        for test, own_drives in drives.items()
     }
     trained = tracks["tyre_d"][friction.TRAINED_FROM]
-    times, final = friction.interval_of(trained.times(), friction.median), friction.interval_of(trained.final, friction.mean)
+    times, final = (
+        friction.interval_of(trained.times(), friction.median),
+        friction.interval_of(trained.final, friction.mean),
+    )
     own.claims += claims.friction_claims(times, final, kind)
     own.front += ["## Friction", friction.figure(tracks, skip, name, where)]
     own.appendix += [
@@ -222,7 +283,11 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
 
 
 def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
-    groups = {method: models for method, models in models_by_candidate(part).items() if method in (paper.NNT, paper.NNT_U)}
+    groups = {
+        method: models
+        for method, models in models_by_candidate(part).items()
+        if method in (paper.NNT, paper.NNT_U)
+    }
     lost = {}
     for method, models in groups.items():
         filters = [loaded(model) for model in models]
@@ -231,18 +296,33 @@ def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
     own.claims += claims.instability_claims(lost, kind)
 
 
-def _likelihood(own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str) -> None:
+def _likelihood(
+    own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str
+) -> None:
     if LIKELIHOOD in beside:
         trained = {
             words: (which, models_by_candidate(which)[paper.NNTF_UH])
             for words, which in (("squared errors", part), ("with likelihood", beside[LIKELIHOOD]))
         }
-        own.appendix += ["## Appendix: bands", coverage.coverage_table(trained, paper.NNTF_UH, name, kind.upper())]
+        own.appendix += [
+            "## Appendix: bands",
+            coverage.coverage_table(trained, paper.NNTF_UH, name, kind.upper()),
+        ]
 
 
-def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: str, data: dict[str, pd.DataFrame]) -> None:
+def _prediction(
+    own: Outcome,
+    name: str,
+    part: PartArtefacts,
+    where: str,
+    kind: str,
+    data: dict[str, pd.DataFrame],
+) -> None:
     groups = models_by_candidate(part)
-    by_seed = [{model.seed: model for model in groups.get(method, [])} for method in (prediction.BEFORE, prediction.AFTER)]
+    by_seed = [
+        {model.seed: model for model in groups.get(method, [])}
+        for method in (prediction.BEFORE, prediction.AFTER)
+    ]
     seeds = sorted(set(by_seed[0]) & set(by_seed[1]))
     if not seeds:
         return
@@ -268,4 +348,6 @@ def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: 
         change = prediction.over_sequences(mse[1, 0], mse[0, 0])
         swapped = f"{paper.NNTF_U} in the prediction alone: lower MSE"
         values = (float(mse[1, 0].mean()), float(mse[0, 0].mean()))
-        own.claims.append(claims.difference_claim(swapped, "18 % lower, Figure 6", change, values, on))
+        own.claims.append(
+            claims.difference_claim(swapped, "18 % lower, Figure 6", change, values, on)
+        )

@@ -24,7 +24,9 @@ SAME_WEIGHTS = {paper.NNTF_UH, paper.NNTF_UH_LOW}
 class Losses:
     """What the methods lose on a test, sample by sample."""
 
-    squared: dict[str, FloatArray]  # method -> weighted squared error of each seed at each scored sample, (S, K)
+    squared: dict[
+        str, FloatArray
+    ]  # method -> weighted squared error of each seed at each scored sample, (S, K)
     absolute: dict[str, FloatArray]  # method -> weighted absolute error, (S, K)
     sequence: NDArray[np.int64]  # of each sample, (K,)
     rate_hz: float  # of the samples
@@ -74,12 +76,24 @@ class Losses:
             values = []
             for own in pieces:
                 seeds = rng.integers(len(own), size=max(len(own) - 1, 1))
-                values.append(np.percentile(own[seeds][:, rows].reshape(len(seeds), -1), 99.0, axis=1).mean())
+                values.append(
+                    np.percentile(own[seeds][:, rows].reshape(len(seeds), -1), 99.0, axis=1).mean()
+                )
             drawn[k] = values[0] - values[1]
-        value = float(np.mean(np.percentile(both[0], 99.0, axis=1)) - np.mean(np.percentile(both[1], 99.0, axis=1)))
+        value = float(
+            np.mean(np.percentile(both[0], 99.0, axis=1))
+            - np.mean(np.percentile(both[1], 99.0, axis=1))
+        )
         error = float(np.std(drawn))
         half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - 1)) * error
-        return Interval(value, value - half, value + half, 2.0 * float(stats.t.sf(abs(value) / error, n - 1)), error, n - 1)
+        return Interval(
+            value,
+            value - half,
+            value + half,
+            2.0 * float(stats.t.sf(abs(value) / error, n - 1)),
+            error,
+            n - 1,
+        )
 
 
 def _edge(apart: Callable[[float], bool], inside: float, outside: float) -> float:

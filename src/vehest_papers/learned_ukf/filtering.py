@@ -32,29 +32,43 @@ class Swapped(PointModel):
 
 def _with_its_car(model: PointModel, entry: int) -> Callable[..., None]:
     """An entry of a model, whatever car it is called with."""
-    return lambda points, inputs, _, out, first, end: model.entries[entry](points, inputs, model.car, out, first, end)
+    return lambda points, inputs, _, out, first, end: model.entries[entry](
+        points, inputs, model.car, out, first, end
+    )
 
 
 def loaded(model: EvaluatedModel) -> LearnedUkf:
     """The filter of an evaluated model; raises `MissingError` where there is none, `DataError` where it is damaged or another's."""
     estimator = load_model(model.model_folder)
     if not isinstance(estimator, LearnedUkf):
-        raise DataError(f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'")
+        raise DataError(
+            f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'"
+        )
     return estimator
 
 
 def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
     """The sequences of a test set, as the filter takes them, side by side: (B, T, ...); raises `ConfigurationError` or `DataError`."""
-    if part.protocol.sequence_seconds is None or part.protocol.rate_hz != estimator.settings.rate_hz:
+    if (
+        part.protocol.sequence_seconds is None
+        or part.protocol.rate_hz != estimator.settings.rate_hz
+    ):
         raise ConfigurationError(
             f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "
             f"have it, not {part.protocol.rate_hz:g}"
         )
     wanted = dict.fromkeys((span.dataset, span.recording) for span in part.split.tests[test])
     recordings = {key: read_recording(part.references[key]) for key in wanted}
-    pieces = sequences(part.split.tests[test], lambda span: recordings[span.dataset, span.recording], part.protocol)
+    pieces = sequences(
+        part.split.tests[test], lambda span: recordings[span.dataset, span.recording], part.protocol
+    )
     dtype = next(estimator.filter.parameters()).dtype
-    drives = [estimator.drive(recordings[piece.dataset, piece.recording].cut(piece.start, piece.stop), dtype) for piece in pieces]
+    drives = [
+        estimator.drive(
+            recordings[piece.dataset, piece.recording].cut(piece.start, piece.stop), dtype
+        )
+        for piece in pieces
+    ]
     return Drive(*(torch.stack([drive[position] for drive in drives]) for position in range(3)))
 
 
@@ -87,7 +101,9 @@ def filtered(
             if deviation is not None:
                 covariance[-1, :] = covariance[:, -1] = 0.0
                 covariance[-1, -1] = deviation**2
-            return own.filtered(drives.measurements, drives.inputs, Gaussian(start, covariance), model=model)
+            return own.filtered(
+                drives.measurements, drives.inputs, Gaussian(start, covariance), model=model
+            )
     finally:
         own.repair = kept
 
@@ -118,7 +134,9 @@ def weighted(squares: FloatArray) -> FloatArray:
 
 def one_step_squares(estimator: LearnedUkf, drives: Drive) -> FloatArray:
     """Mean squared error of the prediction of the next sample from each true state; of `MOVING` in each sequence, (B, 4)."""
-    states, inputs = (part[:, :-1].reshape(-1, part.shape[-1]) for part in (drives.states, drives.inputs))
+    states, inputs = (
+        part[:, :-1].reshape(-1, part.shape[-1]) for part in (drives.states, drives.inputs)
+    )
     with torch.no_grad():
         after = estimator.filter.moved(states, inputs).reshape(drives.states[:, 1:].shape)
     errors = (after - drives.states[:, 1:])[..., : len(MOVING)].double()

@@ -27,7 +27,11 @@ from vehest_papers.learned_ukf.prediction import over_sequences
 STARTS = (0.3, 0.6, 0.9)
 COLOURS = ("#0b4f9c", "#444444", "#b3122a")
 TRAINED_FROM, LOW = 0.6, 0.4  # starts of NNTF_UH and NNTF_UH*
-DEVIATIONS = (None, 0.03, 0.003)  # of the friction at the start: as learnt, and two smaller ones, the last that of the authors' code
+DEVIATIONS = (
+    None,
+    0.03,
+    0.003,
+)  # of the friction at the start: as learnt, and two smaller ones, the last that of the authors' code
 LAST_SECONDS = 2.0
 N_RESAMPLES = 2000
 
@@ -75,7 +79,10 @@ def interval_of(values: FloatArray, statistic: Callable[[FloatArray], float]) ->
     rng = np.random.default_rng(0)
     seeds, n = values.shape
     drawn = [
-        statistic(values[np.ix_(rng.integers(seeds, size=max(seeds - 1, 1)), rng.integers(n, size=n - 1))]) for _ in range(N_RESAMPLES)
+        statistic(
+            values[np.ix_(rng.integers(seeds, size=max(seeds - 1, 1)), rng.integers(n, size=n - 1))]
+        )
+        for _ in range(N_RESAMPLES)
     ]
     value, error = statistic(values), float(np.std(drawn))
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - 1)) * error
@@ -92,7 +99,9 @@ def mean(values: FloatArray) -> float:
     return float(np.mean(values))
 
 
-def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Table:
+def convergence_table(
+    tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str
+) -> Table:
     """A row a tyre and start: time to converge, final value, and and the filter's own deviation."""
     rows = []
     for test, by_start in tracks.items():
@@ -103,7 +112,9 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
             rows.append(
                 {
                     "forgotten": apart.value,
-                    "forgotten_words": MISSING if start == TRAINED_FROM else with_interval(apart.value, max(apart.low, 0.0), apart.high, 2),
+                    "forgotten_words": MISSING
+                    if start == TRAINED_FROM
+                    else with_interval(apart.value, max(apart.low, 0.0), apart.high, 2),
                     "tyre": SETS[test],
                     "start": start,
                     "time": time.value,
@@ -134,7 +145,9 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
     return Table(f"friction_{name}", caption, pd.DataFrame(rows), columns)
 
 
-def figure(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Figure:
+def figure(
+    tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str
+) -> Figure:
     """Mean over sequences and seeds from each start, with the 95 % interval of that mean."""
     with new_figure(DOUBLE_COLUMN, 2.8) as drawn:
         grid = drawn.subplots(1, len(tracks), sharey=True, squeeze=False)[0]
@@ -145,9 +158,17 @@ def figure(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, na
                 middle = of_sequences.mean(axis=0)
                 n = len(of_sequences)
                 half = stats.t.ppf(0.975, n - 1) * of_sequences.std(axis=0, ddof=1) / np.sqrt(n)
-                axes.fill_between(time, middle - half, middle + half, color=colour, alpha=0.2, linewidth=0)
+                axes.fill_between(
+                    time, middle - half, middle + half, color=colour, alpha=0.2, linewidth=0
+                )
                 axes.plot(time, middle, color=colour, linewidth=1.1, label=f"from {start:g}")
-            axes.axhline(paper.NOMINAL_FRICTION[test], color="#444444", linewidth=0.8, linestyle="dotted", label="nominal, paper")
+            axes.axhline(
+                paper.NOMINAL_FRICTION[test],
+                color="#444444",
+                linewidth=0.8,
+                linestyle="dotted",
+                label="nominal, paper",
+            )
             axes.axvspan(0.0, skip_seconds, color="#e8e8e8", zorder=0)
             axes.set_title(SETS[test], loc="left")
             axes.set_xlabel("time in the sequence [s]")
@@ -162,29 +183,51 @@ def figure(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, na
     return Figure(f"friction_{name}", caption, drawn)
 
 
-def start_table(filters: Sequence[LearnedUkf], drives: Mapping[str, Drive], protocol: Protocol, name: str, data: str) -> Table:
+def start_table(
+    filters: Sequence[LearnedUkf],
+    drives: Mapping[str, Drive],
+    protocol: Protocol,
+    name: str,
+    data: str,
+) -> Table:
     """NNTF_UH* against NNTF_UH at several deviations of the friction at the start: errors and their difference with its interval."""
     skip = round(protocol.skip_seconds * protocol.rate_hz)
-    learnt = float(np.mean([float(own.filter.initial_covariance()[-1, -1].detach()) ** 0.5 for own in filters]))
+    learnt = float(
+        np.mean([float(own.filter.initial_covariance()[-1, -1].detach()) ** 0.5 for own in filters])
+    )
     rows = []
     for test, own in drives.items():
         for deviation in DEVIATIONS:
             squares = {
                 start: np.stack(
                     [
-                        weighted(squares_of(filtered(one, own, friction=start, deviation=deviation).steps.filtered.mean, own, skip))
+                        weighted(
+                            squares_of(
+                                filtered(
+                                    one, own, friction=start, deviation=deviation
+                                ).steps.filtered.mean,
+                                own,
+                                skip,
+                            )
+                        )
                         for one in filters
                     ]
                 )
                 for start in (TRAINED_FROM, LOW)
             }
             # the same weights start from both frictions: seeds are paired, so their differences are what is resampled
-            change = over_sequences(squares[LOW] - squares[TRAINED_FROM], np.zeros((1, squares[LOW].shape[1])))
+            change = over_sequences(
+                squares[LOW] - squares[TRAINED_FROM], np.zeros((1, squares[LOW].shape[1]))
+            )
             rows.append(
                 {
                     "tyre": SETS[test],
                     "deviation": learnt if deviation is None else deviation,
-                    "which": "as learnt" if deviation is None else "the authors' code" if deviation == DEVIATIONS[-1] else "between",
+                    "which": "as learnt"
+                    if deviation is None
+                    else "the authors' code"
+                    if deviation == DEVIATIONS[-1]
+                    else "between",
                     "usual": float(squares[TRAINED_FROM].mean()),
                     "low": float(squares[LOW].mean()),
                     "change": change.value,

@@ -45,13 +45,17 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
     for name, part in parts.items():
         for model in part.models:
             if "steps" not in model.training or not _SUBSCRIPT_U.search(model.variant):
-                raise DataError(f"part '{name}': {model.title} was not trained through the filter; set estimator.through_filter=true")
+                raise DataError(
+                    f"part '{name}': {model.title} was not trained through the filter; set estimator.through_filter=true"
+                )
         training = part.models[0].training
         steps, batch = int(training["steps"]), int(training["batch_size"])
         candidate = next(iter(models_by_candidate(part)))
         subject = Subject.of(part, candidate, f"{candidate}, {batch} × {steps} samples")
         sequences = sum(length // steps for length in lengths_of(part, part.split.train))
-        found.append(Length(steps, batch, int(training["through"]["max_epochs"]), sequences, subject))
+        found.append(
+            Length(steps, batch, int(training["through"]["max_epochs"]), sequences, subject)
+        )
     return sorted(found, key=lambda own: (own.steps, own.batch))
 
 
@@ -68,8 +72,17 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     rows = []
     for way, words in WAYS.items():
         for own in of_way(found, way):
-            row: dict[str, object] = {"way": words, "steps": own.steps, "batch": own.batch, "epochs": own.epochs}
-            row |= {"epoch_samples": own.sequences * own.steps, "batches": own.batches, "in_a_row": own.batches * own.steps}
+            row: dict[str, object] = {
+                "way": words,
+                "steps": own.steps,
+                "batch": own.batch,
+                "epochs": own.epochs,
+            }
+            row |= {
+                "epoch_samples": own.sequences * own.steps,
+                "batches": own.batches,
+                "in_a_row": own.batches * own.steps,
+            }
             for test, errors in own.subject.errors.items():
                 mse = errors.mean(own.subject.squared(test))
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
@@ -79,10 +92,23 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
-            for (_, words), colour, shift in zip(WAYS.items(), OTHER_COLOURS, (0.97, 1.03), strict=False):
+            for (_, words), colour, shift in zip(
+                WAYS.items(), OTHER_COLOURS, (0.97, 1.03), strict=False
+            ):
                 part = frame[frame["way"] == words]
-                ends = [part[f"mse.{test}"] - part[f"low.{test}"], part[f"high.{test}"] - part[f"mse.{test}"]]
-                axes.errorbar(part["steps"] * shift, part[f"mse.{test}"], yerr=ends, color=colour, marker="o", capsize=2, label=words)
+                ends = [
+                    part[f"mse.{test}"] - part[f"low.{test}"],
+                    part[f"high.{test}"] - part[f"mse.{test}"],
+                ]
+                axes.errorbar(
+                    part["steps"] * shift,
+                    part[f"mse.{test}"],
+                    yerr=ends,
+                    color=colour,
+                    marker="o",
+                    capsize=2,
+                    label=words,
+                )
             steps = sorted(set(frame["steps"]))
             axes.set_xscale("log")
             axes.set_xticks(steps, [f"{own:g}" for own in steps])
@@ -98,11 +124,23 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
         f"{listed([str(own) for own in seeds])} seeds, {found[0].epochs} epochs through the filter. An epoch goes once through the drives, "
         f"so a smaller batch takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
-    columns = {"way": Column("held constant"), "steps": Column("samples", decimals=0), "batch": Column("sequences in a batch", decimals=0)}
-    columns |= {"epochs": Column("epochs", decimals=0), "batches": Column("batches an epoch", decimals=0)}
-    columns |= {"epoch_samples": Column("filter steps an epoch", decimals=0), "in_a_row": Column("of them one after another", decimals=0)}
+    columns = {
+        "way": Column("held constant"),
+        "steps": Column("samples", decimals=0),
+        "batch": Column("sequences in a batch", decimals=0),
+    }
+    columns |= {
+        "epochs": Column("epochs", decimals=0),
+        "batches": Column("batches an epoch", decimals=0),
+    }
+    columns |= {
+        "epoch_samples": Column("filter steps an epoch", decimals=0),
+        "in_a_row": Column("of them one after another", decimals=0),
+    }
     columns |= {f"words.{test}": Column(f"MSE (weighted), {SETS[test]}") for test in tests}
-    return Figure("figure_7", caption, figure), Table("sequence_length", "What Figure 7 draws.", frame, columns)
+    return Figure("figure_7", caption, figure), Table(
+        "sequence_length", "What Figure 7 draws.", frame, columns
+    )
 
 
 def length_comparisons(found: Sequence[Length]) -> list[Comparison]:
@@ -113,7 +151,9 @@ def length_comparisons(found: Sequence[Length]) -> list[Comparison]:
         if len(own) > 1:
             short, long = own[0], own[-1]
             claim = f"sequences of {long.steps} samples below {short.steps}, {words}"
-            comparisons.append(Comparison(long.subject, short.subject, claim, "Figure 7: longer is better"))
+            comparisons.append(
+                Comparison(long.subject, short.subject, claim, "Figure 7: longer is better")
+            )
     return comparisons
 
 
@@ -126,5 +166,10 @@ def epoch_claim(found: Sequence[Length]) -> Claim:
     steps = ", ".join(str(one.steps) for one in of_way(found, "batch"))
     ours = f"of {steps} samples: filter steps one after another, an epoch {'; '.join(counts)}"
     return Claim(
-        "longer training sequences take longer an epoch", "Figure 7", ours, "none", "not testable on this data", "times are not published"
+        "longer training sequences take longer an epoch",
+        "Figure 7",
+        ours,
+        "none",
+        "not testable on this data",
+        "times are not published",
     )

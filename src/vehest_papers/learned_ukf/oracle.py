@@ -13,24 +13,40 @@ from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights
 
 EPOCHS = 15
 TRAINING = ThroughFilterSettings(
-    through=PhaseSettings(learning_rate=2e-3, max_epochs=EPOCHS, validate_every=5, schedule="cosine"),
+    through=PhaseSettings(
+        learning_rate=2e-3, max_epochs=EPOCHS, validate_every=5, schedule="cosine"
+    ),
     batch_size=2,
     mirrored=0.0,
     start_noise="given",  # that of the filter as it is
 )
 
 
-def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughFilterSettings = TRAINING) -> LearnedUkf:
+def train_on(
+    estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughFilterSettings = TRAINING
+) -> LearnedUkf:
     """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free."""
     length = drives.states.shape[1]
-    training = replace(training, steps=min(training.steps, length), validation_steps=length, validation_drop_steps=skip)
+    training = replace(
+        training,
+        steps=min(training.steps, length),
+        validation_steps=length,
+        validation_drop_steps=skip,
+    )
     own = [Drive(*(part[row] for part in drives)) for row in range(len(drives.states))]
     weights = torch.tensor(WEIGHTS, dtype=drives.states.dtype)
     nothing = torch.zeros(1, dtype=drives.states.dtype)
     every = torch.cat([weights, nothing])
     judged = torch.cat([weights[:3], nothing, nothing])
     phases = filter_phases(
-        estimator.filter, own, own, Weights(every, every, judged), training, training.through, lambda name: True, "oracle"
+        estimator.filter,
+        own,
+        own,
+        Weights(every, every, judged),
+        training,
+        training.through,
+        lambda name: True,
+        "oracle",
     )
     train_phases(phases, 0, FitContext())
     return estimator

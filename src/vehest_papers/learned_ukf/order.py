@@ -25,7 +25,10 @@ DECIMALS = 4
 
 
 def differences(
-    losses: Mapping[str, FloatArray], sequence: NDArray[np.int64], published: Mapping[str, float], rate_hz: float
+    losses: Mapping[str, FloatArray],
+    sequence: NDArray[np.int64],
+    published: Mapping[str, float],
+    rate_hz: float,
 ) -> pd.DataFrame:
     """Every pair of candidates, the one with the lower mean loss in the paper first; of equal ones the first of `losses`.
 
@@ -43,11 +46,15 @@ def differences(
         DataError: there are fewer than two sequences, or a loss is not finite.
     """
     order = sorted((name for name in losses if name in published), key=published.__getitem__)
-    places = {value: place for place, value in enumerate(sorted({published[name] for name in order}))}
+    places = {
+        value: place for place, value in enumerate(sorted({published[name] for name in order}))
+    }
     rows = []
     for first, second in itertools.combinations(order, 2):
         own = paired_difference(losses[first], losses[second], sequence, rate_hz=rate_hz)
-        verdict = AS_IN_THE_PAPER if own.mean.high < 0 else TURNED if own.mean.low > 0 else UNDECIDED
+        verdict = (
+            AS_IN_THE_PAPER if own.mean.high < 0 else TURNED if own.mean.low > 0 else UNDECIDED
+        )
         if published[first] == published[second]:
             verdict = LEVEL if own.mean.low <= 0.0 <= own.mean.high else APART
         rows.append(
@@ -56,8 +63,17 @@ def differences(
                 "second": second,
                 "neighbours": places[published[second]] == places[published[first]] + 1,
                 "paper": published[first] - published[second],
-                **{"mean": own.mean.value, "low": own.mean.low, "high": own.mean.high, "p_value": own.mean.p_value},
-                **{"median": own.median.value, "median_low": own.median.low, "median_high": own.median.high},
+                **{
+                    "mean": own.mean.value,
+                    "low": own.mean.low,
+                    "high": own.mean.high,
+                    "p_value": own.mean.p_value,
+                },
+                **{
+                    "median": own.median.value,
+                    "median_low": own.median.low,
+                    "median_high": own.median.high,
+                },
                 "verdict": verdict,
             }
         )
@@ -69,7 +85,8 @@ def pairs_table(pairs: pd.DataFrame, name: str, caption: str) -> Table:
     own = pairs.copy()
     for kind, low, high in (("mean", "low", "high"), ("median", "median_low", "median_high")):
         own[f"{kind}_in_words"] = [
-            f"{fixed(row[kind], DECIMALS)} [{fixed(row[low], DECIMALS)}, {fixed(row[high], DECIMALS)}]" for row in own.to_dict("records")
+            f"{fixed(row[kind], DECIMALS)} [{fixed(row[low], DECIMALS)}, {fixed(row[high], DECIMALS)}]"
+            for row in own.to_dict("records")
         ]
     columns = {
         "first": Column("lower in the paper"),
@@ -89,16 +106,28 @@ def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str
     words = f"Order {where} by the median of seeds, best first: {shown}."
     if pairs.empty:
         return words
-    counts = {verdict: int((pairs["verdict"] == verdict).sum()) for verdict in (AS_IN_THE_PAPER, TURNED, UNDECIDED)}
+    counts = {
+        verdict: int((pairs["verdict"] == verdict).sum())
+        for verdict in (AS_IN_THE_PAPER, TURNED, UNDECIDED)
+    }
     words += (
         f" Of {sum(counts.values())} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its "
         f"order, {counts[TURNED]} the other way round, and includes zero for {counts[UNDECIDED]}."
     )
-    level = [f"{row['first']} and {row['second']}" for row in pairs[pairs["verdict"].isin((LEVEL, APART))].to_dict("records")]
+    level = [
+        f"{row['first']} and {row['second']}"
+        for row in pairs[pairs["verdict"].isin((LEVEL, APART))].to_dict("records")
+    ]
     if level:
-        apart = [f"{row['first']} and {row['second']}" for row in pairs[pairs["verdict"] == APART].to_dict("records")]
+        apart = [
+            f"{row['first']} and {row['second']}"
+            for row in pairs[pairs["verdict"] == APART].to_dict("records")
+        ]
         words += f" Level in the paper: {'; '.join(level)}; told apart here: {'; '.join(apart) or 'none'}."
-    turned = [f"{row['second']} before {row['first']}" for row in pairs[pairs["verdict"] == TURNED].to_dict("records")]
+    turned = [
+        f"{row['second']} before {row['first']}"
+        for row in pairs[pairs["verdict"] == TURNED].to_dict("records")
+    ]
     if turned:
         words += f" The other way round: {'; '.join(turned)}."
     open_pairs = pairs[pairs["neighbours"] & (pairs["verdict"] == UNDECIDED)].to_dict("records")

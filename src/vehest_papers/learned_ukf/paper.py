@@ -14,7 +14,20 @@ GRU, LSTM = "GRU", "LSTM"
 ZERO, STATIC_MAP, DATA_SHEET, ORACLE = "zero", "static map", "data sheet", "oracle"
 BASELINES = (ZERO, STATIC_MAP, DATA_SHEET)
 
-CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW, GRU, LSTM)  # in the order of Table II
+CANDIDATES = (
+    PC,
+    PCR,
+    NN,
+    NN_U,
+    NNT,
+    NNT_U,
+    NNTF,
+    NNTF_U,
+    NNTF_UH,
+    NNTF_UH_LOW,
+    GRU,
+    LSTM,
+)  # in the order of Table II
 
 
 @dataclass(frozen=True)
@@ -58,7 +71,10 @@ TABLE_II: Mapping[str, Published] = {
 TABLES: Mapping[str, Mapping[str, Published]] = {"tyre_a": TABLE_I, "tyre_d": TABLE_II}
 """Test set -> the paper's table; its unseen tyre is C where ours is D."""
 
-RMS: Mapping[tuple[str, str], tuple[float, float]] = {("tyre_a", NNTF_UH): (0.062, 0.070), ("tyre_d", NNTF_UH_LOW): (0.176, 0.128)}
+RMS: Mapping[tuple[str, str], tuple[float, float]] = {
+    ("tyre_a", NNTF_UH): (0.062, 0.070),
+    ("tyre_d", NNTF_UH_LOW): (0.176, 0.128),
+}
 """(test set, candidate) -> root mean square errors of vx and vy [m/s] (Sections IV-B and IV-C)."""
 
 AUTHORS_CODE: Mapping[str, float] = {"tyre_a": 0.0158, "tyre_d": 0.0441}
@@ -66,9 +82,15 @@ AUTHORS_CODE: Mapping[str, float] = {"tyre_a": 0.0158, "tyre_d": 0.0441}
 and 1000 epochs, one seed, on a CPU."""
 
 MINUTES = 52.0  # of driving in the paper's data set (Section III-C), of which ..
-SHARE_OF_TYRE_A, SHARE_LEARNT = 0.201, 0.7  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
+SHARE_OF_TYRE_A, SHARE_LEARNT = (
+    0.201,
+    0.7,
+)  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
 MINUTES_LEARNT = MINUTES * SHARE_OF_TYRE_A * SHARE_LEARNT
 
-NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}  # friction of the tyres (Section III-C)
+NOMINAL_FRICTION: Mapping[str, float] = {
+    "tyre_a": 0.65,
+    "tyre_d": 0.45,
+}  # friction of the tyres (Section III-C)
 
 SLIP_99 = 40.0  # [deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)

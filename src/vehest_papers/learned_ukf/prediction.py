@@ -17,7 +17,14 @@ from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
-from vehest_papers.learned_ukf.filtering import MOVING, filtered, one_step_squares, squares_of, swapped, weighted
+from vehest_papers.learned_ukf.filtering import (
+    MOVING,
+    filtered,
+    one_step_squares,
+    squares_of,
+    swapped,
+    weighted,
+)
 
 BEFORE, AFTER = paper.NNTF, paper.NNTF_U
 PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
@@ -32,15 +39,23 @@ class Compared:
 
     one_step: FloatArray  # of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4)
     estimation: FloatArray  # the same of their filters
-    swaps: Mapping[tuple[int, int], FloatArray]  # (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF
+    swaps: Mapping[
+        tuple[int, int], FloatArray
+    ]  # (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF
 
-    def states(self, task: str, lower: Mapping[str, bool]) -> dict[str, tuple[Interval, float, bool]]:
+    def states(
+        self, task: str, lower: Mapping[str, bool]
+    ) -> dict[str, tuple[Interval, float, bool]]:
         """State -> difference NNTF_U - NNTF of mean squares, the error of NNTF, and whether the paper has it lower."""
         before, after = getattr(self, task)
         found = {}
         for state, expected in lower.items():
             k = MOVING.index(state)
-            found[state] = (over_sequences(after[..., k], before[..., k]), float(before[..., k].mean()), expected)
+            found[state] = (
+                over_sequences(after[..., k], before[..., k]),
+                float(before[..., k].mean()),
+                expected,
+            )
         return found
 
 
@@ -49,24 +64,36 @@ def over_sequences(first: FloatArray, second: FloatArray) -> Interval:
     return difference_of_blocks(first, second, np.ones(first.shape[1]), n_resamples=4000).mean
 
 
-def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> dict[str, Compared]:
+def compared(
+    pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol
+) -> dict[str, Compared]:
     """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them."""
     skip = round(protocol.skip_seconds * protocol.rate_hz)
     found = {}
     for test, own in drives.items():
-        predicted = np.array([[one_step_squares(pair[k], own) for pair in pairs.values()] for k in (0, 1)])
+        predicted = np.array(
+            [[one_step_squares(pair[k], own) for pair in pairs.values()] for k in (0, 1)]
+        )
         estimated: dict[tuple[int, int], list[FloatArray]] = {}
         for pair in pairs.values():
             results = {(0, 0): filtered(pair[0], own), (1, 1): filtered(pair[1], own)}
             results |= {(a, b): swapped(pair[a], pair[b], own) for a, b in ((0, 1), (1, 0))}
             for key, result in results.items():
-                estimated.setdefault(key, []).append(squares_of(result.steps.filtered.mean, own, skip))
+                estimated.setdefault(key, []).append(
+                    squares_of(result.steps.filtered.mean, own, skip)
+                )
         estimation = np.array([estimated[0, 0], estimated[1, 1]])
-        found[test] = Compared(predicted, estimation, {key: weighted(np.array(squares)) for key, squares in estimated.items()})
+        found[test] = Compared(
+            predicted,
+            estimation,
+            {key: weighted(np.array(squares)) for key, squares in estimated.items()},
+        )
     return found
 
 
-def frames(found: Mapping[str, Compared], seeds: Sequence[int]) -> tuple[pd.DataFrame, pd.DataFrame]:
+def frames(
+    found: Mapping[str, Compared], seeds: Sequence[int]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     """What is drawn.
 
     Returns:
@@ -80,10 +107,23 @@ def frames(found: Mapping[str, Compared], seeds: Sequence[int]) -> tuple[pd.Data
             for task in TASKS:
                 before, after = (part[place].mean(axis=0) for part in getattr(own, task))
                 for state, first, second in zip(MOVING, before, after, strict=True):
-                    row = {"test_set": test, "seed": seed, "task": task, "state": state, "before": first, "after": second}
+                    row = {
+                        "test_set": test,
+                        "seed": seed,
+                        "task": task,
+                        "state": state,
+                        "before": first,
+                        "after": second,
+                    }
                     states.append(row | {"decrease": 100.0 * (1.0 - second / first)})
             swaps += [
-                {"test_set": test, "seed": seed, "predicts": names[a], "observes": names[b], "mse": float(mse[place].mean())}
+                {
+                    "test_set": test,
+                    "seed": seed,
+                    "predicts": names[a],
+                    "observes": names[b],
+                    "mse": float(mse[place].mean()),
+                }
                 for (a, b), mse in own.swaps.items()
             ]
     return pd.DataFrame(states), pd.DataFrame(swaps)
@@ -95,12 +135,28 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), sharey=True, squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
-            for offset, (task, label), colour in zip((-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True):
+            for offset, (task, label), colour in zip(
+                (-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True
+            ):
                 own = states[(states["test_set"] == test) & (states["task"] == task)]
                 for place, state in enumerate(MOVING):
                     values = own[own["state"] == state]["decrease"].to_numpy()
-                    axes.bar(place + offset, np.median(values), 0.36, color=colour, alpha=0.75, label=label if not place else None)
-                    axes.scatter(np.full(len(values), place + offset), values, s=7, color="black", zorder=3, linewidths=0)
+                    axes.bar(
+                        place + offset,
+                        np.median(values),
+                        0.36,
+                        color=colour,
+                        alpha=0.75,
+                        label=label if not place else None,
+                    )
+                    axes.scatter(
+                        np.full(len(values), place + offset),
+                        values,
+                        s=7,
+                        color="black",
+                        zorder=3,
+                        linewidths=0,
+                    )
             axes.axhline(0.0, color="#444444", linewidth=0.7)
             axes.set_xticks(range(len(MOVING)), ["$v_x$", "$v_y$", "yaw rate", "rim speed"])
             axes.set_title(SETS[test], loc="left")
@@ -130,16 +186,38 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
         for axes, test in zip(grid, tests, strict=True):
             for place, (predicts, observes) in enumerate(combinations):
                 values = _of(swaps, test, predicts, observes)
-                border, hatch = (PLAIN_BLUE if one == BEFORE else THROUGH_RED for one in (predicts, observes))
-                axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=hatch, hatch="////", linewidth=0)
-                axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=border, linewidth=1.8)
-                axes.scatter(np.full(len(values), place), values, s=9, color="black", zorder=3, linewidths=0)
+                border, hatch = (
+                    PLAIN_BLUE if one == BEFORE else THROUGH_RED for one in (predicts, observes)
+                )
+                axes.bar(
+                    place,
+                    np.median(values),
+                    0.66,
+                    facecolor="none",
+                    edgecolor=hatch,
+                    hatch="////",
+                    linewidth=0,
+                )
+                axes.bar(
+                    place,
+                    np.median(values),
+                    0.66,
+                    facecolor="none",
+                    edgecolor=border,
+                    linewidth=1.8,
+                )
+                axes.scatter(
+                    np.full(len(values), place), values, s=9, color="black", zorder=3, linewidths=0
+                )
             axes.set_xticks(range(4), [f"{a}\n{b}" for a, b in combinations], linespacing=1.5)
             axes.set_title(SETS[test], loc="left")
             axes.grid(visible=False, axis="x")
             axes.set_ylabel("MSE (weighted)")
             axes.set_ylim(bottom=0.0)
-        figure.supxlabel("above: the model that predicts, and its noise; below: the model that observes", fontsize=7.5)
+        figure.supxlabel(
+            "above: the model that predicts, and its noise; below: the model that observes",
+            fontsize=7.5,
+        )
     caption = (
         f"MSE (weighted) of filters that predict with one model and observe with another, Figure 6 of the paper: border, the model of the "
         f"prediction step; hatching, that of the observation; blue {BEFORE}, red {AFTER}, of one seed each. Noise is that of the "
@@ -148,8 +226,14 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
     return Figure(f"figure_6_{name}", caption, figure)
 
 
-def _of(swaps: pd.DataFrame, test: str, predicts: str, observes: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    own = swaps[(swaps["test_set"] == test) & (swaps["predicts"] == predicts) & (swaps["observes"] == observes)]
+def _of(
+    swaps: pd.DataFrame, test: str, predicts: str, observes: str
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    own = swaps[
+        (swaps["test_set"] == test)
+        & (swaps["predicts"] == predicts)
+        & (swaps["observes"] == observes)
+    ]
     return own["mse"].to_numpy(dtype=np.float64)
 
 

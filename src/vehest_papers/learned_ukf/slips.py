@@ -37,19 +37,31 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
     return np.concatenate(parts)
 
 
-def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: str) -> tuple[Figure, Table, pd.DataFrame]:
+def distribution(
+    slips: Mapping[str, FloatArray], name: str, data: str, note: str
+) -> tuple[Figure, Table, pd.DataFrame]:
     """Density of each set's slip angle [deg], its percentiles, and the drawn values."""
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
     with new_figure(DOUBLE_COLUMN * 0.8, 2.9) as figure:
         axes = figure.add_subplot()
-        for (label, values), colour, dash in zip(slips.items(), OTHER_COLOURS, ("solid", "dashed", "dashdot"), strict=False):
+        for (label, values), colour, dash in zip(
+            slips.items(), OTHER_COLOURS, ("solid", "dashed", "dashdot"), strict=False
+        ):
             counts, _ = np.histogram(np.clip(values, -LIMIT, LIMIT), edges)
             drawn[label] = counts / len(values) / WIDTH
-            axes.stairs(drawn[label], edges, color=colour, linestyle=dash, linewidth=1.2, label=label)
+            axes.stairs(
+                drawn[label], edges, color=colour, linestyle=dash, linewidth=1.2, label=label
+            )
         for side in (-1.0, 1.0):
             known = "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
-            axes.axvline(side * paper.SLIP_99, color="#767676", linewidth=0.8, linestyle="dotted", label=known)
+            axes.axvline(
+                side * paper.SLIP_99,
+                color="#767676",
+                linewidth=0.8,
+                linestyle="dotted",
+                label=known,
+            )
         axes.set_yscale("log")
         axes.set_xlim(-LIMIT, LIMIT)
         axes.set_xlabel("slip angle of the rear axle [deg]")
@@ -60,11 +72,20 @@ def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: st
         f"{LEAST_SPEED:g} m/s and more; angles beyond {LIMIT:g}° count in the outermost bins. {note}"
     )
     rows = [
-        {"set": label, "samples": len(values), **{f"p{p}": float(np.percentile(np.abs(values), p)) for p in PERCENTILES}}
+        {
+            "set": label,
+            "samples": len(values),
+            **{f"p{p}": float(np.percentile(np.abs(values), p)) for p in PERCENTILES},
+        }
         for label, values in slips.items()
     ]
     columns = {"set": Column("set"), "samples": Column("samples")} | {
         f"p{p}": Column(f"{p} % below [deg]", decimals=1) for p in PERCENTILES
     }
-    table = Table(f"slip_percentiles_{name}", "Size of the slip angle of the rear axle.", pd.DataFrame(rows), columns)
+    table = Table(
+        f"slip_percentiles_{name}",
+        "Size of the slip angle of the rear axle.",
+        pd.DataFrame(rows),
+        columns,
+    )
     return Figure(f"figure_3_{name}", caption, figure), table, drawn

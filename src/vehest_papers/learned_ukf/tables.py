@@ -18,7 +18,11 @@ from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_c
 from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.paper import Published
 
-METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "MAE"), "ae99": ("ae99_weighted", "99%-AE")}
+METRICS = {
+    "mse": ("mse_weighted", "MSE (weighted)"),
+    "mae": ("mae_weighted", "MAE"),
+    "ae99": ("ae99_weighted", "99%-AE"),
+}
 """Attribute of `Published` -> metric, and its header."""
 
 STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
@@ -62,7 +66,9 @@ def overview(errors: Mapping[str, Losses], kind: str) -> Table:
         rows.append(row)
     columns = {"candidate": Column("method")}
     for test in errors:
-        columns[f"paper_{test}"] = Column(f"paper, {'tyre A' if test == 'tyre_a' else 'tyre C'}", decimals=4)
+        columns[f"paper_{test}"] = Column(
+            f"paper, {'tyre A' if test == 'tyre_a' else 'tyre C'}", decimals=4
+        )
         columns[f"words_{test}"] = Column(f"ours, {SETS[test]}")
     columns["n_seeds"] = Column("seeds", decimals=0)
     caption = (
@@ -82,21 +88,36 @@ def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) 
             for state in STATES:
                 values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
                 row[f"ours_{state}_{test}"] = median_and_range(values, 3)
-                row |= {f"median_{state}_{test}": np.median(values), f"paper_{state}_{test}": known.get(state, math.nan)}
+                row |= {
+                    f"median_{state}_{test}": np.median(values),
+                    f"paper_{state}_{test}": known.get(state, math.nan),
+                }
                 row[f"shown_{state}_{test}"] = _beside(row, state, test)
         rows.append(row)
     columns = {"candidate": Column("method")}
     for test in tests:
-        columns |= {f"shown_{state}_{test}": Column(f"{state.replace('_', ' ')}, {SETS[test]} [{unit}]") for state, unit in STATES.items()}
+        columns |= {
+            f"shown_{state}_{test}": Column(f"{state.replace('_', ' ')}, {SETS[test]} [{unit}]")
+            for state, unit in STATES.items()
+        }
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
 def consistency(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
     """NEES, NIS and coverage of the bands of vy, of filters."""
     rows: list[dict[str, object]] = [
-        {"candidate": "consistent", **{f"{metric}_{test}": value for test in tests for metric, value in _CONSISTENT.items()}}
+        {
+            "candidate": "consistent",
+            **{
+                f"{metric}_{test}": value for test in tests for metric, value in _CONSISTENT.items()
+            },
+        }
     ]
-    rows[0] |= {f"shown_{key}": fixed(float(value), 3) for key, value in list(rows[0].items()) if key != "candidate"}  # type: ignore[arg-type]
+    rows[0] |= {
+        f"shown_{key}": fixed(float(value), 3)  # type: ignore[arg-type]
+        for key, value in list(rows[0].items())
+        if key != "candidate"
+    }
     for candidate in dict.fromkeys(runs["candidate"]):
         if np.isnan(of_candidate(runs, candidate, f"nees.{tests[0]}")).all():
             continue
@@ -104,15 +125,32 @@ def consistency(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: st
         for test in tests:
             for metric in _CONSISTENT:
                 values = of_candidate(runs, candidate, f"{metric}.{test}")
-                row |= {f"{metric}_{test}": np.median(values), f"shown_{metric}_{test}": median_and_range(values, _DECIMALS[metric])}
+                row |= {
+                    f"{metric}_{test}": np.median(values),
+                    f"shown_{metric}_{test}": median_and_range(values, _DECIMALS[metric]),
+                }
         rows.append(row)
     columns = {"candidate": Column("method")}
-    columns |= {f"shown_{metric}_{test}": Column(f"{header}, {SETS[test]}") for test in tests for metric, header in _HEADERS.items()}
+    columns |= {
+        f"shown_{metric}_{test}": Column(f"{header}, {SETS[test]}")
+        for test in tests
+        for metric, header in _HEADERS.items()
+    }
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-_CONSISTENT = {"nees": 1.0, "nis": 1.0, "coverage_1sigma": COVERAGE[1], "coverage_2sigma": COVERAGE[2]}
-_HEADERS = {"nees": "NEES", "nis": "NIS", "coverage_1sigma": "within 1σ", "coverage_2sigma": "within 2σ"}
+_CONSISTENT = {
+    "nees": 1.0,
+    "nis": 1.0,
+    "coverage_1sigma": COVERAGE[1],
+    "coverage_2sigma": COVERAGE[2],
+}
+_HEADERS = {
+    "nees": "NEES",
+    "nis": "NIS",
+    "coverage_1sigma": "within 1σ",
+    "coverage_2sigma": "within 2σ",
+}
 _DECIMALS = {"nees": 2, "nis": 2, "coverage_1sigma": 3, "coverage_2sigma": 3}
 
 
@@ -144,7 +182,10 @@ def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> 
 
 def medians(runs: pd.DataFrame, column: str) -> dict[str, float]:
     """Candidate -> median over seeds."""
-    return {candidate: float(np.median(of_candidate(runs, candidate, column))) for candidate in dict.fromkeys(runs["candidate"])}
+    return {
+        candidate: float(np.median(of_candidate(runs, candidate, column)))
+        for candidate in dict.fromkeys(runs["candidate"])
+    }
 
 
 def _figure(published: Published | None, short: str) -> float:
@@ -153,12 +194,20 @@ def _figure(published: Published | None, short: str) -> float:
 
 def _beside(row: Mapping[str, object], state: str, test: str) -> str:
     value, own = row[f"paper_{state}_{test}"], str(row[f"ours_{state}_{test}"])
-    return f"{own} (paper {fixed(value, 3)})" if isinstance(value, float) and math.isfinite(value) else own
+    return (
+        f"{own} (paper {fixed(value, 3)})"
+        if isinstance(value, float) and math.isfinite(value)
+        else own
+    )
 
 
 def _epochs_by_phase(history: pd.DataFrame) -> list[int]:
     """Epochs of each phase; of one where a history knows no phases."""
-    return [int(count) for count in history.groupby("phase").size()] if "phase" in history else [len(history)]
+    return (
+        [int(count) for count in history.groupby("phase").size()]
+        if "phase" in history
+        else [len(history)]
+    )
 
 
 def _median(values: Sequence[float]) -> float:

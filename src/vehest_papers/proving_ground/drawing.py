@@ -12,19 +12,36 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, MatplotlibFigure, new_figure
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    LINEAR_BLUES,
+    NONLINEAR_ORANGES,
+    OTHER_COLOURS,
+    MatplotlibFigure,
+    new_figure,
+)
 from vehest_papers.proving_ground import noise
 from vehest_papers.proving_ground.handling import ANGLE_EDGES, AY_EDGES
 from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile
-from vehest_papers.proving_ground.vehicles import SHORTEST_TRACE, TRACE_SECONDS, Stretch, VehiclePage
+from vehest_papers.proving_ground.vehicles import (
+    SHORTEST_TRACE,
+    TRACE_SECONDS,
+    Stretch,
+    VehiclePage,
+)
 
 POINTS = 1200
 GREYS = 12
 FARTHEST_ANGLE = 6.0  # deg, to which a characteristic is shown beyond the samples
 GAP_SHARE = 0.012  # of the time axis, between two stretches
 SOURCES = {"simulated": (LINEAR_BLUES[1], "solid"), "real": (NONLINEAR_ORANGES[1], "dashed")}
-_CURVES = ((LINEAR_BLUES[1], "solid"), (NONLINEAR_ORANGES[0], "dashed"), (OTHER_COLOURS[0], "dashdot"), (OTHER_COLOURS[2], "dotted"))
+_CURVES = (
+    (LINEAR_BLUES[1], "solid"),
+    (NONLINEAR_ORANGES[0], "dashed"),
+    (OTHER_COLOURS[0], "dashdot"),
+    (OTHER_COLOURS[2], "dotted"),
+)
 MOST_STRETCHES = 8
 QUANTITIES = {
     "vx": ("vx [m/s]", 1.0),
@@ -62,7 +79,11 @@ def traces(stretches: Sequence[Stretch]) -> MatplotlibFigure:
             at = offset + trace.time - trace.time[0]
             points = max(round(POINTS * (at[-1] - at[0]) / total), 60)
             for axes, (name, (_, factor)) in zip(rows, shown.items(), strict=True):
-                axes.plot(*decimated(at, factor * trace.channels[name], points), color=SOURCES["simulated"][0], linewidth=0.9)
+                axes.plot(
+                    *decimated(at, factor * trace.channels[name], points),
+                    color=SOURCES["simulated"][0],
+                    linewidth=0.9,
+                )
             rows[0].annotate(
                 trace.manoeuvre.replace("_", " "),
                 (at[0], 1.0),
@@ -92,25 +113,60 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
 
     assert page.handling is not None
     edges, counts, curves = (AY_EDGES, ANGLE_EDGES), page.handling.everything, page.characteristics
-    sources = {"simulated": page.handling, **({"real": page.real_handling} if page.real_handling is not None else {})}
+    sources = {
+        "simulated": page.handling,
+        **({"real": page.real_handling} if page.real_handling is not None else {}),
+    }
     with new_figure(DOUBLE_COLUMN, 3.6) as figure:
         axes = figure.add_subplot()
         greys = LinearSegmentedColormap.from_list("greys", ["#ececec", "#7d7d7d"], N=GREYS)
         shown = np.ma.masked_equal(counts.T, 0)
-        mesh = axes.pcolormesh(*edges, shown, cmap=greys, norm=LogNorm(1, max(int(counts.max()), 10)), rasterized=True, zorder=1)
+        mesh = axes.pcolormesh(
+            *edges,
+            shown,
+            cmap=greys,
+            norm=LogNorm(1, max(int(counts.max()), 10)),
+            rasterized=True,
+            zorder=1,
+        )
         for (colour, dash), curve in zip(_CURVES, curves, strict=False):
-            axes.plot(curve.ay, curve.angle, color=colour, linestyle=dash, linewidth=1.5, label=f"plant, {curve.label}", zorder=4)
+            axes.plot(
+                curve.ay,
+                curve.angle,
+                color=colour,
+                linestyle=dash,
+                linewidth=1.5,
+                label=f"plant, {curve.label}",
+                zorder=4,
+            )
         for (colour, _), curve in zip(_CURVES, curves, strict=False):
             if curve.gradient not in [other.gradient for other in curves[: curves.index(curve)]]:
                 ends = np.array([-6.0, 6.0])
-                label = f"linear single track, {curve.label.split(',')[0]}: {curve.gradient:.3f}°/(m/s²)".replace("-", "\N{MINUS SIGN}")
-                axes.plot(ends, curve.gradient * ends, color=colour, linewidth=0.7, linestyle=(0, (6, 2)), label=label, zorder=3)
+                label = f"linear single track, {curve.label.split(',')[0]}: {curve.gradient:.3f}°/(m/s²)".replace(
+                    "-", "\N{MINUS SIGN}"
+                )
+                axes.plot(
+                    ends,
+                    curve.gradient * ends,
+                    color=colour,
+                    linewidth=0.7,
+                    linestyle=(0, (6, 2)),
+                    label=label,
+                    zorder=3,
+                )
         for kind, points in sources.items():
             filled = SOURCES[kind][0] if kind == "real" else "white"
             marker = "D" if kind == "real" else "o"
             label = f"median of steady turns, {kind}"
-            looks: dict[str, Any] = {"markeredgecolor": "black", "markerfacecolor": filled, "markeredgewidth": 0.7, "markersize": 3.6}
-            axes.plot(*points.medians(), linestyle="none", marker=marker, label=label, zorder=5, **looks)
+            looks: dict[str, Any] = {
+                "markeredgecolor": "black",
+                "markerfacecolor": filled,
+                "markeredgewidth": 0.7,
+                "markersize": 3.6,
+            }
+            axes.plot(
+                *points.medians(), linestyle="none", marker=marker, label=label, zorder=5, **looks
+            )
         axes.set_xlim(*_reach(edges[0], counts.sum(axis=1), [curve.ay for curve in curves]))
         shown_curves = [np.clip(curve.angle, -FARTHEST_ANGLE, FARTHEST_ANGLE) for curve in curves]
         axes.set_ylim(*_reach(edges[1], counts.sum(axis=0), shown_curves, share=0.001))
@@ -119,7 +175,13 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
         bar = figure.colorbar(mesh, ax=axes, pad=0.01, aspect=30)
         bar.set_label("samples a bin")
         bar.outline.set_visible(False)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=2, columnspacing=1.4, handlelength=2.8)
+        figure.legend(
+            *axes.get_legend_handles_labels(),
+            loc="outside upper left",
+            ncols=2,
+            columnspacing=1.4,
+            handlelength=2.8,
+        )
     return figure
 
 
@@ -129,7 +191,10 @@ MOST_SIDESLIP = 20.0  # beyond it a distribution of the sideslip angle is not dr
 def beyond(distributions: Sequence[Distribution], limit: float) -> float:
     """Share of all samples in bins beyond ±limit [%]."""
     total = sum(int(own.counts.sum()) for own in distributions)
-    outside = sum(int(own.counts[(own.edges[1:] <= -limit) | (own.edges[:-1] >= limit)].sum()) for own in distributions)
+    outside = sum(
+        int(own.counts[(own.edges[1:] <= -limit) | (own.edges[:-1] >= limit)].sum())
+        for own in distributions
+    )
     return 100.0 * outside / max(total, 1)
 
 
@@ -138,37 +203,64 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
     from matplotlib.ticker import FuncFormatter
 
     kinds = [*(["simulated"] if page.simulated else []), *(["real"] if page.real else [])]
-    sideslip, ay = ([Distribution(kind, *page.merged(kind).histogram(name, 1.0)) for kind in kinds] for name in ("sideslip", "ay"))
+    sideslip, ay = (
+        [Distribution(kind, *page.merged(kind).histogram(name, 1.0)) for kind in kinds]
+        for name in ("sideslip", "ay")
+    )
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         lowest = 1.0
-        for axes, counted, limit in ((left, sideslip, profile.sideslip_limit), (right, ay, profile.ay_limit)):
+        for axes, counted, limit in (
+            (left, sideslip, profile.sideslip_limit),
+            (right, ay, profile.ay_limit),
+        ):
             reach = 1.0
             for own in counted:
-                shares, (colour, dash) = 100.0 * own.counts / max(int(own.counts.sum()), 1), SOURCES[own.kind]
+                shares, (colour, dash) = (
+                    100.0 * own.counts / max(int(own.counts.sum()), 1),
+                    SOURCES[own.kind],
+                )
                 filled = own.kind == "simulated"
-                axes.stairs(shares, own.edges, color=colour, fill=filled, alpha=0.25 if filled else 1.0, linewidth=0)
-                axes.stairs(shares, own.edges, color=colour, linestyle=dash, linewidth=1.2, label=own.kind)
+                axes.stairs(
+                    shares,
+                    own.edges,
+                    color=colour,
+                    fill=filled,
+                    alpha=0.25 if filled else 1.0,
+                    linewidth=0,
+                )
+                axes.stairs(
+                    shares, own.edges, color=colour, linestyle=dash, linewidth=1.2, label=own.kind
+                )
                 occupied = np.flatnonzero(own.counts)
                 if len(occupied):
-                    reach = max(reach, abs(own.edges[occupied[0]]), abs(own.edges[occupied[-1] + 1]))
+                    reach = max(
+                        reach, abs(own.edges[occupied[0]]), abs(own.edges[occupied[-1] + 1])
+                    )
                     lowest = min(lowest, float(shares[shares > 0].min()))
             if limit is not None:
                 for side in (-1, 1):
                     label = profile.limit_label if side > 0 else None
-                    axes.axvline(side * limit, color="black", linestyle="dotted", linewidth=1.0, label=label)
+                    axes.axvline(
+                        side * limit, color="black", linestyle="dotted", linewidth=1.0, label=label
+                    )
             axes.set_yscale("log")
             shown = min(reach, MOST_SIDESLIP) if counted is sideslip else reach
             axes.set_xlim(-1.03 * shown, 1.03 * shown)
             if shown < reach:
-                axes.set_title(f"not shown: {beyond(counted, shown):.2g} % of samples beyond ±{shown:g}°", fontsize="small")
+                axes.set_title(
+                    f"not shown: {beyond(counted, shown):.2g} % of samples beyond ±{shown:g}°",
+                    fontsize="small",
+                )
         left.set_ylim(bottom=0.6 * lowest, top=100.0)
         left.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         left.set_ylabel("share of samples [%]")
         left.set_xlabel("sideslip angle, bins of 1° [deg]")
         right.set_xlabel("lateral acceleration, bins of 1 m/s² [m/s²]")
         handles, labels = right.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), columnspacing=1.4)
+        figure.legend(
+            handles, labels, loc="outside upper left", ncols=len(labels), columnspacing=1.4
+        )
     return figure
 
 
@@ -182,7 +274,14 @@ def noise_spectra(samples: Mapping[str, Recording]) -> MatplotlibFigure:
             for spectrum in own:
                 colour, dash = SOURCES[spectrum.kind]
                 style: Any = "solid" if dash == "solid" else (0, (3, 1))
-                axes.loglog(spectrum.frequency, spectrum.density, color=colour, linestyle=style, linewidth=0.9, label=spectrum.kind)
+                axes.loglog(
+                    spectrum.frequency,
+                    spectrum.density,
+                    color=colour,
+                    linestyle=style,
+                    linewidth=0.9,
+                    label=spectrum.kind,
+                )
             axes.axvline(NOISE_ABOVE, color="black", linestyle="dotted", linewidth=0.8)
             axes.set_title(quantity, loc="left", fontsize=7.5, pad=2.5)
         for axes in grid.flat[len(spectra) :]:
@@ -193,11 +292,15 @@ def noise_spectra(samples: Mapping[str, Recording]) -> MatplotlibFigure:
     return figure
 
 
-def _reach(edges: FloatArray, counts: NDArray[np.int64], curves: Sequence[FloatArray], share: float = 0.0) -> tuple[float, float]:
+def _reach(
+    edges: FloatArray, counts: NDArray[np.int64], curves: Sequence[FloatArray], share: float = 0.0
+) -> tuple[float, float]:
     """Limits of an axis that show the curves and all but a share of the samples at either end, the same to both sides of zero."""
     total, reach = int(counts.sum()), 1.0
     if total:
-        inside = np.flatnonzero((np.cumsum(counts) > share * total) & (np.cumsum(counts[::-1])[::-1] > share * total))
+        inside = np.flatnonzero(
+            (np.cumsum(counts) > share * total) & (np.cumsum(counts[::-1])[::-1] > share * total)
+        )
         reach = max(abs(float(edges[inside[0]])), abs(float(edges[inside[-1] + 1])))
     reach = max([reach, *(float(np.abs(curve).max()) for curve in curves)])
     return -1.04 * reach, 1.04 * reach

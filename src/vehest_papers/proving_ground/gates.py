@@ -21,18 +21,30 @@ from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest.studies.artefacts import StoredDataset
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, decibels, mean_bias
-from vehest_papers.ksnn.data_quality import PUBLISHED, PUBLISHED_BIAS, Statistics, spectra_of, statistics
+from vehest_papers.ksnn.data_quality import (
+    PUBLISHED,
+    PUBLISHED_BIAS,
+    Statistics,
+    spectra_of,
+    statistics,
+)
 from vehest_papers.proving_ground.papers import PROFILES
 from vehest_papers.proving_ground.tally import MOVING
 
 BEFORE, AFTER = "sim_two_cars", "sim_race_cars"
 """Data sets whose gates are shown: the first simulated cars, and those that the study of the KS-NN learns on."""
 RATE_HZ = 20.0  # rate of the paper's recordings, at which all is read
-BANDS_HZ = tuple(float(0.1 * 2.0 ** (step / 3.0)) for step in range(14))  # centres of thirds of an octave, 0.1 to 2.0 Hz
+BANDS_HZ = tuple(
+    float(0.1 * 2.0 ** (step / 3.0)) for step in range(14)
+)  # centres of thirds of an octave, 0.1 to 2.0 Hz
 SPECTRUM_DB = 3.0
 MAP_RANGE = (0.08, 0.13)  # FVU of a static map fitted on the car itself; the real Ferrari: 0.10
 BIAS_WITHIN = 0.03
-CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}  # first letter of a drive -> the car that it is like
+CARS = {
+    "c": "Corvette",
+    "f": "Ferrari",
+    "j": "Jaguar",
+}  # first letter of a drive -> the car that it is like
 
 READ_AT_HZ = (0.1, 0.3, 1.0)
 
@@ -61,7 +73,9 @@ class Gate:
     wanted: str  # what the paper or the real recording has, in words
     low: float  # of the range, included
     high: float  # likewise
-    values: Mapping[str, float]  # data set -> what it has; a data set without these drives is left out
+    values: Mapping[
+        str, float
+    ]  # data set -> what it has; a data set without these drives is left out
 
     def met(self, dataset: str) -> bool:
         """Whether a data set's value lies in the range."""
@@ -78,7 +92,9 @@ def static_map_of(recordings: Sequence[Recording]) -> StaticMap:
 def left_by(fitted: StaticMap, recordings: Sequence[Recording]) -> float:
     """FVU of a static map on recordings [1]."""
     vy = np.concatenate([own["vy_ref"] for own in recordings])
-    mapped = np.concatenate([fitted.run(own.stack(fitted.channels), None)[0]["vy"] for own in recordings])
+    mapped = np.concatenate(
+        [fitted.run(own.stack(fitted.channels), None)[0]["vy"] for own in recordings]
+    )
     return float(np.var(vy - mapped) / np.var(vy))
 
 
@@ -87,9 +103,15 @@ def _quantities(own: Statistics) -> dict[str, float]:
     return {**asdict(own), "ratio": (own.v_high - own.v_low) / (2.0 * own.ay)}
 
 
-def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> list[Gate]:
+def gates(
+    drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]
+) -> list[Gate]:
     """All gates, of data sets at `RATE_HZ`; without the real Ferrari the gate on its spectrum is left out."""
-    found = [gate for name, published in PUBLISHED.items() for gate in _of_table_one(name, published, drives)]
+    found = [
+        gate
+        for name, published in PUBLISHED.items()
+        for gate in _of_table_one(name, published, drives)
+    ]
     by_car = {name: _by_car(sets) for name, sets in drives.items()}
     real_map = f"{left_by(static_map_of(real), real):.2f} (real Ferrari)" if real else "–"
     for letter, car in CARS.items():
@@ -97,14 +119,27 @@ def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequenc
         wanted = PUBLISHED_BIAS.get(car.lower())
         if wanted is not None:
             biases = {name: mean_bias(recordings) for name, recordings in own.items()}
-            found.append(Gate(car, "mean bias of ay − ωu [m/s²]", fixed(wanted, 2), wanted - BIAS_WITHIN, wanted + BIAS_WITHIN, biases))
-        left = {name: left_by(static_map_of(recordings), recordings) for name, recordings in own.items()}
+            found.append(
+                Gate(
+                    car,
+                    "mean bias of ay − ωu [m/s²]",
+                    fixed(wanted, 2),
+                    wanted - BIAS_WITHIN,
+                    wanted + BIAS_WITHIN,
+                    biases,
+                )
+            )
+        left = {
+            name: left_by(static_map_of(recordings), recordings) for name, recordings in own.items()
+        }
         found.append(Gate(car, "FVU of the car's own static map", real_map, *MAP_RANGE, left))
     if real:
         noise = spectra_of(real)[1]
         own_noise = {name: spectra_of(cars["f"])[1] for name, cars in by_car.items() if "f" in cars}
         for hz in BANDS_HZ:
-            levels = {name: decibels(own.level(hz), noise.level(hz)) for name, own in own_noise.items()}
+            levels = {
+                name: decibels(own.level(hz), noise.level(hz)) for name, own in own_noise.items()
+            }
             title = f"process noise at {hz:.2g} Hz, against the real one [dB]"
             found.append(Gate("Ferrari", title, "0", -SPECTRUM_DB, SPECTRUM_DB, levels))
     return found
@@ -112,37 +147,57 @@ def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequenc
 
 def _by_car(sets: Mapping[str, Sequence[Recording]]) -> dict[str, list[Recording]]:
     """First letter of `CARS` -> all recordings of that car, if it has any."""
-    cars = {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
+    cars = {
+        letter: [own for key, part in sets.items() if key[:1] == letter for own in part]
+        for letter in CARS
+    }
     return {letter: recordings for letter, recordings in cars.items() if recordings}
 
 
-def _of_table_one(name: str, published: Statistics, drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> list[Gate]:
+def _of_table_one(
+    name: str, published: Statistics, drives: Mapping[str, Mapping[str, Sequence[Recording]]]
+) -> list[Gate]:
     """Gates on one row of Table I, ``C-1`` say, whose drives begin with ``c1``."""
     key = name.replace("-", "").lower()
     paper = _quantities(published)
-    ours = {dataset: _quantities(statistics(sets[key])) for dataset, sets in drives.items() if sets.get(key)}
+    ours = {
+        dataset: _quantities(statistics(sets[key]))
+        for dataset, sets in drives.items()
+        if sets.get(key)
+    }
     found = []
     for quantity, (title, how, within) in QUANTITIES.items():
         wanted = paper[quantity]
         room = within * abs(wanted) if how == "relative" else within
         values = {dataset: own[quantity] for dataset, own in ours.items()}
-        found.append(Gate(name, title, f"{wanted:.3g}".replace("-", "−"), wanted - room, wanted + room, values))
+        found.append(
+            Gate(
+                name, title, f"{wanted:.3g}".replace("-", "−"), wanted - room, wanted + room, values
+            )
+        )
     return found
 
 
-def drives_of(datasets: Sequence[StoredDataset]) -> tuple[dict[str, dict[str, list[Recording]]], list[Recording]]:
+def drives_of(
+    datasets: Sequence[StoredDataset],
+) -> tuple[dict[str, dict[str, list[Recording]]], list[Recording]]:
     """Recordings at `RATE_HZ` with what gates read: of the simulated race cars by data set and set, and of the real Ferrari."""
     drives: dict[str, dict[str, list[Recording]]] = {}
     real: list[Recording] = []
     for dataset in datasets:
-        if dataset.name not in (BEFORE, AFTER) and dataset.name != PROFILES["ferrari_250_lm"].counterpart:
+        if (
+            dataset.name not in (BEFORE, AFTER)
+            and dataset.name != PROFILES["ferrari_250_lm"].counterpart
+        ):
             continue
         for recording in dataset.recordings():
             kept = Resample(RATE_HZ)(recording.select(["vx", "yaw_rate", "ay", "vy_ref"]))
             if dataset.kind == "real":
                 real.append(kept)
             else:
-                drives.setdefault(dataset.name, {}).setdefault(recording.id.split("_")[0], []).append(kept)
+                drives.setdefault(dataset.name, {}).setdefault(
+                    recording.id.split("_")[0], []
+                ).append(kept)
     return drives, real
 
 
@@ -165,12 +220,18 @@ def blocks(datasets: Sequence[StoredDataset]) -> list[Block]:
         }
         for gate in found
     ]
-    missed = [f"{gate.of}: {gate.quantity} ({gate.values.get(AFTER, np.nan):.3g})" for gate in found if not gate.met(AFTER)]
+    missed = [
+        f"{gate.of}: {gate.quantity} ({gate.values.get(AFTER, np.nan):.3g})"
+        for gate in found
+        if not gate.met(AFTER)
+    ]
     met_before = sum(gate.met(BEFORE) for gate in found)
     verdict = f"{len(found) - len(missed)} of {len(found)} gates are met by `{AFTER}`"
     verdict += f"; before, by `{BEFORE}`, {met_before} were." if BEFORE in drives else "."
     verdict += f" Not met: {'; '.join(missed)}." if missed else ""
-    absent = "" if real else " The gate on the spectrum needs the real recording, which is not here."
+    absent = (
+        "" if real else " The gate on the spectrum needs the real recording, which is not here."
+    )
     table = Table(
         "gates",
         "Gates on the simulated race cars' inputs, fixed before any network was trained on them: what the paper prints of its recordings "
@@ -209,9 +270,13 @@ def excitation(datasets: Sequence[StoredDataset]) -> Table:
             flags = recording.provenance.get("flags", {})
             if not (flags.get("spun") or flags.get("left_road")):
                 kept = recording.select(["vx", "yaw_rate", "ay", "vy_ref"])
-                cars.setdefault(recording.vehicle, []).append(Resample(RATE_HZ)(kept) if kept.rate_hz > RATE_HZ else kept)
+                cars.setdefault(recording.vehicle, []).append(
+                    Resample(RATE_HZ)(kept) if kept.rate_hz > RATE_HZ else kept
+                )
         for vehicle, recordings in cars.items():
-            u, ay, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "ay", "vy_ref"))
+            u, ay, v = (
+                np.concatenate([own[name] for own in recordings]) for name in ("vx", "ay", "vy_ref")
+            )
             moving = u > MOVING
             long = [own for own in recordings if own.duration >= SEGMENT_SECONDS]
             row: dict[str, object] = {
@@ -220,12 +285,16 @@ def excitation(datasets: Sequence[StoredDataset]) -> Table:
                 "kind": dataset.kind,
                 "drives": len(recordings),
                 "ay": float(np.quantile(np.abs(ay[moving]), 0.99)),
-                "sideslip": float(np.degrees(np.quantile(np.abs(np.arctan2(v[moving], u[moving])), 0.99))),
+                "sideslip": float(
+                    np.degrees(np.quantile(np.abs(np.arctan2(v[moving], u[moving])), 0.99))
+                ),
                 "map": left_by(static_map_of(recordings), recordings),
             }
             if long:
                 rate, noise = spectra_of(long)
-                row |= {f"above_{hz:g}": decibels(rate.level(hz), noise.level(hz)) for hz in READ_AT_HZ}
+                row |= {
+                    f"above_{hz:g}": decibels(rate.level(hz), noise.level(hz)) for hz in READ_AT_HZ
+                }
             rows.append(row)
     return Table(
         "excitation",
@@ -241,7 +310,10 @@ def excitation(datasets: Sequence[StoredDataset]) -> Table:
             "ay": Column("|ay| 99 % [m/s²]", decimals=2),
             "sideslip": Column("|β| 99 % [deg]", decimals=2),
             "map": Column("FVU of the own static map", decimals=3),
-            **{f"above_{hz:g}": Column(f"v̇ over noise at {hz:g} Hz [dB]", decimals=1) for hz in READ_AT_HZ},
+            **{
+                f"above_{hz:g}": Column(f"v̇ over noise at {hz:g} Hz [dB]", decimals=1)
+                for hz in READ_AT_HZ
+            },
         },
     )
 
@@ -255,7 +327,15 @@ def _differ(drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> Table:
             fitted = static_map_of(source)
             errors = {other: left_by(fitted, target) for other, target in cars.items()}
             numbers = {"b": fitted.values["b"], "k": 1000.0 * fitted.values["k"]}
-            rows.append({"dataset": dataset, "fitted": CARS[letter], **dict.fromkeys(CARS, math.nan), **errors, **numbers})
+            rows.append(
+                {
+                    "dataset": dataset,
+                    "fitted": CARS[letter],
+                    **dict.fromkeys(CARS, math.nan),
+                    **errors,
+                    **numbers,
+                }
+            )
     return Table(
         "static_maps",
         "FVU that the static map v = r·(b − k·u²) of one simulated car leaves on another: how far the cars differ.",
@@ -270,7 +350,9 @@ def _differ(drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> Table:
     )
 
 
-def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> Figure:
+def _figure(
+    drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]
+) -> Figure:
     """Figure 4 of the paper: dv/dt and process noise, the real Ferrari, and each simulated car before and after."""
     panels: list[tuple[str, Sequence[Recording]]] = [("Ferrari, real", real)] if real else []
     for letter, car in CARS.items():
@@ -285,7 +367,9 @@ def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Seque
         for axes, (title, recordings) in zip(grid.flat, panels, strict=False):
             rate, noise = spectra_of(recordings)
             shown = (rate.frequency >= 0.08) & (rate.frequency <= 5.0)
-            axes.loglog(rate.frequency[shown], rate.density[shown], color="#0072B2", label="$\\dot{v}$")
+            axes.loglog(
+                rate.frequency[shown], rate.density[shown], color="#0072B2", label="$\\dot{v}$"
+            )
             axes.loglog(
                 noise.frequency[shown],
                 noise.density[shown],
@@ -295,7 +379,13 @@ def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Seque
             )
             axes.set_title(title, loc="left")
             above = decibels(rate.level(1.0), noise.level(1.0))
-            axes.annotate(f"{above:.0f} dB at 1 Hz", (1.0, rate.level(1.0)), textcoords="offset points", xytext=(4, 6), fontsize=7)
+            axes.annotate(
+                f"{above:.0f} dB at 1 Hz",
+                (1.0, rate.level(1.0)),
+                textcoords="offset points",
+                xytext=(4, 6),
+                fontsize=7,
+            )
             axes.set_ylabel("density [(m/s²)²/Hz]")
         for axes in grid[-1]:
             axes.set_xlabel("frequency [Hz]")

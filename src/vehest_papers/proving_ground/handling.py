@@ -21,7 +21,9 @@ Counts = NDArray[np.int64]
 AY_WIDTH, AY_LIMIT = 0.5, 14.0  # m/s²
 ANGLE_WIDTH, ANGLE_LIMIT = 0.1, 10.0  # deg
 AY_EDGES: FloatArray = np.arange(-AY_LIMIT, AY_LIMIT + AY_WIDTH / 2, AY_WIDTH)
-ANGLE_EDGES: FloatArray = np.linspace(-ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1)
+ANGLE_EDGES: FloatArray = np.linspace(
+    -ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1
+)
 
 SLOWEST = 5.0  # speed from which on samples count [m/s]
 STEADY_ACCELERATION, STEADY_YAW, SMOOTHED_SECONDS = 1.0, 0.1, 0.3
@@ -51,12 +53,26 @@ class HandlingPoints:
         vx, yaw_rate = recording["vx"], recording["yaw_rate"]
         moving = vx > SLOWEST
         ay = vx * yaw_rate
-        angle = np.degrees(recording["steer"] - np.arctan(self.wheelbase * yaw_rate / np.where(moving, vx, np.inf)))
-        turning = np.gradient(yaw_rate) * recording.rate_hz if len(yaw_rate) > 1 else np.zeros_like(yaw_rate)
-        limited = ((recording["ax"], STEADY_ACCELERATION), (recording["ay"] - ay, STEADY_ACCELERATION), (turning, STEADY_YAW))
-        steady = np.logical_and.reduce([moving, *(np.abs(_smooth(own, recording.rate_hz)) < limit for own, limit in limited)])
+        angle = np.degrees(
+            recording["steer"] - np.arctan(self.wheelbase * yaw_rate / np.where(moving, vx, np.inf))
+        )
+        turning = (
+            np.gradient(yaw_rate) * recording.rate_hz
+            if len(yaw_rate) > 1
+            else np.zeros_like(yaw_rate)
+        )
+        limited = (
+            (recording["ax"], STEADY_ACCELERATION),
+            (recording["ay"] - ay, STEADY_ACCELERATION),
+            (turning, STEADY_YAW),
+        )
+        steady = np.logical_and.reduce(
+            [moving, *(np.abs(_smooth(own, recording.rate_hz)) < limit for own, limit in limited)]
+        )
         for counts, chosen in ((self.everything, moving), (self.steady, steady)):
-            counts += np.histogram2d(ay[chosen], angle[chosen], bins=(AY_EDGES, ANGLE_EDGES))[0].astype(np.int64)
+            counts += np.histogram2d(ay[chosen], angle[chosen], bins=(AY_EDGES, ANGLE_EDGES))[
+                0
+            ].astype(np.int64)
 
     def medians(self) -> tuple[FloatArray, FloatArray]:
         """Lateral acceleration and median understeer angle of quasi-steady turns, a point a bin of enough samples."""
@@ -115,7 +131,11 @@ def single_track_gradient(vehicle: Vehicle) -> float:
     m (b/C_f - a/C_r)/L with axle stiffnesses C = -p_ky1 times the static load is (1/|p_ky1 front| - 1/|p_ky1 rear|)/g.
     """
     parameters = compiled_parameters(vehicle)
-    return float(np.degrees((1.0 / abs(parameters.tire.p_ky1) - 1.0 / abs(parameters.tire_rear.p_ky1)) / GRAVITY))
+    return float(
+        np.degrees(
+            (1.0 / abs(parameters.tire.p_ky1) - 1.0 / abs(parameters.tire_rear.p_ky1)) / GRAVITY
+        )
+    )
 
 
 def _smooth(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -124,4 +144,6 @@ def _smooth(samples: FloatArray, rate_hz: float) -> FloatArray:
     if len(samples) < length:
         return np.full_like(samples, samples.mean())
     weights = np.ones(length)
-    return np.convolve(samples, weights, mode="same") / np.convolve(np.ones_like(samples), weights, mode="same")
+    return np.convolve(samples, weights, mode="same") / np.convolve(
+        np.ones_like(samples), weights, mode="same"
+    )

@@ -58,39 +58,61 @@ def spectra(samples: Mapping[str, Recording]) -> dict[str, list[Spectrum]]:
     Args:
         samples: ``simulated`` and ``real`` -> a recording.
     """
-    return {title: [_spectrum(kind, own, name) for kind, own in samples.items()] for name, title in SHOWN.items()}
+    return {
+        title: [_spectrum(kind, own, name) for kind, own in samples.items()]
+        for name, title in SHOWN.items()
+    }
 
 
 def levels(samples: Mapping[str, Recording]) -> pd.DataFrame:
     """One row a level: ``quantity``, ``unit`` and a column a kind of recording."""
-    read = {kind: read_off(recording.channels, recording.rate_hz) for kind, recording in samples.items()}
-    rows = [{"quantity": title, "unit": unit, **{kind: own[name] for kind, own in read.items()}} for name, (title, unit) in LEVELS.items()]
+    read = {
+        kind: read_off(recording.channels, recording.rate_hz) for kind, recording in samples.items()
+    }
+    rows = [
+        {"quantity": title, "unit": unit, **{kind: own[name] for kind, own in read.items()}}
+        for name, (title, unit) in LEVELS.items()
+    ]
     return pd.DataFrame(rows)
 
 
 def same_length(samples: Mapping[str, Recording]) -> dict[str, Recording]:
     """The recordings, of the longer ones the beginning only."""
     seconds = min(recording.duration for recording in samples.values())
-    return {kind: own.cut(own.start_time, own.start_time + seconds) for kind, own in samples.items()}
+    return {
+        kind: own.cut(own.start_time, own.start_time + seconds) for kind, own in samples.items()
+    }
 
 
 def comparable(samples: Mapping[str, Recording]) -> bool:
     """Whether there are two with all channels, at one rate, long enough for spectra up to beyond `NOISE_ABOVE`."""
     complete = all({*SHOWN, "vx_ref"} <= set(own.channels) for own in samples.values())
     rates = {recording.rate_hz for recording in samples.values()}
-    enough = all(own.duration >= 2 * WELCH_SECONDS and own.rate_hz > 3 * NOISE_ABOVE for own in samples.values())
+    enough = all(
+        own.duration >= 2 * WELCH_SECONDS and own.rate_hz > 3 * NOISE_ABOVE
+        for own in samples.values()
+    )
     return complete and len(samples) == 2 and len(rates) == 1 and enough
 
 
 def _spectrum(kind: str, recording: Recording, name: str) -> Spectrum:
-    frequency, power = signal.welch(recording[name], recording.rate_hz, nperseg=round(WELCH_SECONDS * recording.rate_hz), average="median")
+    frequency, power = signal.welch(
+        recording[name],
+        recording.rate_hz,
+        nperseg=round(WELCH_SECONDS * recording.rate_hz),
+        average="median",
+    )
     edges = np.concatenate(
         [
             np.arange(LOWEST_HZ, 10 * LOWEST_HZ, 1.0 / WELCH_SECONDS) - 0.5 / WELCH_SECONDS,
-            10 ** np.arange(np.log10(10 * LOWEST_HZ), np.log10(0.48 * recording.rate_hz), BIN_WIDTH),
+            10
+            ** np.arange(np.log10(10 * LOWEST_HZ), np.log10(0.48 * recording.rate_hz), BIN_WIDTH),
         ]
     )
     band = np.digitize(frequency, edges)
     shown = [number for number in range(1, len(edges)) if (band == number).any()]
-    middle, density = (np.array([np.median(values[band == number]) for number in shown]) for values in (frequency, np.sqrt(power)))
+    middle, density = (
+        np.array([np.median(values[band == number]) for number in shown])
+        for values in (frequency, np.sqrt(power))
+    )
     return Spectrum(kind, middle, density)

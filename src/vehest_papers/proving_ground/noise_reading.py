@@ -19,7 +19,10 @@ from vehest.constants import GRAVITY, FloatArray
 
 NOISE_ABOVE = 10.0  # a car's body hardly moves on purpose above this frequency [Hz]
 SLOW_BELOW = 0.5  # what is left of a kinematic residual below this frequency is drift [Hz]
-DELAY_BAND = (0.2, 2.0)  # where the motion is strong and quick, for comparing the times of channels [Hz]
+DELAY_BAND = (
+    0.2,
+    2.0,
+)  # where the motion is strong and quick, for comparing the times of channels [Hz]
 WELCH_SECONDS = 20.0
 
 
@@ -44,22 +47,37 @@ def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, fl
         channels: vx, yaw_rate, ax, ay, steer, vx_ref and vy_ref, each (T,), in SI units, of some minutes without a stop.
         rate_hz: sampling rate [Hz].
     """
-    vx, vy, yaw_rate, ax, ay = (channels[name] for name in ("vx_ref", "vy_ref", "yaw_rate", "ax", "ay"))
-    change = {name: np.gradient(values) * rate_hz for name, values in (("vx", vx), ("vy", vy), ("r", yaw_rate), ("ax", ax), ("ay", ay))}
-    levels = {f"{name}.noise": noise_density(channels[name], rate_hz) for name in ("vx", "yaw_rate", "ax", "ay", "steer")}
-    levels |= {f"reference.{name}.noise": noise_density(channels[f"{name}_ref"], rate_hz) for name in ("vx", "vy")}
+    vx, vy, yaw_rate, ax, ay = (
+        channels[name] for name in ("vx_ref", "vy_ref", "yaw_rate", "ax", "ay")
+    )
+    change = {
+        name: np.gradient(values) * rate_hz
+        for name, values in (("vx", vx), ("vy", vy), ("r", yaw_rate), ("ax", ax), ("ay", ay))
+    }
+    levels = {
+        f"{name}.noise": noise_density(channels[name], rate_hz)
+        for name in ("vx", "yaw_rate", "ax", "ay", "steer")
+    }
+    levels |= {
+        f"reference.{name}.noise": noise_density(channels[f"{name}_ref"], rate_hz)
+        for name in ("vx", "vy")
+    }
     levels["steer.quantisation"] = quantum(channels["steer"])
 
     longitudinal, lateral = change["vx"] - vy * yaw_rate, change["vy"] + vx * yaw_rate
     scale, lag = lags(longitudinal, [ax, change["ax"]], rate_hz)
     levels["ax.delay"] = lag / scale
-    scale, lag, levels["yaw_rate.delay"] = lags(lateral, [ay, change["ay"], -vx * change["r"]], rate_hz)
+    scale, lag, levels["yaw_rate.delay"] = lags(
+        lateral, [ay, change["ay"], -vx * change["r"]], rate_hz
+    )
     levels["ay.delay"] = lag / scale
 
     slow = slow_error(longitudinal - ax, [ax, ay, change["ax"]], levels["ax.noise"], rate_hz)
     levels |= {"ax.offset": abs(slow.mean), "ax.drift": slow.std, "ax.drift_time": slow.time}
     levels["pitch_gradient"] = abs(slow.slopes[0]) / GRAVITY
-    slow = slow_error(lateral - ay, [ay, ax, change["ay"], vx * change["r"]], levels["ay.noise"], rate_hz)
+    slow = slow_error(
+        lateral - ay, [ay, ax, change["ay"], vx * change["r"]], levels["ay.noise"], rate_hz
+    )
     levels |= {"ay.offset": abs(slow.mean), "ay.drift": slow.std, "ay.drift_time": slow.time}
     levels["roll_gradient"] = abs(slow.slopes[0]) / GRAVITY
     return levels
@@ -70,8 +88,12 @@ def noise_density(samples: FloatArray, rate_hz: float) -> float:
 
     Medians over time and over frequency: neither a jolt nor a resonance of the body counts for much.
     """
-    frequency, power = signal.welch(samples, rate_hz, nperseg=round(WELCH_SECONDS * rate_hz), average="median")
-    return float(np.sqrt(np.median(power[(frequency >= NOISE_ABOVE) & (frequency < rate_hz / 2.0)])))
+    frequency, power = signal.welch(
+        samples, rate_hz, nperseg=round(WELCH_SECONDS * rate_hz), average="median"
+    )
+    return float(
+        np.sqrt(np.median(power[(frequency >= NOISE_ABOVE) & (frequency < rate_hz / 2.0)]))
+    )
 
 
 def quantum(samples: FloatArray) -> float:
@@ -84,7 +106,9 @@ def quantum(samples: FloatArray) -> float:
     return smallest if np.percentile(np.abs(few - np.round(few)), 95) < 0.15 else 0.0
 
 
-def slow_error(residual: FloatArray, explaining: list[FloatArray], noise: float, rate_hz: float) -> SlowError:
+def slow_error(
+    residual: FloatArray, explaining: list[FloatArray], noise: float, rate_hz: float
+) -> SlowError:
     """Split a residual (T,) below ``SLOW_BELOW`` into its mean, what other signals (T,) explain, white noise of a density, and the rest."""
     low_pass = signal.butter(2, SLOW_BELOW, fs=rate_hz, output="sos")
     slow, *signals = (signal.sosfiltfilt(low_pass, values) for values in (residual, *explaining))
@@ -98,7 +122,9 @@ def slow_error(residual: FloatArray, explaining: list[FloatArray], noise: float,
     variance = max(float(covariance[0]), 0.0)
     fallen = np.flatnonzero(covariance < variance / np.e)
     time = float(fallen[0]) / rate_hz if len(fallen) else np.inf
-    return SlowError(float(residual.mean()), tuple(coefficients[1:].tolist()), float(np.sqrt(variance)), time)
+    return SlowError(
+        float(residual.mean()), tuple(coefficients[1:].tolist()), float(np.sqrt(variance)), time
+    )
 
 
 def lags(target: FloatArray, regressors: list[FloatArray], rate_hz: float) -> tuple[float, ...]:

@@ -13,7 +13,14 @@ from vehest_papers.proving_ground import drawing, gates, noise
 from vehest_papers.proving_ground.index import index_document
 from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile, profile_of
-from vehest_papers.proving_ground.tables import COLUMNS, QUANTITIES, accidents, flagged_table, how_to_get, row_of
+from vehest_papers.proving_ground.tables import (
+    COLUMNS,
+    QUANTITIES,
+    accidents,
+    flagged_table,
+    how_to_get,
+    row_of,
+)
 from vehest_papers.proving_ground.tally import MOVING, Tally
 from vehest_papers.proving_ground.vehicles import ALL, DatasetTally, VehiclePage, survey
 
@@ -28,16 +35,35 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         DataError: a recording lacks a channel that is shown.
     """
     names = {own.name for own in artefacts.datasets}
-    pages = survey([own for own in artefacts.datasets if own.name != gates.BEFORE or gates.AFTER not in names])
-    return {"report": index_document(artefacts, pages), **{name: _page(artefacts, page) for name, page in pages.items()}}
+    pages = survey(
+        [own for own in artefacts.datasets if own.name != gates.BEFORE or gates.AFTER not in names]
+    )
+    return {
+        "report": index_document(artefacts, pages),
+        **{name: _page(artefacts, page) for name, page in pages.items()},
+    }
 
 
 def _page(artefacts: StudyArtefacts, page: VehiclePage) -> Document:
     profile = profile_of(page.name)
-    blocks: list[Block] = [_what_it_is(page), *_drives(page), *_traces(page), *_handling(page), *_distributions(page, profile)]
+    blocks: list[Block] = [
+        _what_it_is(page),
+        *_drives(page),
+        *_traces(page),
+        *_handling(page),
+        *_distributions(page, profile),
+    ]
     blocks += _beside_paper(page, profile)
     if profile.counterpart is not None:
-        blocks += _beside_real(page, profile, [dataset for dataset in artefacts.absent_datasets if dataset.name == profile.counterpart])
+        blocks += _beside_real(
+            page,
+            profile,
+            [
+                dataset
+                for dataset in artefacts.absent_datasets
+                if dataset.name == profile.counterpart
+            ],
+        )
     blocks.append("[All vehicles](report.md)")
     return Document(profile.title, blocks)
 
@@ -45,7 +71,9 @@ def _page(artefacts: StudyArtefacts, page: VehiclePage) -> Document:
 def _what_it_is(page: VehiclePage) -> str:
     if not page.simulated:
         return "**Real data:** every number on this page comes from real recordings."
-    except_for = "; the real recording beside is called real wherever it stands" if page.real else ""
+    except_for = (
+        "; the real recording beside is called real wherever it stands" if page.real else ""
+    )
     return (
         f"**SIMULATED:** what stands on this page comes from a simulation of such a vehicle, not from a real one{except_for}. "
         f"Plant: CommonRoad's multi-body model with the parameters of `conf/vehicle/{page.name}.yaml`, each with its source or the word "
@@ -110,23 +138,34 @@ def _handling(page: VehiclePage) -> list[Block]:
 
 
 def _distributions(page: VehiclePage, profile: Profile) -> list[Block]:
-    kinds = " and ".join([*(["simulated"] if page.simulated else []), *(["real"] if page.real else [])])
+    kinds = " and ".join(
+        [*(["simulated"] if page.simulated else []), *(["real"] if page.real else [])]
+    )
     marks = f" Dotted: {profile.limit_label}." if profile.limit_label else ""
     how = profile.preparation
     caption = (
         f"Distribution of sideslip angle and lateral acceleration ({kinds}) in bins of 1° and 1 m/s², on a logarithmic scale as in Figure "
         f"4 of Bertipaglia et al. 2024; samples above {MOVING:g} m/s, {how}.{marks}"
     )
-    blocks: list[Block] = ["## Distributions", Figure(f"{page.name}_distributions", caption, drawing.distributions(page, profile))]
+    blocks: list[Block] = [
+        "## Distributions",
+        Figure(f"{page.name}_distributions", caption, drawing.distributions(page, profile)),
+    ]
     if profile.sideslip_limit is not None and profile.ay_limit is not None:
-        blocks.append(_spread_in_words(page.merged("simulated"), profile.ay_limit, profile.sideslip_limit))
+        blocks.append(
+            _spread_in_words(page.merged("simulated"), profile.ay_limit, profile.sideslip_limit)
+        )
     return blocks
 
 
 def _spread_in_words(tally: Tally, ay_limit: float, sideslip_limit: float) -> str:
     edges, counts = tally.histogram("ay", 1.0)
     inside = counts[(edges[:-1] >= -ay_limit) & (edges[1:] <= ay_limit)]
-    ratio = f"{significant(inside.max() / inside.min(), 2)} times as many samples as" if inside.min() > 0 else "more than"
+    ratio = (
+        f"{significant(inside.max() / inside.min(), 2)} times as many samples as"
+        if inside.min() > 0
+        else "more than"
+    )
     return (
         f"Simulated: {fixed(100 * tally.share_within('ay', ay_limit), 1)} % of the samples lie within ±{ay_limit:g} m/s², where the "
         f"fullest bin holds {ratio} the emptiest; {fixed(100 * tally.share_within('sideslip', sideslip_limit), 1)} % lie within "
@@ -142,10 +181,20 @@ def _beside_paper(page: VehiclePage, profile: Profile) -> list[Block]:
         units = {name: unit for name, (_, unit) in own.all.values().items()}
         for paper in profile.sets:
             if paper.drives in own.tallies:
-                ours = {name: value for name, (value, _) in own.tallies[paper.drives].values().items()}
+                ours = {
+                    name: value for name, (value, _) in own.tallies[paper.drives].values().items()
+                }
                 for name, value in paper.values.items():
-                    about = {"set": paper.name, "drives": paper.drives, "quantity": QUANTITIES[name], "unit": units[name]}
-                    rows.append(about | {"paper": value, "simulated": ours[name], "ratio": ours[name] / value})
+                    about = {
+                        "set": paper.name,
+                        "drives": paper.drives,
+                        "quantity": QUANTITIES[name],
+                        "unit": units[name],
+                    }
+                    rows.append(
+                        about
+                        | {"paper": value, "simulated": ours[name], "ratio": ours[name] / value}
+                    )
     blocks: list[Block] = ["## Beside the paper", profile.prose]
     if rows:
         table = Table(
@@ -167,7 +216,11 @@ def _beside_paper(page: VehiclePage, profile: Profile) -> list[Block]:
 
 
 def _how_alike(simulated: Tally, real: Tally) -> str:
-    ratio = {name: simulated.quantile(name, 0.99, absolute=True) / real.quantile(name, 0.99, absolute=True) for name in ("sideslip", "ay")}
+    ratio = {
+        name: simulated.quantile(name, 0.99, absolute=True)
+        / real.quantile(name, 0.99, absolute=True)
+        for name in ("sideslip", "ay")
+    }
     size = "smaller" if ratio["sideslip"] < 1.0 else "larger"
     return (
         f"The 99 % quantile of |β| is {fixed(ratio['sideslip'], 2)} times the real one, that of |ay| {fixed(ratio['ay'], 2)} times: what "
@@ -175,11 +228,15 @@ def _how_alike(simulated: Tally, real: Tally) -> str:
     )
 
 
-def _beside_real(page: VehiclePage, profile: Profile, absent: Sequence[AbsentDataset]) -> list[Block]:
+def _beside_real(
+    page: VehiclePage, profile: Profile, absent: Sequence[AbsentDataset]
+) -> list[Block]:
     heading = "## Beside the real recording"
     if not page.real or not page.simulated:
         how = " ".join(how_to_get(dataset) for dataset in absent)
-        return [f"{heading}\n\nThe real recording of data set `{profile.counterpart}` is absent from this report. {how}".strip()]
+        return [
+            f"{heading}\n\nThe real recording of data set `{profile.counterpart}` is absent from this report. {how}".strip()
+        ]
     real = next(iter(page.real.values()))
     simulated, measured = page.merged("simulated").values(), real.all.values()
     rows = [
@@ -189,11 +246,19 @@ def _beside_real(page: VehiclePage, profile: Profile, absent: Sequence[AbsentDat
     ]
     blocks: list[Block] = [
         f"{heading}\n\nReal: {_recordings_in_words(real.dataset)}. Simulated: all drives of this page. Both {profile.preparation}.",
-        Table(f"{page.name}_beside_real", "Statistics, real and simulated.", pd.DataFrame(rows), _REAL_AND_SIMULATED),
+        Table(
+            f"{page.name}_beside_real",
+            "Statistics, real and simulated.",
+            pd.DataFrame(rows),
+            _REAL_AND_SIMULATED,
+        ),
         _how_alike(page.merged("simulated"), real.all),
     ]
     if not noise.comparable(page.samples):
-        return [*blocks, "The two have not the same rate or channels, or are too short for spectra."]
+        return [
+            *blocks,
+            "The two have not the same rate or channels, or are too short for spectra.",
+        ]
     samples = noise.same_length(page.samples)
     lengths = f"`{samples['simulated'].id}` (simulated) and `{samples['real'].id}` (real), {samples['real'].duration:.0f} s each"
     return [

@@ -19,7 +19,9 @@ class PaperSet:
 
     name: str  # in the paper
     drives: str  # our set, a name of drives without their counter
-    values: Mapping[str, float]  # quantity of `tally.Tally.values` -> what the paper gives, in the same units
+    values: Mapping[
+        str, float
+    ]  # quantity of `tally.Tally.values` -> what the paper gives, in the same units
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,16 @@ class Profile:
     title: str  # of the vehicle
     source: str = ""  # the paper, for the caption
     sets: tuple[PaperSet, ...] = ()  # what its tables give
-    rate_hz: float | None = None  # rate that its recordings were brought to, and ours before they are counted; none: as recorded
-    cutoff_hz: float | None = None  # of the zero-phase low-pass that its recordings went through; none: none
+    rate_hz: float | None = (
+        None  # rate that its recordings were brought to, and ours before they are counted; none: as recorded
+    )
+    cutoff_hz: float | None = (
+        None  # of the zero-phase low-pass that its recordings went through; none: none
+    )
     prose: str = ""  # its text beside the figures, and how it was read
-    ay_limit: float | None = None  # marked in the distribution of the lateral acceleration [m/s²]: what the paper's 99 % or range are
+    ay_limit: float | None = (
+        None  # marked in the distribution of the lateral acceleration [m/s²]: what the paper's 99 % or range are
+    )
     sideslip_limit: float | None = None  # likewise, of the sideslip angle [deg]
     limit_label: str = ""  # what those marks are
     counterpart: str | None = None  # data set with a real recording of the same car
@@ -48,7 +56,11 @@ class Profile:
     @property
     def preparation(self) -> str:
         """The same in words."""
-        steps = [f"low-passed at {self.cutoff_hz:g} Hz without delay"] if self.cutoff_hz is not None else []
+        steps = (
+            [f"low-passed at {self.cutoff_hz:g} Hz without delay"]
+            if self.cutoff_hz is not None
+            else []
+        )
         steps += [f"brought to {self.rate_hz:g} Hz"] if self.rate_hz is not None else []
         return f"{' and '.join(steps)} first, as in the paper" if steps else "as recorded"
 
@@ -99,7 +111,10 @@ PROFILES: Mapping[str, Profile] = {
     "bmw_545i": Profile(
         title="BMW 545i-like car",
         source="Bertipaglia, Alirezaei, Happee and Shyrokau 2024",
-        sets=(PaperSet("all", "all", {"drives": 216, "duration": 7200.0}), PaperSet("test set", "test", {"drives": 23})),
+        sets=(
+            PaperSet("all", "all", {"drives": 216, "duration": 7200.0}),
+            PaperSet("test set", "test", {"drives": 23}),
+        ),
         cutoff_hz=5.0,
         prose=(
             "The paper's Fig. 4 shows the distributions of β and ay in bins of 1° and 1 m/s² on a logarithmic scale, of samples above 5 "
@@ -114,8 +129,16 @@ PROFILES: Mapping[str, Profile] = {
         title="Heavy-duty truck",
         source="Di Biase, Lenzo and Timpone 2020",
         sets=(
-            PaperSet("three laps", "nominal_laps", {"duration": 721.0, "distance": 7500.0, "speed_mean": 7500.0 / 721.0}),
-            PaperSet("fast lap", "nominal_fast", {"distance": 2500.0, "speed_mean": 76.0 / 3.6, "vx_max": 115.0 / 3.6}),
+            PaperSet(
+                "three laps",
+                "nominal_laps",
+                {"duration": 721.0, "distance": 7500.0, "speed_mean": 7500.0 / 721.0},
+            ),
+            PaperSet(
+                "fast lap",
+                "nominal_fast",
+                {"distance": 2500.0, "speed_mean": 76.0 / 3.6, "vx_max": 115.0 / 3.6},
+            ),
         ),
         prose=(
             "The paper drove three laps of about 2.5 km in 721 s (299, 227 and 195 s, about 30, 40 and 45 km/h), the last of which ends "
@@ -139,4 +162,6 @@ def page_of(vehicle: str) -> str:
 
 def counterpart_page(dataset: str) -> str | None:
     """The page beside whose recordings a real data set stands."""
-    return next((name for name, profile in PROFILES.items() if profile.counterpart == dataset), None)
+    return next(
+        (name for name, profile in PROFILES.items() if profile.counterpart == dataset), None
+    )

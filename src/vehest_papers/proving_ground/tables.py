@@ -13,7 +13,16 @@ from vehest.studies.artefacts import AbsentDataset
 from vehest_papers.proving_ground.tally import FLAGS, Tally
 from vehest_papers.proving_ground.vehicles import FlaggedDrive
 
-OVERVIEW = ("drives", "minutes", "km", "ay_abs_q99", "sideslip_abs_q99", "spun", "left_road", "stood")
+OVERVIEW = (
+    "drives",
+    "minutes",
+    "km",
+    "ay_abs_q99",
+    "sideslip_abs_q99",
+    "spun",
+    "left_road",
+    "stood",
+)
 
 QUANTITIES: Mapping[str, str] = {
     "drives": "drives",
@@ -60,8 +69,14 @@ def row_of(tally: Tally, *, with_flags: bool = True) -> dict[str, float]:
 def accidents(flagged: Sequence[FlaggedDrive], drives: int) -> str:
     """How many drives went wrong, a sentence or two."""
     if not flagged:
-        return f"None of the {drives} simulated drives spun or left the road by accident." if drives else ""
-    spun, left = (sum(bool(drive.flags.get(name)) for drive in flagged) for name in ("spun", "left_road"))
+        return (
+            f"None of the {drives} simulated drives spun or left the road by accident."
+            if drives
+            else ""
+        )
+    spun, left = (
+        sum(bool(drive.flags.get(name)) for drive in flagged) for name in ("spun", "left_road")
+    )
     return (
         f"Of {drives} simulated drives {len(flagged)} went wrong by accident: {spun} spun, {left} left the road (a drive can do both). "
         f"They are kept and counted in all figures but the traces; the driver then brakes, and the drive ends when the car stands."

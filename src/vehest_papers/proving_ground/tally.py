@@ -58,7 +58,11 @@ class Tally:
     seconds: float = 0.0
     distance: float = 0.0
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-    counts: dict[str, Counts] = field(default_factory=lambda: {name: np.zeros(grid.size, dtype=np.int64) for name, grid in FINE.items()})
+    counts: dict[str, Counts] = field(
+        default_factory=lambda: {
+            name: np.zeros(grid.size, dtype=np.int64) for name, grid in FINE.items()
+        }
+    )
     flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FLAGS, 0))
 
     def add(self, recording: Recording) -> None:
@@ -67,7 +71,12 @@ class Tally:
         self.drives += 1
         self.seconds += recording.duration
         self.distance += float(speed.sum()) / recording.rate_hz
-        self._widen({name: (float(recording[name].min()), float(recording[name].max())) for name in ("vx", "yaw_rate")})
+        self._widen(
+            {
+                name: (float(recording[name].min()), float(recording[name].max()))
+                for name in ("vx", "yaw_rate")
+            }
+        )
         samples = {
             "sideslip": np.degrees(recording["sideslip_ref"]),
             "ay": recording["ay"],

@@ -12,7 +12,13 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.studies.artefacts import StoredDataset
-from vehest_papers.proving_ground.handling import Characteristic, HandlingPoints, characteristic, vehicle_of, wheelbase_of
+from vehest_papers.proving_ground.handling import (
+    Characteristic,
+    HandlingPoints,
+    characteristic,
+    vehicle_of,
+    wheelbase_of,
+)
 from vehest_papers.proving_ground.papers import counterpart_page, page_of, profile_of
 from vehest_papers.proving_ground.tally import Tally, flags_of
 
@@ -74,10 +80,14 @@ class VehiclePage:
 
     name: str  # of the page
     simulated: dict[str, DatasetTally] = field(default_factory=dict)  # by data set
-    real: dict[str, DatasetTally] = field(default_factory=dict)  # the same of the real recordings that stand beside
+    real: dict[str, DatasetTally] = field(
+        default_factory=dict
+    )  # the same of the real recordings that stand beside
     handling: HandlingPoints | None = None  # points of the simulated recordings
     real_handling: HandlingPoints | None = None  # of the real ones
-    characteristics: list[Characteristic] = field(default_factory=list)  # of the plant, one a variant and surface
+    characteristics: list[Characteristic] = field(
+        default_factory=list
+    )  # of the plant, one a variant and surface
     # manoeuvre -> of all drives that went as planned, that with the most lateral acceleration
     stretches: dict[str, Stretch] = field(default_factory=dict)
     flagged: list[FlaggedDrive] = field(default_factory=list)  # drives that spun or left the road
@@ -124,12 +134,20 @@ def _add(pages: dict[str, VehiclePage], dataset: StoredDataset, recording: Recor
 def _completed(recording: Recording) -> Recording:
     """The channels that are shown; sideslip from the velocities where it is not recorded."""
     vx_ref = recording.channels.get("vx_ref", recording["vx"])
-    known = {"vx_ref": vx_ref, "sideslip_ref": np.arctan2(recording["vy_ref"], vx_ref), **recording.channels}
-    return replace(recording, channels=known).select([*NEEDED, *(name for name in CHANNELS if name in known and name not in NEEDED)])
+    known = {
+        "vx_ref": vx_ref,
+        "sideslip_ref": np.arctan2(recording["vy_ref"], vx_ref),
+        **recording.channels,
+    }
+    return replace(recording, channels=known).select(
+        [*NEEDED, *(name for name in CHANNELS if name in known and name not in NEEDED)]
+    )
 
 
 def _add_real(page: VehiclePage, recording: Recording) -> None:
-    if page.handling is None or "steer" not in recording:  # no simulated car whose wheelbase it shares
+    if (
+        page.handling is None or "steer" not in recording
+    ):  # no simulated car whose wheelbase it shares
         return
     if page.real_handling is None:
         page.real_handling = HandlingPoints(page.handling.wheelbase)
@@ -140,15 +158,23 @@ def _add_simulated(page: VehiclePage, dataset: StoredDataset, recording: Recordi
     about, manoeuvre = recording.provenance, manoeuvre_of(recording)
     if "parameter_set" in about and "steer" in recording:  # by vehest's own plant
         label = _variant(page.name, recording)
-        if len(page.characteristics) < MOST_CHARACTERISTICS and label not in {known.label for known in page.characteristics}:
+        if len(page.characteristics) < MOST_CHARACTERISTICS and label not in {
+            known.label for known in page.characteristics
+        }:
             vehicle = vehicle_of(about, recording.vehicle)
             page.handling = page.handling or HandlingPoints(wheelbase_of(vehicle))
-            page.characteristics.append(characteristic(vehicle, float(about["surface"]["friction"]), label))
+            page.characteristics.append(
+                characteristic(vehicle, float(about["surface"]["friction"]), label)
+            )
         assert page.handling is not None
         page.handling.add(recording)
     if _accident(recording):
         on = bool(about.get("stability_control"))
-        page.flagged.append(FlaggedDrive(dataset.name, recording.id, recording.vehicle, manoeuvre, on, flags_of(recording)))
+        page.flagged.append(
+            FlaggedDrive(
+                dataset.name, recording.id, recording.vehicle, manoeuvre, on, flags_of(recording)
+            )
+        )
         return
     stretch = busiest_stretch(recording, TRACE_SECONDS)
     if manoeuvre not in page.stretches or stretch.power > page.stretches[manoeuvre].power:
@@ -162,7 +188,9 @@ def busiest_stretch(recording: Recording, seconds: float) -> Stretch:
     first = int(power.argmax())
     kept = slice(first, first + n)
     channels = {name: recording[name][kept].copy() for name in TRACED if name in recording}
-    return Stretch(recording.id, manoeuvre_of(recording), recording.time[kept], channels, float(power[first]))
+    return Stretch(
+        recording.id, manoeuvre_of(recording), recording.time[kept], channels, float(power[first])
+    )
 
 
 def manoeuvre_of(recording: Recording) -> str:

@@ -15,10 +15,22 @@ from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
 from vehest_papers.real_cars.figure import distributions
 from vehest_papers.real_cars.planted import detections
-from vehest_papers.real_cars.statistics import DRIVEN, LEAST_OVER_NOISE, LEAST_SECONDS, LEAST_SIDESLIP, RATE, Statistics, statistics_of
+from vehest_papers.real_cars.statistics import (
+    DRIVEN,
+    LEAST_OVER_NOISE,
+    LEAST_SECONDS,
+    LEAST_SIDESLIP,
+    RATE,
+    Statistics,
+    statistics_of,
+)
 
 PLANTED_IN = "ferrari_250lm"
-RANGES = {"150 to 450 s": (150.0, 450.0), "450 to 550 s": (450.0, 550.0), "550 to 700 s": (550.0, 700.0)}  # of the Ferrari's drive
+RANGES = {
+    "150 to 450 s": (150.0, 450.0),
+    "450 to 550 s": (450.0, 550.0),
+    "550 to 700 s": (550.0, 700.0),
+}  # of the Ferrari's drive
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -37,7 +49,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         together[dataset.name] = statistics_of(recordings)
         findings += [row for recording in recordings for row in _findings(dataset, recording)]
         if dataset.name == PLANTED_IN:
-            planted = [detections(recordings[0].cut(*bounds)).assign(range=name) for name, bounds in RANGES.items()]
+            planted = [
+                detections(recordings[0].cut(*bounds)).assign(range=name)
+                for name, bounds in RANGES.items()
+            ]
     blocks: list[Block] = [
         *_headline(artefacts, together),
         _overview(artefacts.datasets, together),
@@ -46,7 +61,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             "distributions",
             "Sizes of the reference's sideslip angle and of the lateral acceleration while driving: 50, 90 and 99 % of the samples lie "
             "below the three marks of a row. Open markers: simulated by its publishers.",
-            distributions([(dataset.name, dataset.kind, together[dataset.name]) for dataset in artefacts.datasets]),
+            distributions(
+                [
+                    (dataset.name, dataset.kind, together[dataset.name])
+                    for dataset in artefacts.datasets
+                ]
+            ),
         ),
         "## Every recording",
         _recordings(own),
@@ -54,7 +74,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         _findings_table(findings),
     ]
     if planted:
-        blocks += ["## Faults planted into real data", *_planted(pd.concat(planted, ignore_index=True))]
+        blocks += [
+            "## Faults planted into real data",
+            *_planted(pd.concat(planted, ignore_index=True)),
+        ]
     blocks += ["## Licences and citations", _licences(artefacts.datasets), _how(artefacts)]
     return {REPORT: Document(artefacts.title, blocks)}
 
@@ -62,8 +85,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def _headline(artefacts: StudyArtefacts, together: Mapping[str, Statistics]) -> list[Block]:
     kinds = {dataset.name: dataset.kind for dataset in artefacts.datasets}
     able = [name for name, found in together.items() if not found.reasons]
-    unable = [f"{as_code(name)} ({'; '.join(found.reasons)})" for name, found in together.items() if found.reasons]
-    hidden = [name for name, found in together.items() if not found.reasons and ("not known" in found.point or found.point == "not said")]
+    unable = [
+        f"{as_code(name)} ({'; '.join(found.reasons)})"
+        for name, found in together.items()
+        if found.reasons
+    ]
+    hidden = [
+        name
+        for name, found in together.items()
+        if not found.reasons and ("not known" in found.point or found.point == "not said")
+    ]
     text = (
         f"**Of {len(together)} data sets {len(able)} can rank estimators** by the rules below: "
         f"{listed([f'{as_code(name)} ({kinds[name]})' for name in able])}."
@@ -126,7 +157,10 @@ _COLUMNS = {
 
 def _figures_of(found: Statistics) -> dict[str, float]:
     names = ("rms", "static_map", "noise", "bound", "correlation")
-    return {"sideslip_99": found.sideslip[-1], **{name: float(getattr(found, name)) for name in names}}
+    return {
+        "sideslip_99": found.sideslip[-1],
+        **{name: float(getattr(found, name)) for name in names},
+    }
 
 
 def _rules() -> str:
@@ -145,7 +179,9 @@ def _recordings(own: Mapping[str, Mapping[str, Statistics]]) -> Table:
             "recording": name,
             "seconds": found.driven,
             "rate": found.native_rate,
-            "speed": f"{fixed(found.speed[0], 1)} … {fixed(found.speed[1], 1)}" if math.isfinite(found.speed[0]) else MISSING,
+            "speed": f"{fixed(found.speed[0], 1)} … {fixed(found.speed[1], 1)}"
+            if math.isfinite(found.speed[0])
+            else MISSING,
             "ay_99": found.ay[-1],
             **_figures_of(found),
             "kinematic_bound": found.kinematic_bound,
@@ -188,10 +224,18 @@ def _findings(dataset: StoredDataset, recording: Recording) -> list[dict[str, st
 
 
 def _findings_table(findings: Sequence[Mapping[str, str]]) -> Table:
-    frame = pd.DataFrame(findings, columns=["dataset", "recording", "level", "check", "channel", "message"])
-    columns = {name: Column(name) for name in frame.columns} | {"dataset": Column("data set"), "message": Column("finding")}
+    frame = pd.DataFrame(
+        findings, columns=["dataset", "recording", "level", "check", "channel", "message"]
+    )
+    columns = {name: Column(name) for name in frame.columns} | {
+        "dataset": Column("data set"),
+        "message": Column("finding"),
+    }
     return Table(
-        "findings", "Everything that `vehest data check` says of these recordings: delays, held and slow channels among it.", frame, columns
+        "findings",
+        "Everything that `vehest data check` says of these recordings: delays, held and slow channels among it.",
+        frame,
+        columns,
     )
 
 
@@ -209,7 +253,9 @@ def _planted(found: pd.DataFrame) -> list[Block]:
     if len(missed):
         text += f" Missed: {listed([_case(row) for row in missed.to_dict('records')])}."
     shown = found.assign(
-        found=np.where(found["decidable"], np.where(found["found"], "yes", "**no**"), "cannot be told"),
+        found=np.where(
+            found["decidable"], np.where(found["found"], "yes", "**no**"), "cannot be told"
+        ),
         false_alarms=found["false_alarms"].replace("", MISSING),
         reported=found["reported"].replace("", MISSING),
     )
@@ -231,12 +277,23 @@ def _case(row: Mapping[object, object]) -> str:
 
 
 def _licences(datasets: Sequence[StoredDataset]) -> Table:
-    rows = [{"dataset": own.name, "title": own.title, "licence": own.licence, "citation": own.citation} for own in datasets]
-    columns = {"dataset": Column("data set"), "title": Column("what"), "licence": Column("licence"), "citation": Column("cite")}
-    return Table("licences", "Whose recordings they are. None of them comes with vehest.", pd.DataFrame(rows), columns)
+    rows = [
+        {"dataset": own.name, "title": own.title, "licence": own.licence, "citation": own.citation}
+        for own in datasets
+    ]
+    columns = {
+        "dataset": Column("data set"),
+        "title": Column("what"),
+        "licence": Column("licence"),
+        "citation": Column("cite"),
+    }
+    return Table(
+        "licences",
+        "Whose recordings they are. None of them comes with vehest.",
+        pd.DataFrame(rows),
+        columns,
+    )
 
 
 def _how(artefacts: StudyArtefacts) -> str:
-    return (
-        f"## Appendix: how it was made\n\n- Command: {as_code(artefacts.command)}\n- No estimator is trained, no figure depends on a seed."
-    )
+    return f"## Appendix: how it was made\n\n- Command: {as_code(artefacts.command)}\n- No estimator is trained, no figure depends on a seed."

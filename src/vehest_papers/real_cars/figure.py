@@ -24,16 +24,31 @@ def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigu
                 values = np.array(getattr(found, name))
                 if not np.isfinite(values).all():
                     axes.annotate(
-                        "not measured", (0.02, height), xycoords=("axes fraction", "data"), va="center", color="#767676", fontsize=6.5
+                        "not measured",
+                        (0.02, height),
+                        xycoords=("axes fraction", "data"),
+                        va="center",
+                        color="#767676",
+                        fontsize=6.5,
                     )
                     continue
                 axes.plot(values[[0, -1]], [height, height], color=colour, linewidth=1.0)
                 for value, marker in zip(values, ("|", "o", "D"), strict=True):
                     axes.plot(
-                        value, height, marker=marker, color=colour, markersize=4.5, markerfacecolor="white" if kind != "real" else colour
+                        value,
+                        height,
+                        marker=marker,
+                        color=colour,
+                        markersize=4.5,
+                        markerfacecolor="white" if kind != "real" else colour,
                     )
                 axes.annotate(
-                    f"{values[-1]:.2g}", (values[-1], height), xytext=(5, 0), textcoords="offset points", va="center", fontsize=6.5
+                    f"{values[-1]:.2g}",
+                    (values[-1], height),
+                    xytext=(5, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=6.5,
                 )
             axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

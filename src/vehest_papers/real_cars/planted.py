@@ -28,14 +28,20 @@ class Fault:
     """One fault."""
 
     name: str  # what is done
-    channels: tuple[str, ...]  # to which channels; those that a recording does not have are left out, at least one must be there
+    channels: tuple[
+        str, ...
+    ]  # to which channels; those that a recording does not have are left out, at least one must be there
     size: str  # how much, with its unit
     checks: frozenset[str]  # names of checks of which one must find it; empty where none can
     change: Change  # samples (T,) and sampling rate [Hz] to samples
 
     def __call__(self, recording: Recording) -> Recording:
         """The recording with the fault in it."""
-        changed = {name: self.change(recording[name], recording.rate_hz) for name in self.channels if name in recording}
+        changed = {
+            name: self.change(recording[name], recording.rate_hz)
+            for name in self.channels
+            if name in recording
+        }
         return replace(recording, channels={**recording.channels, **changed})
 
 
@@ -55,7 +61,15 @@ def planted_faults() -> list[Fault]:
     ]
     faults += [
         Fault("reversed", channels, "-1", frozenset({"sign"}), partial(_scaled, -1.0))
-        for channels in [("ay",), ("yaw_rate",), ("ax",), ("steer",), ("vy_ref",), ("sideslip_ref",), REFERENCE]
+        for channels in [
+            ("ay",),
+            ("yaw_rate",),
+            ("ax",),
+            ("steer",),
+            ("vy_ref",),
+            ("sideslip_ref",),
+            REFERENCE,
+        ]
     ]
     units = [
         ("yaw_rate", "deg/s", 180.0 / np.pi),
@@ -65,15 +79,30 @@ def planted_faults() -> list[Fault]:
         ("ay", "g", 1.0 / GRAVITY),
     ]
     found_by = frozenset({"unit", "impossible"})
-    faults += [Fault("in another unit", (name,), unit, found_by, partial(_scaled, factor)) for name, unit, factor in units]
+    faults += [
+        Fault("in another unit", (name,), unit, found_by, partial(_scaled, factor))
+        for name, unit, factor in units
+    ]
     faults += [
         Fault("offset", ("ay",), "0.3 m/s²", frozenset({"offset"}), partial(_shifted, 0.3)),
         Fault("offset", ("ay",), "1 m/s²", frozenset({"offset"}), partial(_shifted, 1.0)),
-        Fault("offset", ("steer",), "4 deg", frozenset({"offset"}), partial(_shifted, float(np.radians(4.0)))),
+        Fault(
+            "offset",
+            ("steer",),
+            "4 deg",
+            frozenset({"offset"}),
+            partial(_shifted, float(np.radians(4.0))),
+        ),
     ]
-    faults += [Fault("held", (name,), f"{HELD_RATE:g} Hz", frozenset({"held"}), partial(_held, HELD_RATE)) for name in ("yaw_rate", "ay")]
+    faults += [
+        Fault("held", (name,), f"{HELD_RATE:g} Hz", frozenset({"held"}), partial(_held, HELD_RATE))
+        for name in ("yaw_rate", "ay")
+    ]
     slow = partial(_low_passed, TIME_CONSTANT)
-    faults += [Fault("low-passed", (name,), f"{TIME_CONSTANT:g} s", frozenset({"bandwidth"}), slow) for name in ("yaw_rate", "ax")]
+    faults += [
+        Fault("low-passed", (name,), f"{TIME_CONSTANT:g} s", frozenset({"bandwidth"}), slow)
+        for name in ("yaw_rate", "ax")
+    ]
     return faults
 
 
@@ -93,7 +122,11 @@ def detections(recording: Recording) -> pd.DataFrame:
         touched = [name for name in fault.channels if name in recording]
         if not touched:
             continue
-        new = [finding for finding in _counted(fault(recording)) if (finding.level, finding.check, finding.channel) not in own]
+        new = [
+            finding
+            for finding in _counted(fault(recording))
+            if (finding.level, finding.check, finding.channel) not in own
+        ]
         right = [one for one in new if one.check in fault.checks and _names(one, touched)]
         wrong = [one for one in new if one.channel and not _names(one, touched)]
         rows.append(
@@ -108,12 +141,25 @@ def detections(recording: Recording) -> pd.DataFrame:
                 "false_alarms": "; ".join(f"{one.check}: {one.channel}" for one in wrong),
             }
         )
-    columns = ["fault", "channel", "size", "decidable", "found", "reported", "message", "false_alarms"]
+    columns = [
+        "fault",
+        "channel",
+        "size",
+        "decidable",
+        "found",
+        "reported",
+        "message",
+        "false_alarms",
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 
 def _counted(recording: Recording) -> list[Finding]:
-    return [finding for finding in checks_of_recording(recording) if finding.level != "note" or finding.check in COUNTED_NOTES]
+    return [
+        finding
+        for finding in checks_of_recording(recording)
+        if finding.level != "note" or finding.check in COUNTED_NOTES
+    ]
 
 
 def _names(finding: Finding, touched: Sequence[str]) -> bool:
@@ -121,7 +167,11 @@ def _names(finding: Finding, touched: Sequence[str]) -> bool:
     if finding.check == "kinematics":
         return bool({"ay", "yaw_rate", "vx", "vx_ref", "vy_ref"} & set(touched))
     alternatives = re.search(r"either (.*) point the other way", finding.message)
-    named = set() if alternatives is None or finding.channel else set(re.findall(r"\w+", alternatives[1]))
+    named = (
+        set()
+        if alternatives is None or finding.channel
+        else set(re.findall(r"\w+", alternatives[1]))
+    )
     return finding.channel in touched or bool(named & set(touched))
 
 
@@ -145,4 +195,7 @@ def _held(held_rate: float, samples: FloatArray, rate_hz: float) -> FloatArray:
 
 def _low_passed(time_constant: float, samples: FloatArray, rate_hz: float) -> FloatArray:
     keep = float(np.exp(-1.0 / (rate_hz * time_constant)))
-    return np.asarray(signal.lfilter([1.0 - keep], [1.0, -keep], samples, zi=[keep * samples[0]])[0], dtype=np.float64)
+    return np.asarray(
+        signal.lfilter([1.0 - keep], [1.0, -keep], samples, zi=[keep * samples[0]])[0],
+        dtype=np.float64,
+    )

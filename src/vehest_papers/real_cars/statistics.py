@@ -43,7 +43,9 @@ class Statistics:
     correlation: float  # of v with the yaw rate
     noise: float  # white noise of the reference [deg]
     bound: float  # posterior Cramér-Rao bound with every input that was measured, axles known [deg]
-    kinematic_bound: float  # the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg]
+    kinematic_bound: (
+        float  # the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg]
+    )
     point: str  # where the reference was measured, in words
     missing: str = ""  # the channel that is missing; empty where all are there
 
@@ -60,7 +62,9 @@ class Statistics:
         if self.rms < LEAST_SIDESLIP:
             found.append(f"β of {self.rms:.2g}° (rms) only")
         if not self.static_map > LEAST_OVER_NOISE * self.noise:
-            found.append(f"a static map leaves {self.static_map:.2g}°, the reference's noise is {self.noise:.2g}°")
+            found.append(
+                f"a static map leaves {self.static_map:.2g}°, the reference's noise is {self.noise:.2g}°"
+            )
         return found
 
 
@@ -69,7 +73,14 @@ def statistics_of(recordings: Sequence[Recording]) -> Statistics:
     labelled = [recording for recording in recordings if "vy_ref" in recording]
     recordings = labelled or recordings
     names = {"vx": "speed", "yaw_rate": "yaw rate", "vy_ref": "reference of v"}
-    missing = next((word for name, word in names.items() if any(name not in recording for recording in recordings)), "")
+    missing = next(
+        (
+            word
+            for name, word in names.items()
+            if any(name not in recording for recording in recordings)
+        ),
+        "",
+    )
     pieces = [piece for recording in recordings for piece in _driven(recording)]
     native = recordings[0].rate_hz
     seconds = sum(recording.duration for recording in recordings)
@@ -80,7 +91,17 @@ def statistics_of(recordings: Sequence[Recording]) -> Statistics:
     speed = tuple(np.quantile(vx, (0.01, 0.99)).tolist()) if len(vx) else (math.nan, math.nan)
     ay = _joined(pieces, "ay")
     bands = tuple(np.quantile(np.abs(ay), QUANTILES).tolist()) if len(ay) else nothing
-    plain = Statistics(seconds, driven, native, speed, bands, nothing, *(math.nan,) * 6, point=point, missing=missing)
+    plain = Statistics(
+        seconds,
+        driven,
+        native,
+        speed,
+        bands,
+        nothing,
+        *(math.nan,) * 6,
+        point=point,
+        missing=missing,
+    )
     vy = _joined(pieces, "vy_ref")
     if missing or not len(vy):
         return plain
@@ -96,7 +117,9 @@ def statistics_of(recordings: Sequence[Recording]) -> Statistics:
         sideslip=tuple(np.quantile(np.abs(beta), QUANTILES).tolist()),
         rms=_rms(beta),
         static_map=_left_by_static_map(vx, vy, yaw_rate),
-        correlation=float(np.corrcoef(vy, yaw_rate)[0, 1]) if vy.std() > 0 and yaw_rate.std() > 0 else math.nan,
+        correlation=float(np.corrcoef(vy, yaw_rate)[0, 1])
+        if vy.std() > 0 and yaw_rate.std() > 0
+        else math.nan,
         noise=math.nan if noise is None else noise.sideslip,
         bound=math.nan if bound is None else bound.sideslip,
         kinematic_bound=math.nan if kinematic is None else kinematic.sideslip,
@@ -116,11 +139,18 @@ def _driven(recording: Recording) -> list[Recording]:
         return []
     slow = recording if recording.rate_hz <= RATE * (1 + 1e-9) else _at_rate(recording)
     speed = slow["vx"]
-    moving = speed > DRIVEN * float(np.nanquantile(speed, 0.99)) if np.isfinite(speed).any() else np.zeros(len(slow), dtype=bool)
+    moving = (
+        speed > DRIVEN * float(np.nanquantile(speed, 0.99))
+        if np.isfinite(speed).any()
+        else np.zeros(len(slow), dtype=bool)
+    )
     for name in ("vx", "ay", "yaw_rate", "vy_ref"):
         moving &= np.isfinite(slow[name]) if name in slow else True
     return [
-        slow.cut(slow.start_time + (first - 0.5) / slow.rate_hz, slow.start_time + (end - 0.5) / slow.rate_hz)
+        slow.cut(
+            slow.start_time + (first - 0.5) / slow.rate_hz,
+            slow.start_time + (end - 0.5) / slow.rate_hz,
+        )
         for first, end in true_runs(moving).tolist()
         if end - first >= SHORTEST_PIECE * slow.rate_hz
     ]
@@ -133,7 +163,10 @@ def _at_rate(recording: Recording) -> Recording:
     slow = Resample(RATE)(recording.select(sound))
     if not gappy:
         return slow
-    plain = {name: np.interp(slow.time, recording.time, recording[name], left=math.nan, right=math.nan) for name in gappy}
+    plain = {
+        name: np.interp(slow.time, recording.time, recording[name], left=math.nan, right=math.nan)
+        for name in gappy
+    }
     return replace(slow, channels={**slow.channels, **plain}, gappy=frozenset(gappy))
 
 
@@ -143,7 +176,9 @@ def _drive(piece: Recording) -> Drive:
 
 
 def _point(recording: Recording) -> str:
-    origin = next((line for line in origin_in_words(recording) if line.startswith("reference measured ")), "")
+    origin = next(
+        (line for line in origin_in_words(recording) if line.startswith("reference measured ")), ""
+    )
     return origin.removeprefix("reference measured ") or "not said"
 
 

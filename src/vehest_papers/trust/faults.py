@@ -49,13 +49,26 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
 
     Health and oracle learn on the part's training and validation ranges.
     """
-    train, validation, tests = (recordings_of(part, spans) for spans in (part.split.train, part.split.validation, _tested(part)))
+    train, validation, tests = (
+        recordings_of(part, spans)
+        for spans in (part.split.train, part.split.validation, _tested(part))
+    )
     channels = _channels([*train, *validation, *tests])
     rate = part.protocol.rate_hz
-    model, oracle = learn_health(train, validation, channels, rate), learn_oracle(train, validation, channels, rate)
+    model, oracle = (
+        learn_health(train, validation, channels, rate),
+        learn_oracle(train, validation, channels, rate),
+    )
     limits = learn_limits(train, channels, rate)
-    nominal = [_flags(model, Guard(channels, (), limits, rate), recording.stack(channels)) for recording in tests]
-    long = [(recording, flags) for recording, flags in zip(tests, nominal, strict=True) if recording.duration >= LEAST_SECONDS]
+    nominal = [
+        _flags(model, Guard(channels, (), limits, rate), recording.stack(channels))
+        for recording in tests
+    ]
+    long = [
+        (recording, flags)
+        for recording, flags in zip(tests, nominal, strict=True)
+        if recording.duration >= LEAST_SECONDS
+    ]
     rows = []
     for recording, flags in long[:: max(math.ceil(len(long) / MOST_RANGES), 1)]:
         onset = round(recording.duration / 3.0, 2)
@@ -66,16 +79,39 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
                 if applies(kind, channel):
                     for severity in SEVERITIES:
                         fault = Fault(kind, channel, severity, onset, LASTS)
-                        found = _case(model, oracle, Guard(channels, (), limits, rate), clean, motion, fault, flags)
-                        case = {"recording": recording.id, "fault": kind, "channel": channel, "severity": severity, "onset": onset}
+                        found = _case(
+                            model,
+                            oracle,
+                            Guard(channels, (), limits, rate),
+                            clean,
+                            motion,
+                            fault,
+                            flags,
+                        )
+                        case = {
+                            "recording": recording.id,
+                            "fault": kind,
+                            "channel": channel,
+                            "severity": severity,
+                            "onset": onset,
+                        }
                         rows.append(case | found)
-    data = " and ".join(sorted({f"{part.data_titles[span.dataset]} ({part.kinds[span.dataset]})" for span in _tested(part)}))
+    data = " and ".join(
+        sorted(
+            {
+                f"{part.data_titles[span.dataset]} ({part.kinds[span.dataset]})"
+                for span in _tested(part)
+            }
+        )
+    )
     return FaultTrials(name, data, rate, pd.DataFrame(rows), nominal)
 
 
 def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
     """(test set, number of the range) -> status without faults, (T,), of the channels that the car has."""
-    train, validation = (recordings_of(part, spans) for spans in (part.split.train, part.split.validation))
+    train, validation = (
+        recordings_of(part, spans) for spans in (part.split.train, part.split.validation)
+    )
     found = {}
     for test_set, spans in part.split.tests.items():
         tests = recordings_of(part, spans)
@@ -83,7 +119,9 @@ def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
         model = learn_health(train, validation, channels, part.protocol.rate_hz)
         for position, recording in enumerate(tests):
             rows = np.ascontiguousarray(recording.stack(channels))
-            found[test_set, position] = health_rows(model.packed(), rows, np.isfinite(rows), model.start()).status
+            found[test_set, position] = health_rows(
+                model.packed(), rows, np.isfinite(rows), model.start()
+            ).status
     return found
 
 
@@ -103,7 +141,9 @@ def _case(
         seen = oracle.sees(clean, faulty, first, drawn=True)
     else:
         seen = oracle.sees(motion, inject(motion, rate, fault), first, drive=clean)
-    flags = _flags(model, guard, np.stack([faulty[name] for name in model.channels], axis=1)) & ~nominal
+    flags = (
+        _flags(model, guard, np.stack([faulty[name] for name in model.channels], axis=1)) & ~nominal
+    )
     delay = detection_delay(flags, first, min(first + round(HORIZON_SECONDS * rate), steps), rate)
     return {
         "visible": seen.visible,
@@ -116,18 +156,32 @@ def _case(
 
 def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.bool_]:
     received = np.ascontiguousarray(rows)
-    return np.asarray(health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0)
+    return np.asarray(
+        health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0
+    )
 
 
 def other_vehicle(part: PartArtefacts, test_set: str) -> bool:
     """Whether a test set is of another car, or other tyres, than training and validation."""
     learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
-    return test_set in part.protocol.sets_elsewhere or not {span.dataset for span in part.split.tests[test_set]} <= learnt
+    return (
+        test_set in part.protocol.sets_elsewhere
+        or not {span.dataset for span in part.split.tests[test_set]} <= learnt
+    )
 
 
 def _tested(part: PartArtefacts) -> list[Span]:
-    return [span for name, spans in part.split.tests.items() if not other_vehicle(part, name) for span in spans]
+    return [
+        span
+        for name, spans in part.split.tests.items()
+        if not other_vehicle(part, name)
+        for span in spans
+    ]
 
 
 def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    return tuple(channel for channel in WATCHED if all(channel in own and np.isfinite(own[channel]).all() for own in recordings))
+    return tuple(
+        channel
+        for channel in WATCHED
+        if all(channel in own and np.isfinite(own[channel]).all() for own in recordings)
+    )

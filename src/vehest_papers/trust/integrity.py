@@ -24,7 +24,12 @@ from vehest.data.runs import true_runs
 ALERT_LIMIT = 2.0  # deg of sideslip
 CONFIDENCE = 0.95
 
-NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = "nominal", "misleading", "hazardously misleading", "unavailable"
+NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = (
+    "nominal",
+    "misleading",
+    "hazardously misleading",
+    "unavailable",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +46,27 @@ class Integrity:
         unavailable = self.flagged | ~(self.level <= self.alert_limit)
         outside = ~unavailable & ~(self.error <= self.level)
         hazardous = outside & ~(self.error <= self.alert_limit)
-        return {NOMINAL: ~unavailable & ~outside, MISLEADING: outside & ~hazardous, HAZARDOUS: hazardous, UNAVAILABLE: unavailable}
+        return {
+            NOMINAL: ~unavailable & ~outside,
+            MISLEADING: outside & ~hazardous,
+            HAZARDOUS: hazardous,
+            UNAVAILABLE: unavailable,
+        }
 
     def shares(self) -> dict[str, float]:
         """Region -> share of the samples; NaN without samples."""
-        return {region: float(mask.mean()) if len(mask) else math.nan for region, mask in self.masks().items()}
+        return {
+            region: float(mask.mean()) if len(mask) else math.nan
+            for region, mask in self.masks().items()
+        }
 
 
-def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_], alert_limit: float = ALERT_LIMIT) -> Integrity:
+def integrity_of(
+    error: FloatArray,
+    level: FloatArray,
+    flagged: NDArray[np.bool_],
+    alert_limit: float = ALERT_LIMIT,
+) -> Integrity:
     """Of signed errors; samples without error or level (a window that is not full yet) are left out.
 
     Args:
@@ -58,7 +76,9 @@ def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_
         alert_limit: in the same unit.
     """
     known = ~np.isnan(error) & ~np.isnan(level)
-    return Integrity(np.abs(error[known]), level[known], np.asarray(flagged, bool)[known], alert_limit)
+    return Integrity(
+        np.abs(error[known]), level[known], np.asarray(flagged, bool)[known], alert_limit
+    )
 
 
 @dataclass(frozen=True)

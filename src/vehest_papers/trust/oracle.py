@@ -26,7 +26,14 @@ from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest.trust.health import margin
-from vehest.trust.relations import Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
+from vehest.trust.relations import (
+    Relation,
+    learn_relations,
+    least_speed_of,
+    residuals_of,
+    speed_channel,
+    without_glitches,
+)
 
 N_LEVELS = 5  # speeds at which the noise is looked at
 HORIZON_SECONDS = 10.0  # after the onset, within which a fault has to be seen
@@ -56,7 +63,9 @@ class Oracle:
     model: Autoregression  # of what they leave
     speed: str | None  # channel that the noise goes by
     levels: tuple[FloatArray, FloatArray]  # speeds, and the noise at each
-    healthy: tuple[FloatArray, ...]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
+    healthy: tuple[
+        FloatArray, ...
+    ]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
     reserve: float  # how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector
 
     def sees(
@@ -80,21 +89,43 @@ class Oracle:
             drawn: whether the fault is random; the oracle then knows the covariance of its signature and not the signature.
         """
         length = round(HORIZON_SECONDS * self.rate_hz)
-        begin, end = max(onset - self.model.order, 0), min(onset + length, len(next(iter(healthy.values()))))
+        begin, end = (
+            max(onset - self.model.order, 0),
+            min(onset + length, len(next(iter(healthy.values())))),
+        )
         first, within = onset - begin, end - onset
-        parts = [{name: np.asarray(part[name][begin:end]) for name in self.channels} for part in (healthy, faulty, drive or healthy)]
+        parts = [
+            {name: np.asarray(part[name][begin:end]) for name in self.channels}
+            for part in (healthy, faulty, drive or healthy)
+        ]
         broken = np.any([~np.isfinite(values) for values in parts[1].values()], axis=0)[first:]
         seen = int(np.argmax(broken)) if broken.any() else length
-        parts[1] = {name: np.where(np.isfinite(values), values, parts[0][name]) for name, values in parts[1].items()}
+        parts[1] = {
+            name: np.where(np.isfinite(values), values, parts[0][name])
+            for name, values in parts[1].items()
+        }
         with np.errstate(all="ignore"):
-            before, after, received = (residuals_of(part, self.channels, self.relations, self.least_speed) for part in parts)
+            before, after, received = (
+                residuals_of(part, self.channels, self.relations, self.least_speed)
+                for part in parts
+            )
             bound = MOST_DEVIATIONS * np.sqrt(np.diag(self.model.covariance))
-            signature = filtered(self.model, np.clip(np.nan_to_num(after - before), -1e3 * bound, 1e3 * bound))
+            signature = filtered(
+                self.model, np.clip(np.nan_to_num(after - before), -1e3 * bound, 1e3 * bound)
+            )
         signature = np.clip(signature[first:], -bound, bound)
         innovations = np.nan_to_num(self.model.innovations(received)[first:])
-        levels = levels_at(self.levels, parts[2][self.speed][first:]) if self.speed else np.ones((1, len(self.channels)))
+        levels = (
+            levels_at(self.levels, parts[2][self.speed][first:])
+            if self.speed
+            else np.ones((1, len(self.channels)))
+        )
         signature, innovations = signature / levels, innovations / levels
-        test = _random_test(signature, self.model.covariance) if drawn else known_test(signature, self.model.covariance)
+        test = (
+            _random_test(signature, self.model.covariance)
+            if drawn
+            else known_test(signature, self.model.covariance)
+        )
         threshold = self._threshold(test, within)
         ratio = np.cumsum(test(innovations + signature))
         above = np.flatnonzero(ratio > threshold)
@@ -108,11 +139,20 @@ class Oracle:
         step = max(round(STARTS_SECONDS * self.rate_hz), 1)
         for innovations in self.healthy:
             for begin in range(self.model.order, len(innovations) - within + 1, step):
-                highest = max(highest, float(np.cumsum(test(self.reserve * np.nan_to_num(innovations[begin : begin + within]))).max()))
+                highest = max(
+                    highest,
+                    float(
+                        np.cumsum(
+                            test(self.reserve * np.nan_to_num(innovations[begin : begin + within]))
+                        ).max()
+                    ),
+                )
         return highest
 
 
-Test = Callable[[FloatArray], FloatArray]  # innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)
+Test = Callable[
+    [FloatArray], FloatArray
+]  # innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)
 
 
 def known_test(signature: FloatArray, covariance: FloatArray) -> Test:
@@ -138,20 +178,42 @@ def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, Fl
     return {name: signal.sosfiltfilt(band, values) for name, values in samples.items()}
 
 
-def learn_oracle(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> Oracle:
+def learn_oracle(
+    train: Sequence[Recording],
+    validation: Sequence[Recording],
+    channels: Sequence[str],
+    rate_hz: float,
+) -> Oracle:
     """Fit relations and autoregression to training drives at ``rate_hz`` [Hz]; these and validation's are healthy; raises `DataError`."""
     names = tuple(channels)
-    train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
+    train, validation = (
+        [without_glitches(recording, names) for recording in part] for part in (train, validation)
+    )
     least_speed = least_speed_of(train, names)
     relations = tuple(learn_relations(train, names, rate_hz, least_speed))
-    pieces = [residuals_of({name: recording[name] for name in names}, names, relations, least_speed) for recording in (*train, *validation)]
+    pieces = [
+        residuals_of({name: recording[name] for name in names}, names, relations, least_speed)
+        for recording in (*train, *validation)
+    ]
     model = fit_autoregression(pieces[: len(train)])
     speed, innovations = speed_channel(names), [model.innovations(piece) for piece in pieces]
-    speeds = [recording[speed] if speed else np.zeros(len(recording)) for recording in (*train, *validation)]
+    speeds = [
+        recording[speed] if speed else np.zeros(len(recording))
+        for recording in (*train, *validation)
+    ]
     seen = len(train)
-    levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
-    reserve = margin(STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz)
-    healthy = tuple(own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True))
+    levels = learn_noise_levels(
+        np.concatenate(innovations[:seen]),
+        model.covariance,
+        np.concatenate(speeds[:seen]),
+        N_LEVELS,
+    )
+    reserve = margin(
+        STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz
+    )
+    healthy = tuple(
+        own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True)
+    )
     return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, reserve)
 
 

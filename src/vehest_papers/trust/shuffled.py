@@ -53,12 +53,22 @@ def scores_of(part: PartArtefacts, model: EvaluatedModel, test_set: str) -> Scor
         turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
         values.append(np.abs(turned) / scored.bands["sideslip"])
         if len(parts) == len(spans):  # else each sequence of a range is a manoeuvre
-            reference = read_recording(part.references[spans[position].dataset, spans[position].recording])
-            turns[position] = np.interp(scored.time, reference.time, reference["yaw_rate"]) if "yaw_rate" in reference else None
+            reference = read_recording(
+                part.references[spans[position].dataset, spans[position].recording]
+            )
+            turns[position] = (
+                np.interp(scored.time, reference.time, reference["yaw_rate"])
+                if "yaw_rate" in reference
+                else None
+            )
     labels, _ = block_labels(turns, [len(own) for own in values], part.protocol.rate_hz)
     together, known = np.concatenate(values), np.concatenate(labels)
     finite = np.isfinite(together)
-    return Scores(together[finite], np.unique(known[finite], return_inverse=True)[1]) if finite.any() else None
+    return (
+        Scores(together[finite], np.unique(known[finite], return_inverse=True)[1])
+        if finite.any()
+        else None
+    )
 
 
 def holds_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> bool:
@@ -67,7 +77,9 @@ def holds_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> boo
     return low <= SHOWN_LEVEL <= high
 
 
-def share_if_shuffled(calibration: Scores, test: Scores, draws: int = DRAWS, seed: int = 0) -> float:
+def share_if_shuffled(
+    calibration: Scores, test: Scores, draws: int = DRAWS, seed: int = 0
+) -> float:
     """In which share of draws 0.90 lies in the test's interval, if manoeuvres are shuffled between calibration and test; NaN if too few."""
     if min(calibration.number, test.number) < LEAST_MANOEUVRES:
         return float("nan")
@@ -88,7 +100,9 @@ def together(tests: Sequence[Scores]) -> tuple[float, float, float]:
     """Share of errors inside their bands over several test sets, each by a model and a band of its own, and its 95 % interval."""
     inside = np.concatenate([own.values <= 1.0 for own in tests])
     starts = np.cumsum([0, *(own.number for own in tests)])
-    manoeuvres = np.concatenate([own.manoeuvres + start for own, start in zip(tests, starts[:-1], strict=True)])
+    manoeuvres = np.concatenate(
+        [own.manoeuvres + start for own, start in zip(tests, starts[:-1], strict=True)]
+    )
     low, high = _interval(inside, manoeuvres)
     return float(inside.mean()), low, high
 
@@ -104,13 +118,23 @@ def _interval(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> tuple
 
 def in_words(low: float, high: float) -> str:
     """Whether 0.90 lies in an interval."""
-    return "no interval" if math.isnan(low) else "yes" if low <= 0.9 <= high else "too wide" if low > 0.9 else "too narrow"
+    return (
+        "no interval"
+        if math.isnan(low)
+        else "yes"
+        if low <= 0.9 <= high
+        else "too wide"
+        if low > 0.9
+        else "too narrow"
+    )
 
 
 def scores_learnt(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) -> list[Scores | None]:
     """Of each row of the board, the errors over the band; none off the cars that were learnt on."""
     return [
-        scores_of(parts[row["part"]], _model_of(parts[row["part"]], row), row["test_set"]) if row["car"] == LEARNT else None
+        scores_of(parts[row["part"]], _model_of(parts[row["part"]], row), row["test_set"])
+        if row["car"] == LEARNT
+        else None
         for _, row in board.iterrows()
     ]
 
@@ -119,13 +143,19 @@ def _model_of(part: PartArtefacts, row: pd.Series) -> EvaluatedModel:
     return by_name(part.models)[row["estimator"], row["variant"]][0]
 
 
-def if_shuffled(parts: Mapping[str, PartArtefacts], board: pd.DataFrame, scores: Sequence[Scores | None]) -> list[float]:
+def if_shuffled(
+    parts: Mapping[str, PartArtefacts], board: pd.DataFrame, scores: Sequence[Scores | None]
+) -> list[float]:
     """`share_if_shuffled` of each row of the board [%]; NaN off the cars that were learnt on."""
     found = []
     for (_, row), test in zip(board.iterrows(), scores, strict=True):
         part = parts[row["part"]]
         calibration = None if test is None else scores_of(part, _model_of(part, row), "validation")
-        found.append(math.nan if calibration is None or test is None else 100 * share_if_shuffled(calibration, test))
+        found.append(
+            math.nan
+            if calibration is None or test is None
+            else 100 * share_if_shuffled(calibration, test)
+        )
     return found
 
 
@@ -134,7 +164,10 @@ def shuffled_in_words(board: pd.DataFrame) -> str:
     own = board[(board["inside"] != "no interval") & board["if_shuffled"].notna()]
     if own.empty:
         return ""
-    by_title = "; ".join(f"{title} {shares.mean():.0f} %" for title, shares in own.groupby("title", sort=False)["if_shuffled"])
+    by_title = "; ".join(
+        f"{title} {shares.mean():.0f} %"
+        for title, shares in own.groupby("title", sort=False)["if_shuffled"]
+    )
     held, chance = 100 * float((own["inside"] == "yes").mean()), float(own["if_shuffled"].mean())
     return (
         f"Of these {len(own)}, {held:.0f} % hold it. **With manoeuvres shuffled {DRAWS} times between calibration and test, which "
@@ -147,12 +180,26 @@ def over_parts(board: pd.DataFrame, scores: Sequence[Scores | None]) -> list[Blo
     """Coverage over all parts that test on the same data, each by its own model and band."""
     rows = []
     drives = [title.rpartition(", ")[0] or title for title in board["title"]]
-    for (drive, title), own in board.reset_index(drop=True).groupby([drives, "estimator_title"], sort=False):
+    for (drive, title), own in board.reset_index(drop=True).groupby(
+        [drives, "estimator_title"], sort=False
+    ):
         tests = [test for test in (scores[position] for position in own.index) if test is not None]
         if len(tests) > 1 and own["part"].nunique() == len(own):
             share, low, high = together(tests)
-            row = {"where": drive, "estimator_title": title, "tests": len(tests), "manoeuvres": sum(test.number for test in tests)}
-            rows.append({**row, "share": 100 * share, "interval": f"{100 * low:.0f} … {100 * high:.0f}", "inside": in_words(low, high)})
+            row = {
+                "where": drive,
+                "estimator_title": title,
+                "tests": len(tests),
+                "manoeuvres": sum(test.number for test in tests),
+            }
+            rows.append(
+                {
+                    **row,
+                    "share": 100 * share,
+                    "interval": f"{100 * low:.0f} … {100 * high:.0f}",
+                    "inside": in_words(low, high),
+                }
+            )
     if not rows:
         return []
     frame = pd.DataFrame(rows)

@@ -17,7 +17,16 @@ import pandas as pd
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.under_fault import FAULTED
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.document import (
+    PATENT_NOTE,
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    Table,
+    as_text,
+)
 from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
@@ -29,13 +38,28 @@ from vehest_papers.kit.reading import sideslip_error
 from vehest_papers.trust.faults import FaultTrials, health_of, other_vehicle, trials_of
 from vehest_papers.trust.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest_papers.trust.integrity_figures import stanford_figure
-from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
+from vehest_papers.trust.shuffled import (
+    LEARNT,
+    if_shuffled,
+    in_words,
+    over_parts,
+    scores_learnt,
+    shuffled_in_words,
+)
 
 TAKES = "parts"
 SHOWS_FAILED = True
 
 OTHER = "another"
-FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "error_icc", "band_blocks", "rmse_sideslip")
+FIGURES = (
+    "coverage_90_p10",
+    "coverage_90_p90",
+    "width_90",
+    "interval_score",
+    "error_icc",
+    "band_blocks",
+    "rmse_sideslip",
+)
 SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")  # families of the figures
 
 
@@ -47,14 +71,20 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     board["if_shuffled"] = if_shuffled(parts, board, scores)
     trials = [trials_of(name, part) for name, part in parts.items() if _tries_faults(part)]
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append(f"{_bands_in_words(board)}\n\n{shuffled_in_words(board)}\n\n{_faults_in_words(trials)}")
+    blocks.append(
+        f"{_bands_in_words(board)}\n\n{shuffled_in_words(board)}\n\n{_faults_in_words(trials)}"
+    )
     blocks += [
         "## Bands on cars and tyres that were learnt on",
         *_bands(board[board["car"] == LEARNT], "learnt"),
         *over_parts(board, scores),
     ]
     blocks += [_reliability(board), _by_acceleration(parts, board)]
-    blocks += ["## Bands on another car or tyre", _widening_in_words(board), *_bands(board[board["car"] == OTHER], "elsewhere")]
+    blocks += [
+        "## Bands on another car or tyre",
+        _widening_in_words(board),
+        *_bands(board[board["car"] == OTHER], "elsewhere"),
+    ]
     blocks += ["## Faults", *_faults(trials), *_bands_under_faults(parts, trials)]
     stanford = _stanford(parts)
     blocks += ["## Integrity", stanford] if stanford is not None else []
@@ -72,17 +102,32 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
         metrics = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
         for name, models in by_name(part.models).items():
             for test_set in part.split.tests:
-                own = metrics[(metrics["estimator"] == name[0]) & (metrics["variant"].fillna("") == name[1])]
+                own = metrics[
+                    (metrics["estimator"] == name[0]) & (metrics["variant"].fillna("") == name[1])
+                ]
                 own = own[own["test_set"] == test_set].set_index("metric")
                 if "coverage_90" not in own.index:
                     continue
-                row: dict[str, Any] = {"part": key, "title": as_text(part.title), "test_set": test_set, "estimator": name[0]}
+                row: dict[str, Any] = {
+                    "part": key,
+                    "title": as_text(part.title),
+                    "test_set": test_set,
+                    "estimator": name[0],
+                }
                 row |= {"variant": name[1], "estimator_title": as_text(models[0].title)}
                 row |= {"car": OTHER if other_vehicle(part, test_set) else LEARNT}
-                row |= {figure: float(own["value"][figure]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
+                row |= {
+                    figure: float(own["value"][figure])
+                    for figure in (*COVERAGES, *FIGURES)
+                    if figure in own.index
+                }
                 row |= {end: float(own[end]["coverage_90"]) for end in ("low", "high")}
                 row |= {"inside": in_words(row["low"], row["high"])}
-                row |= {"without_widening": _without_widening(part, models[0], test_set) if row["car"] == OTHER else math.nan}
+                row |= {
+                    "without_widening": _without_widening(part, models[0], test_set)
+                    if row["car"] == OTHER
+                    else math.nan
+                }
                 rows.append(row)
     return pd.DataFrame(rows)
 
@@ -91,7 +136,9 @@ def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
     """Coverage if the band were not widened for another car."""
     inside = []
     for position, scored in enumerate(part.scored(model, test_set)):
-        band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / OTHER_VEHICLE
+        band = (
+            model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / OTHER_VEHICLE
+        )
         inside.append(np.abs(sideslip_error(scored)) <= np.degrees(band))
     return float(np.concatenate(inside).mean())
 
@@ -127,9 +174,15 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
     if board.empty:
         return []
     shown = board.assign(
-        interval=[f"{100 * low:.0f} … {100 * high:.0f}" for low, high in zip(board["low"], board["high"], strict=True)],
+        interval=[
+            f"{100 * low:.0f} … {100 * high:.0f}"
+            for low, high in zip(board["low"], board["high"], strict=True)
+        ],
         where=board["title"] + ", " + board["test_set"],
-        **{column: 100 * board[column] for column in ("coverage_90", "coverage_90_p10", "coverage_90_p90", "without_widening")},
+        **{
+            column: 100 * board[column]
+            for column in ("coverage_90", "coverage_90_p10", "coverage_90_p90", "without_widening")
+        },
     )
     columns = {
         "where": Column("test set"),
@@ -148,7 +201,10 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
     if name == "learnt":
         columns = {**columns, "if_shuffled": Column("0.90 in it if shuffled [%]", decimals=0)}
     if name == "elsewhere":
-        columns = {**columns, "without_widening": Column("inside without the factor [%]", decimals=1)}
+        columns = {
+            **columns,
+            "without_widening": Column("inside without the factor [%]", decimals=1),
+        }
     caption = (
         "90 % bands of β: errors inside, with the 95 % interval over blocks of the drive and the 10 and 90 % quantiles over manoeuvres; "
         "mean full width; interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how "
@@ -168,7 +224,11 @@ def _reliability(board: pd.DataFrame) -> Figure:
         own = learnt[learnt["estimator"] == family]
         values = own[list(COVERAGES)].to_numpy(dtype=float)
         low, high = (np.quantile(values, share, axis=0) for share in (0.1, 0.9))
-        rows.append(Reliability(estimator_class(family).title, lines[family, ""], values.mean(axis=0), low, high))
+        rows.append(
+            Reliability(
+                estimator_class(family).title, lines[family, ""], values.mean(axis=0), low, high
+            )
+        )
     caption = (
         "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a "
         "family, bars from the 10 to the 90 % quantile over them. On the diagonal the coverage is the nominal one."
@@ -182,12 +242,22 @@ def _by_acceleration(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) ->
     for title, own in board[board["car"] == LEARNT].groupby("title", sort=False):
         part = next(part for part in parts.values() if as_text(part.title) == title)
         tests = set(own["test_set"])
-        metrics = part.metrics[part.metrics["test_set"].isin(tests) & (part.metrics["metric"] == "coverage_90")]
+        metrics = part.metrics[
+            part.metrics["test_set"].isin(tests) & (part.metrics["metric"] == "coverage_90")
+        ]
         by_regime = metrics[metrics["subset"].str.startswith("ay_")].groupby("subset")["value"]
-        rows.append({"title": title, **{str(regime): 100 * float(values.median()) for regime, values in by_regime}})
+        rows.append(
+            {
+                "title": title,
+                **{str(regime): 100 * float(values.median()) for regime, values in by_regime},
+            }
+        )
     frame = pd.DataFrame(rows)
     regimes = sorted(str(name) for name in frame if name != "title")
-    columns = {"title": Column("part"), **{name: Column(_range_in_words(name), decimals=0) for name in regimes}}
+    columns = {
+        "title": Column("part"),
+        **{name: Column(_range_in_words(name), decimals=0) for name in regimes},
+    }
     caption = "Errors inside the 90 % band of β by size of the lateral acceleration, median over estimators."
     return Table("bands_by_acceleration", caption, frame, columns)
 
@@ -222,7 +292,9 @@ def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
 
 
 def _alarms_in_words(trials: Sequence[FaultTrials]) -> str:
-    rate = false_alarms_per_hour([drive for own in trials for drive in own.nominal], trials[0].rate_hz)
+    rate = false_alarms_per_hour(
+        [drive for own in trials for drive in own.nominal], trials[0].rate_hz
+    )
     return (
         f"Without faults {rate.alarms} alarms in {rate.hours:.2f} h: {rate.per_hour:.1f} an hour, 95 % interval {rate.low:.1f} to "
         f"{rate.high:.1f}; samples outside what the model learnt count as alarms."
@@ -230,7 +302,9 @@ def _alarms_in_words(trials: Sequence[FaultTrials]) -> str:
 
 
 def _cases(trials: Sequence[FaultTrials]) -> pd.DataFrame:
-    return pd.concat([own.table.assign(part=own.part, data=own.data) for own in trials], ignore_index=True)
+    return pd.concat(
+        [own.table.assign(part=own.part, data=own.data) for own in trials], ignore_index=True
+    )
 
 
 def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
@@ -254,7 +328,9 @@ def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
                     "in_time": int(seen["in_time"].sum()),
                     "share": 100 * float(seen["in_time"].mean()) if len(seen) else math.nan,
                     "oracle": float(seen["oracle_delay"].median()) if len(seen) else math.nan,
-                    "delay": float(seen.loc[seen["flagged"], "delay"].median()) if seen["flagged"].any() else math.nan,
+                    "delay": float(seen.loc[seen["flagged"], "delay"].median())
+                    if seen["flagged"].any()
+                    else math.nan,
                     "unseen_flagged": int(own.loc[~own["visible"], "flagged"].sum()),
                 }
             )
@@ -275,16 +351,23 @@ def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
     return blocks
 
 
-def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]) -> pd.DataFrame:
+def bands_under_faults(
+    parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]
+) -> pd.DataFrame:
     """One row a part and fault: whether the oracle sees such a fault there, and what bands of β hold while it lasts.
 
     Estimators count whose error it changes; ``lowest`` is that of the worst of them, ``unflagged`` is over samples that are not flagged.
     """
     rows = []
     for key, part in parts.items():
-        own = part.metrics[(part.metrics["subset"] == FAULTED) & part.metrics["test_set"].isin(part.split.tests)]
+        own = part.metrics[
+            (part.metrics["subset"] == FAULTED) & part.metrics["test_set"].isin(part.split.tests)
+        ]
         wide = own.assign(variant=own["variant"].fillna("")).pivot_table(
-            index=["condition", "estimator", "variant", "test_set"], columns="metric", values="value", sort=False
+            index=["condition", "estimator", "variant", "test_set"],
+            columns="metric",
+            values="value",
+            sort=False,
         )
         if "coverage_90" not in wide:
             continue
@@ -292,8 +375,16 @@ def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[Faul
         table = pd.concat([other.table for other in trials if other.part == key])
         for condition, found in wide.groupby("condition", sort=False):
             kind, channel, severity = str(condition).split(":")[:3]
-            tried = table[(table["fault"] == kind) & (table["channel"] == channel) & (table["severity"] == severity)]
-            unflagged = found["coverage_90_unflagged"].dropna() if "coverage_90_unflagged" in found else pd.Series(dtype=float)
+            tried = table[
+                (table["fault"] == kind)
+                & (table["channel"] == channel)
+                & (table["severity"] == severity)
+            ]
+            unflagged = (
+                found["coverage_90_unflagged"].dropna()
+                if "coverage_90_unflagged" in found
+                else pd.Series(dtype=float)
+            )
             rows.append(
                 {
                     "part": as_text(part.title),
@@ -312,7 +403,9 @@ def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[Faul
     return pd.DataFrame(rows)
 
 
-def _bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]) -> list[Block]:
+def _bands_under_faults(
+    parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]
+) -> list[Block]:
     frame = bands_under_faults(parts, trials)
     if frame.empty:
         return []
@@ -349,7 +442,11 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
     """Errors over protection levels, real laps of cars learnt on together."""
     found: dict[str, list[Integrity]] = {}
     for part in parts.values():
-        if "real" not in set(part.kinds.values()) or not _tries_faults(part) or "vx" not in _channels_of(part):
+        if (
+            "real" not in set(part.kinds.values())
+            or not _tries_faults(part)
+            or "vx" not in _channels_of(part)
+        ):
             continue
         status = health_of(part)
         for name, models in by_name(part.models).items():
@@ -357,7 +454,9 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
                 continue
             for test_set in part.split.tests:
                 for position, scored in enumerate(part.scored(models[0], test_set)):
-                    band = models[0].estimate(test_set, position).held_at(scored.time, "band_sideslip")
+                    band = (
+                        models[0].estimate(test_set, position).held_at(scored.time, "band_sideslip")
+                    )
                     invalid = status[test_set, position][-len(scored.time) :] == 2
                     own = integrity_of(sideslip_error(scored), np.degrees(band), invalid)
                     found.setdefault(as_text(models[0].title), []).append(own)
@@ -373,10 +472,15 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
     }
     shares = []
     for title, own in joined.items():
-        shares.append(f"{title}: " + listed([f"{100 * share:.2g} % {region}" for region, share in own.shares().items()]))
+        shares.append(
+            f"{title}: "
+            + listed([f"{100 * share:.2g} % {region}" for region, share in own.shares().items()])
+        )
     caption = (
         "Stanford diagrams of β on the real Ferrari, all laps, without faults: size of the error over the protection level, which is the "
-        "90 % band; alert limit 2°. Misleading: the error exceeds the level and nothing is flagged. " + "; ".join(shares) + "."
+        "90 % band; alert limit 2°. Misleading: the error exceeds the level and nothing is flagged. "
+        + "; ".join(shares)
+        + "."
     )
     return Figure("stanford", caption, stanford_figure(joined))
 

@@ -14,7 +14,12 @@ from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes, spoil_json, spoil
 
 STAGES = ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
 TRACKED = tuple(word for word in KSNN if not word.startswith("tracking"))
-STATEMENTS = ("DELETE FROM experiments", "DROP TABLE runs", "UPDATE alembic_version SET version_num = 'x'", "DROP TABLE alembic_version")
+STATEMENTS = (
+    "DELETE FROM experiments",
+    "DROP TABLE runs",
+    "UPDATE alembic_version SET version_num = 'x'",
+    "DROP TABLE alembic_version",
+)
 
 
 def _mend(folder):
@@ -37,7 +42,9 @@ def _put(file, how):
 def _rename(content, case):
     """Labels and file names in a manifest that lead elsewhere."""
     tree = json.loads(content)
-    name = case.rng.choice([*NAMES, str(case.folder / "evil"), "../../../../evil", str(case.place / "raw" / "evil")])
+    name = case.rng.choice(
+        [*NAMES, str(case.folder / "evil"), "../../../../evil", str(case.place / "raw" / "evil")]
+    )
     if case.rng.random() < 0.7:
         tree[case.rng.choice(["label", "stage", "key"])] = name
     else:
@@ -58,43 +65,78 @@ def _with_header(content, change, rng):
 def manifest(case):
     """Manifests and files of every stage; a file is spoilt while the manifest still agrees with its size."""
     case.copy("study")
-    folder = case.rng.choice([folder for stage in STAGES for folder in sorted((case.place / "outputs" / stage).glob("*"))])
+    folder = case.rng.choice(
+        [
+            folder
+            for stage in STAGES
+            for folder in sorted((case.place / "outputs" / stage).glob("*"))
+        ]
+    )
     file, how = folder / "manifest.json", case.idea(4)
     if how == 0:
         case.spoil(file, lambda content, rng: _rename(content, case))
     elif how == 1:
-        file = case.rng.choice([one for one in sorted(folder.rglob("*")) if one.is_file() and one != file])
+        file = case.rng.choice(
+            [one for one in sorted(folder.rglob("*")) if one.is_file() and one != file]
+        )
         text = file.suffix in (".csv", ".json", ".yaml", ".md")
-        case.spoil(file, lambda content, rng: spoil_text(content.decode(), rng) if text else spoil_bytes(content, rng))
+        case.spoil(
+            file,
+            lambda content, rng: (
+                spoil_text(content.decode(), rng) if text else spoil_bytes(content, rng)
+            ),
+        )
         _mend(folder)
     elif how == 2:
         _put(file, case.visit // 4)
     else:
         case.spoil(file, spoil_json)
-    likely = [("run", "small", "tracking=none", "--dry-run"), ("eval", *KSNN)] * 5  # the others draw the report anew, which takes seconds
+    likely = [
+        ("run", "small", "tracking=none", "--dry-run"),
+        ("eval", *KSNN),
+    ] * 5  # the others draw the report anew, which takes seconds
     force = [] if case.honest else [("report", "small", "tracking=none", "--force")]
-    return Command(case.rng.choice([*likely, ("run", "small", "tracking=none", "--jobs", "1"), *force]))
+    return Command(
+        case.rng.choice([*likely, ("run", "small", "tracking=none", "--jobs", "1"), *force])
+    )
 
 
 @generator("study", weight=10)
 def model(case):
     """model.yaml, model.safetensors with its header, manifest.json; names of models and folders that are none."""
     case.copy("study")
-    folder, rng, how = case.rng.choice(sorted((case.place / "outputs" / "train").iterdir())), case.rng, case.idea(5)
+    folder, rng, how = (
+        case.rng.choice(sorted((case.place / "outputs" / "train").iterdir())),
+        case.rng,
+        case.idea(5),
+    )
     name = rng.choice([str(folder.relative_to(case.place)), folder.name])
     if how == 0:
-        case.spoil(folder / "model.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng))
+        case.spoil(
+            folder / "model.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng)
+        )
     elif how == 1:
         case.spoil(folder / "model.safetensors", spoil_bytes)
     elif how == 2:
-        case.spoil(folder / "model.safetensors", lambda content, rng: _with_header(content, lambda head: spoil_json(head, rng), rng))
+        case.spoil(
+            folder / "model.safetensors",
+            lambda content, rng: _with_header(content, lambda head: spoil_json(head, rng), rng),
+        )
     elif how == 3:
-        _put(folder / rng.choice(["model.yaml", "model.safetensors", "manifest.json"]), case.visit // 5)
+        _put(
+            folder / rng.choice(["model.yaml", "model.safetensors", "manifest.json"]),
+            case.visit // 5,
+        )
     elif not case.honest:
-        name = rng.choice(["", ".", "..", "/", "*", "[", "k", "../train", "outputs", "raw", "**", *WRITABLE_NAMES])
+        name = rng.choice(
+            ["", ".", "..", "/", "*", "[", "k", "../train", "outputs", "raw", "**", *WRITABLE_NAMES]
+        )
     if how < 3 and not case.honest:
         _mend(folder)
-    used = [("estimate", name, "lap.csv", "-o", "out.csv"), ("eval", "--model", name, "split=mine", "tracking=none", "--force")]
+    used = [
+        ("estimate", name, "lap.csv", "-o", "out.csv"),
+        ("eval", "--model", name, "split=mine", "tracking=none", "--force"),
+    ]
     return Command(rng.choice(used))
 
 
@@ -120,7 +162,10 @@ def checkpoint(case):
     if case.rng.random() < 0.3:
         case.spoil(file, spoil_bytes)
     else:
-        case.spoil(file, lambda content, rng: _with_header(content, lambda header: spoil_json(header, rng), rng))
+        case.spoil(
+            file,
+            lambda content, rng: _with_header(content, lambda header: spoil_json(header, rng), rng),
+        )
     return Command(("train", *KSNN))
 
 
@@ -144,5 +189,8 @@ def tracking_store(case):
         connection.executescript(case.rng.choice(STATEMENTS))
         connection.close()
     else:
-        case.spoil(store, lambda content, rng: spoil_bytes(content[: rng.choice([100, 5000, len(content)])], rng))
+        case.spoil(
+            store,
+            lambda content, rng: spoil_bytes(content[: rng.choice([100, 5000, len(content)])], rng),
+        )
     return Command(("eval", *TRACKED, "--force"))

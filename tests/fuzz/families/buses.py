@@ -10,7 +10,14 @@ from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes
 
 TOLD = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
 SUFFIXES = (".asc", ".blf", ".log")
-BUS = {"name": "logs", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "can"}
+BUS = {
+    "name": "logs",
+    "kind": "real",
+    "vehicle": "car",
+    "licence": "none",
+    "citation": "none",
+    "source": "can",
+}
 BUS |= {"path": "${root}", "files": "drive.*", "dbc": "${root}/car.dbc", "rate_hz": 100}
 BUS |= {"channels": {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}}
 LINES_OF_A_LOG = (
@@ -34,7 +41,13 @@ CLOCKS = (0.0, 86_395.0, 86_399.99, 43_200.0)
 def can(folder):
     """A drive of ten seconds in every format."""
     for suffix in SUFFIXES:
-        write_log(planar_drive(10.0, 100.0, seed=1), folder / suffix[1:], suffix, jitter=0.0005, lost=0.003)
+        write_log(
+            planar_drive(10.0, 100.0, seed=1),
+            folder / suffix[1:],
+            suffix,
+            jitter=0.0005,
+            lost=0.003,
+        )
 
 
 def _swap(case, file, lines):
@@ -42,7 +55,12 @@ def _swap(case, file, lines):
     if case.rng.random() < 0.5:
         case.spoil(file, spoil_bytes)
     else:
-        case.spoil(file, lambda content, rng: content.replace(*rng.choice(lines), rng.choice([1, 1, 5, -1]))[: 4 * 2**20])
+        case.spoil(
+            file,
+            lambda content, rng: content.replace(*rng.choice(lines), rng.choice([1, 1, 5, -1]))[
+                : 4 * 2**20
+            ],
+        )
 
 
 def _reads(case, file):
@@ -65,14 +83,29 @@ def log_of_a_bus(case):
     else:
         _swap(case, folder / f"drive{suffix}", LINES_OF_A_LOG)
     file = f"raw/drive{suffix}"
-    replay = ("replay", file, "--dbc", "raw/car.dbc", "--signals", TOLD, "--speed", "max", "--quiet", "--out", "out.csv")
+    replay = (
+        "replay",
+        file,
+        "--dbc",
+        "raw/car.dbc",
+        "--signals",
+        TOLD,
+        "--speed",
+        "max",
+        "--quiet",
+        "--out",
+        "out.csv",
+    )
     return Command(case.rng.choice([replay, *_reads(case, file)]))
 
 
 @generator(weight=4)
 def vbo(case):
     more = {} if case.honest or case.rng.random() < 0.8 else {"clock": "interpolate"}
-    write_yaml(case.place / "conf/dataset/logs.yaml", vbo_log.dataset(case.place / "raw") | {"title": "Logs"} | more)
+    write_yaml(
+        case.place / "conf/dataset/logs.yaml",
+        vbo_log.dataset(case.place / "raw") | {"title": "Logs"} | more,
+    )
     units = vbo_log.UNITS
     if not case.honest and case.rng.random() < 0.2:
         units = tuple(" ".join(case.rng.choice(WRITABLE_NAMES).split())[:200] for _ in units)
@@ -80,5 +113,10 @@ def vbo(case):
     vbo_log.write_log(file, case.rng.choice(CLOCKS), units=units)
     _swap(case, file, LINES_OF_A_VBO)
     return Command(
-        case.rng.choice([(words[0], *words[2:]) if words[1] == "pretrained" else words for words in _reads(case, "raw/lap.vbo")])
+        case.rng.choice(
+            [
+                (words[0], *words[2:]) if words[1] == "pretrained" else words
+                for words in _reads(case, "raw/lap.vbo")
+            ]
+        )
     )

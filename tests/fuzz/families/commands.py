@@ -55,5 +55,9 @@ BASES = (
 def overrides(case):
     case.copy("drives")
     case.copy("steered")
-    more = () if case.honest else (_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
+    more = (
+        ()
+        if case.honest
+        else (_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
+    )
     return Command((*case.rng.choice(BASES), *more))

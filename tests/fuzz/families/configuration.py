@@ -9,9 +9,35 @@ from place import DATASET
 from vehest.run.config_files import packaged
 
 HEAD = "# @package _global_\n"
-ESTIMATORS = ["ksnn", "gru", "luenberger", "kalman", "learned_ukf", "rational_ekf", "dugoff_ukf", "cnn_ukf", "factor_graph", "ensemble_ukf"]
-DATASETS = ["tum", "f1tenth", "f1tenth_bag", "ferrari_250lm", "revs_targa_2014", "mdf", "sim_quickstart", "sim_fleet", "sim_heavy"]
-CARS = {"bmw_320i_low": "sim_quickstart", "f1tenth": "sim_tyre_sets", "heavy_truck": "sim_heavy", "bmw_545i": "sim_bmw"}
+ESTIMATORS = [
+    "ksnn",
+    "gru",
+    "luenberger",
+    "kalman",
+    "learned_ukf",
+    "rational_ekf",
+    "dugoff_ukf",
+    "cnn_ukf",
+    "factor_graph",
+    "ensemble_ukf",
+]
+DATASETS = [
+    "tum",
+    "f1tenth",
+    "f1tenth_bag",
+    "ferrari_250lm",
+    "revs_targa_2014",
+    "mdf",
+    "sim_quickstart",
+    "sim_fleet",
+    "sim_heavy",
+]
+CARS = {
+    "bmw_320i_low": "sim_quickstart",
+    "f1tenth": "sim_tyre_sets",
+    "heavy_truck": "sim_heavy",
+    "bmw_545i": "sim_bmw",
+}
 PACKAGED = {  # file of the packaged configuration -> commands that read it, of which the first succeeds
     "training/supervised": [("train", *KSNN, "--dry-run")],
     "training/nelder_mead": [("train", *LUENBERGER, "--dry-run")],
@@ -22,17 +48,38 @@ PACKAGED = {  # file of the packaged configuration -> commands that read it, of 
     "estimate": [("estimate", "lap.csv", "-o", "out.csv")],
 }
 DRY = ("split=steered", "tracking=none", "--dry-run")
-PACKAGED |= {f"estimator/{own}": [("config", "train", f"estimator={own}"), ("train", f"estimator={own}", *DRY)] for own in ESTIMATORS}
-PACKAGED |= {f"dataset/{own}": [("config", "ingest", f"dataset={own}"), ("ingest", own, "--dry-run", "--download")] for own in DATASETS}
-PACKAGED |= {f"vehicle/{own}": [("simulate", dataset, "--dry-run")] for own, dataset in CARS.items()}
+PACKAGED |= {
+    f"estimator/{own}": [
+        ("config", "train", f"estimator={own}"),
+        ("train", f"estimator={own}", *DRY),
+    ]
+    for own in ESTIMATORS
+}
+PACKAGED |= {
+    f"dataset/{own}": [
+        ("config", "ingest", f"dataset={own}"),
+        ("ingest", own, "--dry-run", "--download"),
+    ]
+    for own in DATASETS
+}
+PACKAGED |= {
+    f"vehicle/{own}": [("simulate", dataset, "--dry-run")] for own, dataset in CARS.items()
+}
 DERIVED = DATASET | {
-    "transforms": [{"name": "acceleration_from_speed", "cutoff_hz": 5.0}, {"name": "sideslip_from_velocity"}],
+    "transforms": [
+        {"name": "acceleration_from_speed", "cutoff_hz": 5.0},
+        {"name": "sideslip_from_velocity"},
+    ],
     "reference_point": {"x": 0.4, "y": -0.1},
     "imu_point": "unknown",
     "drop_rows": {"one": ["1490-"]},
     "time_restarts": True,
 }
-POSITION = {"x": {"column": "Speed", "unit": "m"}, "y": {"column": "Vy", "unit": "m"}, "yaw": {"column": "Yaw", "unit": "deg"}}
+POSITION = {
+    "x": {"column": "Speed", "unit": "m"},
+    "y": {"column": "Vy", "unit": "m"},
+    "yaw": {"column": "Yaw", "unit": "deg"},
+}
 MORE_DERIVED = (
     {},
     {"held": {"channels": ["ay", "ax"], "updated": "Time", "delay": 0.01}},
@@ -42,19 +89,63 @@ MORE_DERIVED = (
 )
 SPLITS = (
     SPLIT,
-    SPLIT | {"train": [{"recordings": "o*", "keep": {"magnitude": {"vx": {"at_least": 1.0}}, "at_least_seconds": 2.0}}]},
-    {"name": "mine", "dataset": "mine", "train": "60 %", "validation": "20%", "tests": {"test": "20 %"}},
+    SPLIT
+    | {
+        "train": [
+            {
+                "recordings": "o*",
+                "keep": {"magnitude": {"vx": {"at_least": 1.0}}, "at_least_seconds": 2.0},
+            }
+        ]
+    },
+    {
+        "name": "mine",
+        "dataset": "mine",
+        "train": "60 %",
+        "validation": "20%",
+        "tests": {"test": "20 %"},
+    },
     {"name": "mine", "dataset": "mine", "folds": {"number": 3, "of": "recordings"}, "fold": 1},
-    {"name": "mine", "dataset": "mine", "folds": {"number": 4, "of": "seconds", "block_seconds": 5.0, "gap_seconds": 0.5}},
-    {"name": "mine", "dataset": "mine", "train": "50 %", "validation": [{"recording": "one", "laps": "2 to 3"}]},
+    {
+        "name": "mine",
+        "dataset": "mine",
+        "folds": {"number": 4, "of": "seconds", "block_seconds": 5.0, "gap_seconds": 0.5},
+    },
+    {
+        "name": "mine",
+        "dataset": "mine",
+        "train": "50 %",
+        "validation": [{"recording": "one", "laps": "2 to 3"}],
+    },
 )
-PORTIONS = ("101 %", "-5 %", "1e999 %", "last 0 laps", "first " + "9" * 20, "0", "9 to 3", "last\nlap", "%", "NaN %")
-PARTS = {"parts": {part: {"split": "mine", "title": part, "sweeps": PIPELINE["sweeps"][:1]} for part in "ab"}}
+PORTIONS = (
+    "101 %",
+    "-5 %",
+    "1e999 %",
+    "last 0 laps",
+    "first " + "9" * 20,
+    "0",
+    "9 to 3",
+    "last\nlap",
+    "%",
+    "NaN %",
+)
+PARTS = {
+    "parts": {
+        part: {"split": "mine", "title": part, "sweeps": PIPELINE["sweeps"][:1]} for part in "ab"
+    }
+}
 PIPELINES = (
     PIPELINE,
     {key: value for key, value in PIPELINE.items() if key not in ("split", "sweeps")} | PARTS,
     PIPELINE | {"about": "what", "publish": False, "based_on": "quickstart"},
-    {"study": "small", "title": "S", "report": "proving_ground", "datasets": ["mine"], "optional_datasets": ["sim_small"]},
+    {
+        "study": "small",
+        "title": "S",
+        "report": "proving_ground",
+        "datasets": ["mine"],
+        "optional_datasets": ["sim_small"],
+    },
 )
 
 
@@ -65,7 +156,9 @@ def _write(case, name, tree, head=""):
     elif "defaults" in tree or case.rng.random() < 0.3:
         case.write(name, head + yaml_of(spoil_items(tree, case.rng)))
     else:
-        case.write(name, head.encode() + spoil_yaml(tree, case.rng, bombs=name.startswith("pipelines/")))
+        case.write(
+            name, head.encode() + spoil_yaml(tree, case.rng, bombs=name.startswith("pipelines/"))
+        )
 
 
 @generator("drives", weight=8)
@@ -75,11 +168,31 @@ def dataset(case):
     _write(
         case,
         "conf/dataset/mine.yaml",
-        case.rng.choice([DATASET, DERIVED] if case.honest else [DATASET, *(DERIVED | more for more in MORE_DERIVED)]),
+        case.rng.choice(
+            [DATASET, DERIVED]
+            if case.honest
+            else [DATASET, *(DERIVED | more for more in MORE_DERIVED)]
+        ),
     )
-    commands = [("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine"), ("data", "usable", "mine")]
+    commands = [
+        ("ingest", "mine"),
+        ("data", "check", "mine"),
+        ("data", "show", "mine"),
+        ("data", "usable", "mine"),
+    ]
     commands += [("downsample", "mine", "rate_hz=20"), ("config", "ingest", "dataset=mine")]
-    return Command(case.rng.choice([*commands, *([] if case.honest else [("estimate", "lap.csv", "dataset=mine", "-o", "out.csv")])]))
+    return Command(
+        case.rng.choice(
+            [
+                *commands,
+                *(
+                    []
+                    if case.honest
+                    else [("estimate", "lap.csv", "dataset=mine", "-o", "out.csv")]
+                ),
+            ]
+        )
+    )
 
 
 @generator("drives", weight=6)
@@ -88,9 +201,18 @@ def split(case):
     case.copy("drives")
     tree = case.rng.choice(SPLITS[:1] + SPLITS[2:5] if case.honest else SPLITS)
     if not case.honest and case.rng.random() < 0.2:
-        tree = tree | {"train": [{"recordings": "*", case.rng.choice(["start", "stop", "laps"]): case.rng.choice(PORTIONS)}]}
+        tree = tree | {
+            "train": [
+                {
+                    "recordings": "*",
+                    case.rng.choice(["start", "stop", "laps"]): case.rng.choice(PORTIONS),
+                }
+            ]
+        }
     _write(case, "conf/split/mine.yaml", tree)
-    return Command((case.rng.choice(["eval"] if case.honest else ["train", "eval"]), *KSNN, "--dry-run"))
+    return Command(
+        (case.rng.choice(["eval"] if case.honest else ["train", "eval"]), *KSNN, "--dry-run")
+    )
 
 
 @generator("drives", "steered", weight=20)
@@ -100,7 +222,11 @@ def packaged_file(case):
     case.copy("steered")
     if not case.honest and case.rng.random() < 0.1:
         group = case.rng.choice(["split", "estimator", "training", "tracking"])
-        tree = {"name": "odd", case.rng.choice(["a", *NAMES[:10]]): hostile(case.rng), "defaults": hostile(case.rng)}
+        tree = {
+            "name": "odd",
+            case.rng.choice(["a", *NAMES[:10]]): hostile(case.rng),
+            "defaults": hostile(case.rng),
+        }
         case.write(f"conf/{group}/odd.yaml", yaml_of(tree).encode("utf-8", "replace"))
         return Command(("config", "train", f"{group}=odd"))
     name = case.rng.choice(list(PACKAGED))
@@ -115,8 +241,13 @@ def pipeline(case):
     how = case.idea(8)
     case.copy("study" if how == 0 else "drives")
     if how == 0:
-        word = case.rng.choice([*WRITABLE_NAMES, "$x^{", "\\frac", "$", "_" * 50, "|a|b|", "&lt;", "</script>"])
-        write_yaml(case.place / "pipelines" / "small.yaml", PIPELINE | {case.rng.choice(["title", "about", "study"]): word})
+        word = case.rng.choice(
+            [*WRITABLE_NAMES, "$x^{", "\\frac", "$", "_" * 50, "|a|b|", "&lt;", "</script>"]
+        )
+        write_yaml(
+            case.place / "pipelines" / "small.yaml",
+            PIPELINE | {case.rng.choice(["title", "about", "study"]): word},
+        )
         return Command(("report", "small", "tracking=none"))
     name = "small"
     if how in (1, 2):

@@ -9,9 +9,27 @@ from fuzz.mutations import CALL, spoil_bytes
 
 TIME = np.arange(0, 301) / 50.0
 FORMULA = "X1*1+" + "0" * 66
-CHANNELS = {**ONE, "yaw_rate": {"column": "r", "unit": "rad/s"}, "ay": {"column": "a", "unit": "m/s²"}}
-DECLARED = {"name": "measured", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "mdf"}
-DECLARED |= {"path": "${root}", "files": "*.m*", "rate_hz": 50, "raster": None, "channels": CHANNELS, "gappy": []}
+CHANNELS = {
+    **ONE,
+    "yaw_rate": {"column": "r", "unit": "rad/s"},
+    "ay": {"column": "a", "unit": "m/s²"},
+}
+DECLARED = {
+    "name": "measured",
+    "kind": "real",
+    "vehicle": "car",
+    "licence": "none",
+    "citation": "none",
+    "source": "mdf",
+}
+DECLARED |= {
+    "path": "${root}",
+    "files": "*.m*",
+    "rate_hz": 50,
+    "raster": None,
+    "channels": CHANNELS,
+    "gappy": [],
+}
 DECLARED |= {"file_units": "check", "accept": []}
 PAIRS = {"raw_0": 0, "phys_0": 5.0, "raw_1": 50, "phys_1": 90.0, "interpolation": True}
 RATIONAL = {"P1": 0.0, "P2": 2.0, "P3": 1.0, "P4": 0.0, "P5": 0.0, "P6": 1.0}
@@ -41,7 +59,12 @@ def mdf(folder):
     for name, (version, packed) in VERSIONS.items():
         options = {} if version == "3.30" else {"compression": packed}
         for number, conversion in enumerate(CONVERSIONS):
-            write_mdf(folder / "files" / f"{name}_{number}", {"Only": signals(conversion)}, version, **options)
+            write_mdf(
+                folder / "files" / f"{name}_{number}",
+                {"Only": signals(conversion)},
+                version,
+                **options,
+            )
 
 
 def _overwrite_formula(content, rng):
@@ -54,6 +77,13 @@ def measurement(case):
     case.copy("mdf/conf", "conf")
     how = case.idea(2)
     name = f"{case.rng.choice(list(VERSIONS))}_{4 if how == 0 else case.rng.randrange(4)}"
-    file = case.write(f"raw/drive.{'mdf' if name.startswith('v3') else 'mf4'}", (case.templates / "mdf" / "files" / name).read_bytes())
+    file = case.write(
+        f"raw/drive.{'mdf' if name.startswith('v3') else 'mf4'}",
+        (case.templates / "mdf" / "files" / name).read_bytes(),
+    )
     case.spoil(file, (_overwrite_formula, spoil_bytes)[how])
-    return Command(case.rng.choice([("data", "check", "measured"), ("data", "show", "measured"), ("ingest", "measured")]))
+    return Command(
+        case.rng.choice(
+            [("data", "check", "measured"), ("data", "show", "measured"), ("ingest", "measured")]
+        )
+    )

@@ -27,7 +27,12 @@ def files(case):
     else:
         file.unlink()
         special = file.with_name("special.csv")
-        makers = [lambda: os.mkfifo(special), special.mkdir, lambda: special.symlink_to("/dev/zero"), lambda: special.symlink_to("gone")]
+        makers = [
+            lambda: os.mkfifo(special),
+            special.mkdir,
+            lambda: special.symlink_to("/dev/zero"),
+            lambda: special.symlink_to("gone"),
+        ]
         makers[case.visit // 2 % len(makers)]()
     name = b"./" + name if case.rng.random() < 0.2 else name
     lone = [("estimate", name, "-o", "out.csv"), ("data", "check", name), ("data", "show", name)]

@@ -76,7 +76,10 @@ def much(_):
 
 MISDEEDS = {
     "finishes": ("ok", _finish),
-    "refuses_in_one_line": ("ok", lambda: _leave(3, "warning something else\nerror: 'raw/given.csv' holds nothing\n")),
+    "refuses_in_one_line": (
+        "ok",
+        lambda: _leave(3, "warning something else\nerror: 'raw/given.csv' holds nothing\n"),
+    ),
     "evaluates": ("executed", lambda: eval("1 + 1")),
     "starts_a_program": ("executed", lambda: subprocess.run(["true"], check=True)),
     "imports_a_module": ("executed", _import_a_module),
@@ -88,9 +91,15 @@ MISDEEDS = {
     "allocates": ("memory", lambda: len(bytearray(b"x") * MUCH)),
     "dies": ("crash", lambda: os.kill(os.getpid(), signal.SIGSEGV)),
     "raises": ("traceback", _raise),
-    "calls_itself_a_defect": ("exit1", lambda: _leave(1, "error: this is a defect of vehest (KeyError: 'a')\n")),
+    "calls_itself_a_defect": (
+        "exit1",
+        lambda: _leave(1, "error: this is a defect of vehest (KeyError: 'a')\n"),
+    ),
     "says_nothing": ("silent", lambda: _leave(2)),
-    "says_too_much": ("several lines", lambda: _leave(2, "Usage: vehest\n\nerror: no such command\n")),
+    "says_too_much": (
+        "several lines",
+        lambda: _leave(2, "Usage: vehest\n\nerror: no such command\n"),
+    ),
     "colours_the_terminal": ("escapes", lambda: _leave(3, "error: no column '\x1b[31mvx'\n")),
     "leaves_half_a_file": ("leftovers", _leave_half_a_file),
     "reads_in_a_process": ("ok", lambda: _read_by("answer")),

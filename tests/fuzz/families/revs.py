@@ -8,7 +8,14 @@ from fuzz.mutations import spoil_bytes
 from revs_files import smooth_drive, write_csv, write_vehicle_parameters
 
 NAME = "20140222_01_01_03_250lm"
-TEXT = {"vx": "m/s", "yaw_rate": "rad/s", "ax": "m/s²", "ay": "m/s²", "steer": "rad", "vy_ref": "m/s"}
+TEXT = {
+    "vx": "m/s",
+    "yaw_rate": "rad/s",
+    "ax": "m/s²",
+    "ay": "m/s²",
+    "steer": "rad",
+    "vy_ref": "m/s",
+}
 
 
 @template
@@ -22,8 +29,22 @@ def revs(folder):
     time = 12.5 + np.arange(len(truth["vx"]) // 10) / 100
     for name, samples in {"t": time, **{name: truth[name][::10] for name in TEXT}}.items():
         np.savetxt(files / "lap" / f"{name}.txt", samples, fmt="%.6f")
-    declared = {"name": "text", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "revs", "layout": "text"}
-    declared |= {"path": "${root}/revs", "recordings": ["lap"], "time": {"column": "t", "unit": "s"}, "gappy": [], "clock": "strict"}
+    declared = {
+        "name": "text",
+        "kind": "real",
+        "vehicle": "car",
+        "licence": "none",
+        "citation": "none",
+        "source": "revs",
+        "layout": "text",
+    }
+    declared |= {
+        "path": "${root}/revs",
+        "recordings": ["lap"],
+        "time": {"column": "t", "unit": "s"},
+        "gappy": [],
+        "clock": "strict",
+    }
     channels = {name: {"column": name, "unit": unit} for name, unit in TEXT.items()}
     write_yaml(folder / "conf" / "dataset" / "text.yaml", declared | {"channels": channels})
 

@@ -17,7 +17,12 @@ STATEMENTS = (
     "UPDATE messages SET timestamp = timestamp + 1000000000000000000 WHERE id % 97 = 0",
     "UPDATE messages SET data = zeroblob(100000000) WHERE id = 5",
 )
-LAYOUTS = ("float64[1000000000] a", "MotorStamped again", f"float64 {CALL}", f'string a "\\n{CALL}"')
+LAYOUTS = (
+    "float64[1000000000] a",
+    "MotorStamped again",
+    f"float64 {CALL}",
+    f'string a "\\n{CALL}"',
+)
 TYPES = (*NAMES, "os/msg/system", "a", "a/b", "a/msg/b\nfloat64 x", "std_msgs/msg/Header")
 
 
@@ -28,7 +33,13 @@ def bags(folder):
 
     for storage in ("sqlite3", "mcap"):
         write_bag(folder / storage, drive(2.0), storage, name="lap")
-    declared = configuration(Path("x")) | {"path": "${root}", "licence": "none", "citation": "none", "kind": "real", "accept": []}
+    declared = configuration(Path("x")) | {
+        "path": "${root}",
+        "licence": "none",
+        "citation": "none",
+        "kind": "real",
+        "accept": [],
+    }
     write_yaml(folder / "conf" / "dataset" / "mine.yaml", declared)
 
 
@@ -44,7 +55,9 @@ def _state(database, case):
 def _spoil_layout(content, case):
     """Definitions of messages, which the library turns into Python code."""
     tree = yaml.safe_load(content)
-    tree["messages"][case.rng.choice([*tree["messages"], case.rng.choice(TYPES)])] = case.rng.choice(LAYOUTS)
+    tree["messages"][case.rng.choice([*tree["messages"], case.rng.choice(TYPES)])] = (
+        case.rng.choice(LAYOUTS)
+    )
     return yaml_of(tree).encode("utf-8", "replace")
 
 
@@ -57,13 +70,21 @@ def bag(case):
     if how == 0:
         _state(folder / "lap.db3", case)
     elif how == 1:
-        case.spoil(case.place / "conf/dataset/mine.yaml", lambda content, rng: _spoil_layout(content, case))
+        case.spoil(
+            case.place / "conf/dataset/mine.yaml", lambda content, rng: _spoil_layout(content, case)
+        )
     elif how == 2:
-        case.spoil(folder / "metadata.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng))
+        case.spoil(
+            folder / "metadata.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng)
+        )
     elif how == 3 or (case.honest and case.rng.random() < 0.5):
-        archive = Path(shutil.make_archive(str(case.place / "raw" / "lap"), "zip", case.place / "raw", "lap"))
+        archive = Path(
+            shutil.make_archive(str(case.place / "raw" / "lap"), "zip", case.place / "raw", "lap")
+        )
         shutil.rmtree(folder)
         case.spoil(archive, spoil_bytes)
     else:
         case.spoil(folder / ("lap.mcap" if storage == "mcap" else "lap.db3"), spoil_bytes)
-    return Command(case.rng.choice([("data", "check", "mine"), ("data", "show", "mine"), ("ingest", "mine")]))
+    return Command(
+        case.rng.choice([("data", "check", "mine"), ("data", "show", "mine"), ("ingest", "mine")])
+    )

@@ -18,7 +18,11 @@ CELLS = (
 
 def _reads(case, file):
     """One of the commands that read a table."""
-    words = [("estimate", file, "-o", "out.csv"), ("data", "check", file), ("data", "show", file, "--json")]
+    words = [
+        ("estimate", file, "-o", "out.csv"),
+        ("data", "check", file),
+        ("data", "show", file, "--json"),
+    ]
     return Command(case.rng.choice([*words, ("data", "align", file, "-e", "offsets")]))
 
 
@@ -40,13 +44,19 @@ def parquet(case):
     """Bytes, most of all of the footer, which says how to read the rest; zeros that pack to next to nothing."""
     file = case.place / "lap.parquet"
     if case.idea(4) == 0:
-        block = pa.table({name: np.zeros(100_000) for name in ("time", "vx", "yaw_rate", "ay", "ax")})
+        block = pa.table(
+            {name: np.zeros(100_000) for name in ("time", "vx", "yaw_rate", "ay", "ax")}
+        )
         with pq.ParquetWriter(file, block.schema, compression="zstd") as writer:
             for _ in range(case.rng.choice([40, 400, 3000])):
                 writer.write_table(block)
     else:
         table = pa.Table.from_pandas(lap(9, 20.0), preserve_index=False)
-        pq.write_table(table, file, compression=case.rng.choice(["snappy", "zstd", "gzip", "none", "brotli", "lz4"]))
+        pq.write_table(
+            table,
+            file,
+            compression=case.rng.choice(["snappy", "zstd", "gzip", "none", "brotli", "lz4"]),
+        )
         case.spoil(file, spoil_bytes)
     return _reads(case, "lap.parquet")
 

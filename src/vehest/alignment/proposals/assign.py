@@ -10,8 +10,23 @@ from itertools import combinations
 import numpy as np
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import UNITS, Candidate, candidates, correlation, largest, si_factor, slow_of
-from vehest.alignment.proposals.fitting import CLEAR, REFERENCES, Agreement, fitting_channels, longitudinal, may_be_ax
+from vehest.alignment.proposals.columns import (
+    UNITS,
+    Candidate,
+    candidates,
+    correlation,
+    largest,
+    si_factor,
+    slow_of,
+)
+from vehest.alignment.proposals.fitting import (
+    CLEAR,
+    REFERENCES,
+    Agreement,
+    fitting_channels,
+    longitudinal,
+    may_be_ax,
+)
 from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
@@ -27,17 +42,43 @@ from vehest.alignment.proposals.turning import (
     repeated,
     turning_by_names,
 )
-from vehest.alignment.proposals.wheels import Wheels, find_wheels, speed_of_wheels, turning_left, wheel_proposals, wheels_over_speed
+from vehest.alignment.proposals.wheels import (
+    Wheels,
+    find_wheels,
+    speed_of_wheels,
+    turning_left,
+    wheel_proposals,
+    wheels_over_speed,
+)
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
 STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
-FITTING_SPEED, MISREAD = (0.97, 1.08), (0.9, 1.35)  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
+FITTING_SPEED, MISREAD = (
+    (0.97, 1.08),
+    (0.9, 1.35),
+)  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
 WHEELS_AGREE = 0.02
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
-RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
+RATES = (
+    5.0,
+    10.0,
+    20.0,
+    25.0,
+    40.0,
+    50.0,
+    60.0,
+    100.0,
+    125.0,
+    200.0,
+    250.0,
+    400.0,
+    500.0,
+    1000.0,
+    2000.0,
+)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
 SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
@@ -53,11 +94,24 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "sideslip_ref": (0.002, 0.8),
 }
 UNCONFIRMED = "no other column agrees with it"
-BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
+BY_NAME_ALONE = (
+    "motor_current",
+    "brake_pressure_front",
+    "brake_pressure_rear",
+    "roll",
+    "pitch",
+    "roll_rate",
+    "pitch_rate",
+)
 """Channels that no relation is known of."""
 
 
-def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float | None, *, is_vbo: bool = False) -> Proposals:
+def propose(
+    columns: Sequence[tuple[str, str, FloatArray, str]],
+    rate_hz: float | None,
+    *,
+    is_vbo: bool = False,
+) -> Proposals:
     """Propose channels for the columns of a log.
 
     Args:
@@ -85,7 +139,9 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
         proposals = replace(proposals, pose=find_pose(found, known))
         named = [f"'{one.name}'" for one in named_pose(found)]
         if len(named) == 3 and not proposals.pose:
-            notes.append(f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate")
+            notes.append(
+                f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate"
+            )
         notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
@@ -93,8 +149,12 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
         proposals, more = _speedometer(proposals, search.turning, wheels)
         notes += more
     clues = () if known is None else _clues(found, wheels, known, is_vbo)
-    proposals = _as_most_count(_left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues))
-    proposals = possible(proposals, {column.name: column.values for column in (*found, *wheels.values())})
+    proposals = _as_most_count(
+        _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
+    )
+    proposals = possible(
+        proposals, {column.name: column.values for column in (*found, *wheels.values())}
+    )
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, *_ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -112,27 +172,50 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
             text = f"'{one.column}' is named as {one.channel}, but shows {shown} (possible: {limits.low:.3g} to {limits.high:.3g}"
             notes.append(f"{text} {limits.unit}); it is left out")
         elif share > MOST_BEYOND and not one.asked:
-            kept.append(replace(one, asked=f"{100.0 * share:.2g} % of its samples are beyond what a vehicle can do in {one.unit}"))
+            kept.append(
+                replace(
+                    one,
+                    asked=f"{100.0 * share:.2g} % of its samples are beyond what a vehicle can do in {one.unit}",
+                )
+            )
         else:
             kept.append(one)
     return replace(proposals, channels=tuple(kept), notes=tuple(notes))
 
 
-def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tuple[Proposals, list[str]]:
+def _speedometer(
+    proposals: Proposals, turning: Turning, wheels: Wheels
+) -> tuple[Proposals, list[str]]:
     """The speed asked where ay over the yaw rate and the wheels agree that it misreads; a note where ay alone says so."""
     own = proposals.by_channel.get("vx")
     is_right = FITTING_SPEED[0] <= turning.scale <= FITTING_SPEED[1]
-    if "ay" not in turning.columns or own is None or is_right or not MISREAD[0] < turning.scale < MISREAD[1]:
+    if (
+        "ay" not in turning.columns
+        or own is None
+        or is_right
+        or not MISREAD[0] < turning.scale < MISREAD[1]
+    ):
         return proposals, []
-    by_wheels = wheels_over_speed(wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx"))
+    by_wheels = wheels_over_speed(
+        wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx")
+    )
     if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
-        excess = _excess(turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation))  # by regression either way
+        excess = _excess(
+            turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation)
+        )  # by regression either way
         other = "little" if turning.scale < 1.0 else "much, as in a body that rolls"
-        return proposals, [f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"]
+        return proposals, [
+            f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
+        ]
     scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
-    doubt = own.asked or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
+    doubt = (
+        own.asked
+        or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
+    )
     changed = replace(own, asked=doubt, others=(*own.others, scaled))
-    return replace(proposals, channels=tuple(changed if one is own else one for one in proposals.channels)), []
+    return replace(
+        proposals, channels=tuple(changed if one is own else one for one in proposals.channels)
+    ), []
 
 
 def _excess(*scales: float) -> str:
@@ -140,18 +223,33 @@ def _excess(*scales: float) -> str:
     return f"{size} % too {'much' if scales[0] < 1.0 else 'little'}"
 
 
-def _search(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float) -> Search | None:
+def _search(
+    columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float
+) -> Search | None:
     """The triple that agrees best with a longitudinal acceleration among the best ones; speed and yaw rate by name where there is none."""
     if not turning:
         named = turning_by_names(columns)
-        return None if named is None else _of(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
-    near = [_of(columns, one, rate_hz) for one in turning if one.score > turning[0].score - NEAR_SCORE]
-    return max(near, key=lambda one: one.turning.score + 4.0 * max((by_ax.strength for by_ax in _by_ax(one)), default=0.0))
+        return (
+            None if named is None else _of(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
+        )
+    near = [
+        _of(columns, one, rate_hz) for one in turning if one.score > turning[0].score - NEAR_SCORE
+    ]
+    return max(
+        near,
+        key=lambda one: (
+            one.turning.score + 4.0 * max((by_ax.strength for by_ax in _by_ax(one)), default=0.0)
+        ),
+    )
 
 
 def _of(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Search:
     used = turning.columns.values()
-    return Search(turning, turning.motion(rate_hz), [one for one in columns if one not in used and not one.is_made])
+    return Search(
+        turning,
+        turning.motion(rate_hz),
+        [one for one in columns if one not in used and not one.is_made],
+    )
 
 
 def _by_ax(search: Search, unit: str = "") -> list[Agreement]:
@@ -165,14 +263,18 @@ def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -
     found = [(CLOSE, named)]
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
-        agreeing = [one.mismatch for one in _by_ax(_of(columns, turning, rate_hz)) if one.strength >= CLEAR]
+        agreeing = [
+            one.mismatch for one in _by_ax(_of(columns, turning, rate_hz)) if one.strength >= CLEAR
+        ]
         found += [(mismatch + RARE.get(unit, 0.0), turning) for mismatch in agreeing]
     return min(found, key=lambda one: one[0])[1]
 
 
 def _rate_by_ax(search: Search) -> float | None:
     """The plain rate at which some column, in the unit of ay, is d(vx)/dt; None where none is."""
-    best = max(_by_ax(search, search.turning.units["ay"]), key=lambda one: one.strength, default=None)
+    best = max(
+        _by_ax(search, search.turning.units["ay"]), key=lambda one: one.strength, default=None
+    )
     if best is None or best.strength < CLEAR:
         return None
     exact = search.known.rate_hz * best.scale
@@ -189,7 +291,11 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         for own in (*_turning_proposals(search.turning), *repeated(search)):
             before = found.get(own.channel)
             if before is not None and before.column == own.column:
-                evidence, asked, others = (*before.evidence, *own.evidence), own.asked or before.asked, own.others or before.others
+                evidence, asked, others = (
+                    (*before.evidence, *own.evidence),
+                    own.asked or before.asked,
+                    own.others or before.others,
+                )
                 own = replace(own, evidence=evidence, asked=asked, others=others)
             found[own.channel] = own
         fitting, notes = fitting_channels(search)
@@ -198,13 +304,17 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         free = search.free
     if wheels:
         is_made = any(one.is_made for one in columns)
-        made, radius = wheel_proposals(wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made)
+        made, radius = wheel_proposals(
+            wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made
+        )
         found |= {one.channel: one for one in made}
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
     return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
 
 
-def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, moves: bool) -> list[Proposal]:
+def _named_channels(
+    columns: Sequence[Candidate], held: Collection[str], *, moves: bool
+) -> list[Proposal]:
     """Channels that only names suggest, of columns that are left beside the channels that are held; ``moves``: the motion is known.
 
     Channels of the motion are asked: had they agreed with the others, they would not be left. `BY_NAME_ALONE` are taken where
@@ -214,11 +324,18 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
     has_wheels = any(name.startswith("wheel_speed") for name in held)
     for channel in USUAL:
         least = STRONG if moves else WEAK
-        named = [one for one in columns if one.hints.get(channel, 0.0) >= least and one.measures(channel)]
-        needless = (channel == "steer" and "handwheel" in {*held, *found}) or (channel == "vx" and has_wheels and moves)
+        named = [
+            one for one in columns if one.hints.get(channel, 0.0) >= least and one.measures(channel)
+        ]
+        needless = (channel == "steer" and "handwheel" in {*held, *found}) or (
+            channel == "vx" and has_wheels and moves
+        )
         if not named or channel in held or needless:
             continue
-        best = max(named, key=lambda one: (one.hints[channel], not is_filtered(one.name), not one.is_reference))
+        best = max(
+            named,
+            key=lambda one: (one.hints[channel], not is_filtered(one.name), not one.is_reference),
+        )
         if best.name not in {one.column for one in found.values()}:
             found[channel] = _by_name(best, channel)
     for column in columns:
@@ -226,20 +343,38 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
             is_sure = (column.unit or channel == "motor_current") and column.measures(channel)
             if is_sure and channel in column.hints and channel not in {*held, *found}:
                 evidence = "its name and unit" if column.unit else "its name"
-                found[channel] = Proposal(column.name, channel, column.unit or CHANNELS[channel].unit, 1, (evidence,))
+                found[channel] = Proposal(
+                    column.name, channel, column.unit or CHANNELS[channel].unit, 1, (evidence,)
+                )
     return list(found.values())
 
 
 def _by_name(column: Candidate, channel: str) -> Proposal:
     """With the header's unit, or the first in which the column is of a usual size, or at least of a possible one."""
     if column.unit:
-        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), f"sign: {UNCONFIRMED}", others=UNITS[channel])
+        return Proposal(
+            column.name,
+            channel,
+            column.unit,
+            1,
+            ("its name and unit",),
+            f"sign: {UNCONFIRMED}",
+            others=UNITS[channel],
+        )
     size, (low, high) = largest(column.values), USUAL[channel]
     sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
     fitting = [unit for unit, own in sizes.items() if low <= own <= high]
     fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]
     evidence = f"its name, and {size:.3g} for its 99th percentile"
-    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), f"unit and sign: {UNCONFIRMED}", others=UNITS[channel])
+    return Proposal(
+        column.name,
+        channel,
+        (*fitting, *sizes)[0],
+        1,
+        (evidence,),
+        f"unit and sign: {UNCONFIRMED}",
+        others=UNITS[channel],
+    )
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
@@ -252,40 +387,70 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
             asked = f"ay is {turning.scale:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
     else:
         evidence = "its name and unit" if turning.decided else "its name and size"
-        asked = "" if turning.decided else "unit: no lateral acceleration ties speed and yaw rate together"
+        asked = (
+            ""
+            if turning.decided
+            else "unit: no lateral acceleration ties speed and yaw rate together"
+        )
     for channel, column in turning.columns.items():
         if not column.is_made:
             doubt = "" if column.unit and "ay" in turning.columns and is_close else asked
             if channel == "ay" and not is_evident(column, turning.scale):
-                doubt = doubt or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
+                doubt = (
+                    doubt
+                    or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
+                )
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
             unit = turning.units[channel]
             if column.unit not in ("", unit):
                 doubt = f"by ay over vx·yaw_rate it is in {unit}, by its header in {column.unit}"
             others = (f"{channel} {column.unit}",) if column.unit not in ("", unit) else ()
-            yield Proposal(column.name, channel, unit, turning.signs[channel], (evidence,), doubt, others=others)
+            yield Proposal(
+                column.name,
+                channel,
+                unit,
+                turning.signs[channel],
+                (evidence,),
+                doubt,
+                others=others,
+            )
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:
     """The three of turning asked where no name, unit or other column speaks for them: yaw_rate ≈ steer·vx / wheelbase looks alike."""
-    named = any(one.unit or channel in one.hints for channel, one in turning.columns.items() if channel != "vx")
-    confirmed = any(channel in found and not found[channel].asked for channel in ("ax", *REFERENCES))
+    named = any(
+        one.unit or channel in one.hints
+        for channel, one in turning.columns.items()
+        if channel != "vx"
+    )
+    confirmed = any(
+        channel in found and not found[channel].asked for channel in ("ax", *REFERENCES)
+    )
     if named or confirmed or "ay" not in turning.columns:
         return found
     doubt = "no name and no other column speaks for it: yaw rate and acceleration could be steering and yaw rate"
     three = {one.name for one in turning.columns.values()}
-    return {name: replace(one, asked=one.asked or doubt) if one.column in three else one for name, one in found.items()}
+    return {
+        name: replace(one, asked=one.asked or doubt) if one.column in three else one
+        for name, one in found.items()
+    }
 
 
 def _left_and_right(
-    proposals: Proposals, columns: Sequence[Candidate], known: Motion | None, clues: Iterable[tuple[str, float]]
+    proposals: Proposals,
+    columns: Sequence[Candidate],
+    known: Motion | None,
+    clues: Iterable[tuple[str, float]],
 ) -> Proposals:
     """Signs by the first clue that decides, else by a pose; else those of most columns, the yaw rate's own where they are even."""
     for text, agreeing in clues:
         if abs(agreeing) > DECIDING:
             turned = proposals if agreeing > 0.0 else proposals.mirrored()
-            return replace(turned, left_right=f"{text.format('+1' if agreeing > 0.0 else '-1')} ({abs(agreeing):.2f})")
+            return replace(
+                turned,
+                left_right=f"{text.format('+1' if agreeing > 0.0 else '-1')} ({abs(agreeing):.2f})",
+            )
     if proposals.pose and known is not None:
         _, name, unit = proposals.pose[-1]
         yaw = next(one for one in columns if one.name == name)
@@ -298,7 +463,9 @@ def _sideslip_to_save(columns: Sequence[Candidate], known: Motion) -> Iterator[s
     """Notes of two angles, such as course and heading, whose difference may be a sideslip angle."""
     for one, other in combinations((column for column in columns if "heading" in column.hints), 2):
         apart = one.values - other.values
-        apart = np.angle(np.exp(1j * (np.radians(apart) if np.ptp(one.values) > 2.1 * math.pi else apart)))[known.moving]
+        apart = np.angle(
+            np.exp(1j * (np.radians(apart) if np.ptp(one.values) > 2.1 * math.pi else apart))
+        )[known.moving]
         low, high = np.quantile(apart, [0.02, 0.98]) if len(apart) else (0.0, 0.0)
         if SIDESLIP[0] < high - low < SIDESLIP[1]:
             yield f"'{one.name}' less '{other.name}' may be the sideslip angle that is missing as a reference; save it as a column"
@@ -306,25 +473,52 @@ def _sideslip_to_save(columns: Sequence[Candidate], known: Motion) -> Iterator[s
 
 def _as_most_count(proposals: Proposals) -> Proposals:
     """With channels whose sign nothing but a name suggests counting to the side to which most of the others do."""
-    by_name = [one for one in proposals.channels if one.channel in LATERAL - {"yaw_rate", "ay"} and one.evidence[0].startswith("its name")]
-    others = [one.sign for one in proposals.channels if one.channel in LATERAL and one not in by_name]
-    changed = {one.channel: replace(one, sign=1 if sum(others) >= 0 else -1) for one in by_name} if others else {}
-    return replace(proposals, channels=tuple(changed.get(one.channel, one) for one in proposals.channels))
+    by_name = [
+        one
+        for one in proposals.channels
+        if one.channel in LATERAL - {"yaw_rate", "ay"} and one.evidence[0].startswith("its name")
+    ]
+    others = [
+        one.sign for one in proposals.channels if one.channel in LATERAL and one not in by_name
+    ]
+    changed = (
+        {one.channel: replace(one, sign=1 if sum(others) >= 0 else -1) for one in by_name}
+        if others
+        else {}
+    )
+    return replace(
+        proposals, channels=tuple(changed.get(one.channel, one) for one in proposals.channels)
+    )
 
 
-def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, is_vbo: bool) -> Iterator[tuple[str, float]]:
+def _clues(
+    columns: Sequence[Candidate], wheels: Wheels, known: Motion, is_vbo: bool
+) -> Iterator[tuple[str, float]]:
     """Texts with a place for the sign of the yaw rate, and correlations with the sign by which it counts to the left."""
     yield "right wheels are faster where yaw_rate, sign {}, counts up", turning_left(wheels, known)
     for column in columns:
         if is_vbo and column.name == "heading":
-            yield "'heading', clockwise by its format, runs against yaw_rate, sign {}", -turning_of(column, "deg", known)
-    latitude, longitude = (next((one.slow for one in columns if role in one.hints), None) for role in ("latitude", "longitude"))
+            yield (
+                "'heading', clockwise by its format, runs against yaw_rate, sign {}",
+                -turning_of(column, "deg", known),
+            )
+    latitude, longitude = (
+        next((one.slow for one in columns if role in one.hints), None)
+        for role in ("latitude", "longitude")
+    )
     if latitude is None or longitude is None:
         return
-    east = longitude * (-1.0 if is_vbo else 1.0) * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
+    east = (
+        longitude
+        * (-1.0 if is_vbo else 1.0)
+        * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
+    )
     steps = np.gradient(east), np.gradient(latitude)
     turned = -np.gradient(np.unwrap(np.arctan2(*steps)))
     usual = (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
     if usual.sum() > FEWEST:
         rate = slow_of(known["yaw_rate"], known.rate_hz)
-        yield "the course over latitude and longitude runs against yaw_rate, sign {}", correlation(turned[usual], rate[usual])
+        yield (
+            "the course over latitude and longitude runs against yaw_rate, sign {}",
+            correlation(turned[usual], rate[usual]),
+        )

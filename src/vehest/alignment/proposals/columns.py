@@ -62,7 +62,9 @@ class Candidate:
     @cached_property
     def is_of_bus(self) -> bool:
         """Whether it comes from the car's own bus, by the file or else by its name."""
-        return self.device == "car" or (not self.device and is_of_bus(self.name) and not is_reference(self.name))
+        return self.device == "car" or (
+            not self.device and is_of_bus(self.name) and not is_reference(self.name)
+        )
 
     def hint(self, role: str) -> float:
         """Strength with which the name suggests a role; negative where it suggests others only."""
@@ -85,19 +87,31 @@ def si_factor(unit: str, channel: str) -> float:
     return factor_to_si(unit, CHANNELS[channel].unit)
 
 
-def candidates(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float) -> list[Candidate]:
+def candidates(
+    columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float
+) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
     found = []
     for name, unit, values, device in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)
-        if 1.0 - known.mean() > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
+        if (
+            1.0 - known.mean() > MOST_MISSING
+            or not np.ptp(values[known]) > 0.0
+            or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS
+        ):
             continue
         roles = hints(name, unit)
         only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
-        if "other" in roles or (only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(roles)):
+        if "other" in roles or (
+            only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(roles)
+        ):
             continue
         known[known] = ~_stray(values[known])
-        whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+        whole = (
+            values
+            if known.all()
+            else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+        )
         found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), roles, device=device))
     return found
 

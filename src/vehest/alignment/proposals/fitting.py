@@ -25,7 +25,10 @@ CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
 FITTING = 1.1  # logarithm of the scale of an acceleration over d(vx)/dt, within which pitch, grade and slip explain it
-OF_REFERENCE, BESIDE_BUS = 2.5, 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
+OF_REFERENCE, BESIDE_BUS = (
+    2.5,
+    8.0,
+)  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 HARDLY = "the motion hardly decides it"
@@ -33,8 +36,14 @@ SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
 REFERENCES = ("vy_ref", "sideslip_ref")
 LARGEST = {"steer": 0.8, "handwheel": 16.0}  # rad
 STRAIGHT_AHEAD = 0.1  # rad that a road wheel may show there, of an angle
-LENGTHS = {"steer": (1.2, 7.0), "handwheel": (12.0, 130.0)}  # m, wheelbase, and that times the ratio, of cars
-SHOWN = {"steer": (1.8, 5.0), "handwheel": (25.0, 80.0)}  # m, of cars; others are an error of the estimate
+LENGTHS = {
+    "steer": (1.2, 7.0),
+    "handwheel": (12.0, 130.0),
+}  # m, wheelbase, and that times the ratio, of cars
+SHOWN = {
+    "steer": (1.8, 5.0),
+    "handwheel": (25.0, 80.0),
+}  # m, of cars; others are an error of the estimate
 USUAL_LENGTH = {"steer": 2.7, "handwheel": 43.0}  # m
 SMALL = 0.08  # m, wheelbase of the smallest model
 FASTEST_MODEL = 20.0  # m/s
@@ -78,14 +87,20 @@ class Angle(NamedTuple):
 def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ...]]:
     """The assignment with most evidence in all, and notes of columns that are left out."""
     columns = list(search.free)
-    offers = [[offer(search, one) for one in columns] for offer in (_as_ax, _as_steering, _as_lateral)]
+    offers = [
+        [offer(search, one) for one in columns] for offer in (_as_ax, _as_steering, _as_lateral)
+    ]
     scores = np.array([[offer.score if offer else 0.0 for offer in row] for row in offers])
     pairs = zip(*linear_sum_assignment(scores, maximize=True), strict=True) if columns else ()
-    chosen = {row: offer for row, place in pairs if (offer := offers[row][place]) and offer.score > 0.0}
+    chosen = {
+        row: offer for row, place in pairs if (offer := offers[row][place]) and offer.score > 0.0
+    }
     for offer in chosen.values():
         search.free.remove(offer.column)
     left = [[offer for offer in row if offer and offer.column in search.free] for row in offers]
-    proposals = {offer.proposal.channel: _with_rivals(offer, left[row]) for row, offer in chosen.items()}
+    proposals = {
+        offer.proposal.channel: _with_rivals(offer, left[row]) for row, offer in chosen.items()
+    }
     held = set(REFERENCES) & set(proposals)
     others = [offer for offer in left[2] if held and offer.proposal.channel not in held]
     second = max(others, key=lambda one: one.score, default=None)
@@ -103,7 +118,9 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
         return proposals, ()
     del proposals["sideslip_ref"]
     expected = f"atan2({velocity.name}, {search.turning.columns['vx'].name})"
-    return proposals, (f"'{angle.name}' is not {expected} (correlation {agreeing:.2f}), so no sideslip angle; it is left out",)
+    return proposals, (
+        f"'{angle.name}' is not {expected} (correlation {agreeing:.2f}), so no sideslip angle; it is left out",
+    )
 
 
 def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
@@ -116,10 +133,17 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
         one.column.name
         for one in rivals
         if one.proposal.channel == chosen.proposal.channel
-        and (one.score > chosen.score - NEAR or (one.score > 0.0 and is_named(one) and not is_named(chosen)))
+        and (
+            one.score > chosen.score - NEAR
+            or (one.score > 0.0 and is_named(one) and not is_named(chosen))
+        )
     )
     proposal = chosen.proposal
-    return replace(proposal, asked=f"{', '.join(near)} would do as well", others=near) if near and not proposal.asked else proposal
+    return (
+        replace(proposal, asked=f"{', '.join(near)} would do as well", others=near)
+        if near and not proposal.asked
+        else proposal
+    )
 
 
 def may_be_ax(column: Candidate) -> bool:
@@ -139,7 +163,10 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
     asked = "" if is_clear or (column.hint("ax") == STRONG and column.unit) else HARDLY
     evidence = (best.in_words or "its name alone", *_name_evidence(column, "ax"))
     measured = any(one.is_of_bus and "ax" in one.hints for one in search.free)
-    score = _score(best.strength, CLEAR, column.hint("ax")) - (BESIDE_BUS if measured else OF_REFERENCE) * column.is_reference
+    score = (
+        _score(best.strength, CLEAR, column.hint("ax"))
+        - (BESIDE_BUS if measured else OF_REFERENCE) * column.is_reference
+    )
     return Offer(score, column, Proposal(column.name, "ax", unit, best.sign, evidence, asked))
 
 
@@ -148,7 +175,9 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     hint = max(column.hint("steer"), column.hint("handwheel"))
     if hint < 0.0 or not column.measures("steer"):
         return None
-    best = agreement(search.known, column, "steer", "rad", "steer", offset=float(np.median(column.values)))
+    best = agreement(
+        search.known, column, "steer", "rad", "steer", offset=float(np.median(column.values))
+    )
     score = _score(best.strength, CLEAR, hint)
     if score <= 0.0:
         return None
@@ -161,22 +190,42 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     if "handwheel" in column.hints:
         found = [one for one in found if one.channel == "handwheel"] or found
     if not found and column.hints.get("handwheel") == STRONG and column.unit:
-        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence, asked))
+        return Offer(
+            score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence, asked)
+        )
     if not found:
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
-        unit = next((unit for unit in column.units("steer") if spread * si_factor(unit, "steer") <= CHANNELS["steer"].high), "rad")
+        unit = next(
+            (
+                unit
+                for unit in column.units("steer")
+                if spread * si_factor(unit, "steer") <= CHANNELS["steer"].high
+            ),
+            "rad",
+        )
         offset = straight if abs(straight) > CENTRED * spread else 0.0
         asked = "no angle of the road wheels or of a steering wheel by its range and slow corners; its scale is to be given"
-        return Offer(score, column, Proposal(column.name, "steer", unit, sign, evidence, asked, offset=offset))
+        return Offer(
+            score,
+            column,
+            Proposal(column.name, "steer", unit, sign, evidence, asked, offset=offset),
+        )
     _, channel, unit, length, reach = min(found)
     others = sorted({(one.channel, one.unit) for one in found} - {(channel, unit)})
     if others:
         asked = f"could be {' or '.join(f'{other} in {of_other}' for other, of_other in others)} as well"
     text = f"up to {math.degrees(reach):.3g}°"
-    if SHOWN[channel][0] <= length <= SHOWN[channel][1] or float(np.quantile(search.known.vx, 0.99)) < FASTEST_MODEL:
+    if (
+        SHOWN[channel][0] <= length <= SHOWN[channel][1]
+        or float(np.quantile(search.known.vx, 0.99)) < FASTEST_MODEL
+    ):
         text += f", and {'a wheelbase' if channel == 'steer' else 'wheelbase times ratio'} of {length:.3g} m by slow corners"
     alternatives = tuple(" ".join(other) for other in others)
-    return Offer(score, column, Proposal(column.name, channel, unit, sign, (*evidence, text), asked, others=alternatives))
+    return Offer(
+        score,
+        column,
+        Proposal(column.name, channel, unit, sign, (*evidence, text), asked, others=alternatives),
+    )
 
 
 def _as_lateral(search: Search, column: Candidate) -> Offer | None:
@@ -185,25 +234,48 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     found = [
         agreement(known, column, channel, unit, f"d({channel})/dt")
         for channel in REFERENCES
-        if column.measures(channel) and (column.hints.get(channel) == STRONG or not is_named_otherwise)
+        if column.measures(channel)
+        and (column.hints.get(channel) == STRONG or not is_named_otherwise)
         for unit in column.units(channel)
     ]
-    found = sorted((one for one in found if _is_plausible(known, column, one)), key=lambda one: 0.3 * one.mismatch - 2.0 * one.strength)
+    found = sorted(
+        (one for one in found if _is_plausible(known, column, one)),
+        key=lambda one: 0.3 * one.mismatch - 2.0 * one.strength,
+    )
     if not found:
         return None
     hints = {channel: column.hints.get(channel, 0.0) for channel in REFERENCES}
-    best = max(found, key=lambda one: 4.0 * one.strength - 0.6 * min(one.mismatch, 5.0) + hints[one.channel])
+    best = max(
+        found,
+        key=lambda one: 4.0 * one.strength - 0.6 * min(one.mismatch, 5.0) + hints[one.channel],
+    )
     hint = hints[best.channel]
-    rivals = [one for one in found if one.channel != best.channel and one.strength > best.strength - 0.05 and not hint]
+    rivals = [
+        one
+        for one in found
+        if one.channel != best.channel and one.strength > best.strength - 0.05 and not hint
+    ]
     is_clear = best.strength >= CLEAR_LATERAL or (best.strength >= LEAST and hint > 0.0)
-    asked = f"could be {rivals[0].channel} in {rivals[0].unit} as well" if rivals else "" if is_clear else HARDLY
+    asked = (
+        f"could be {rivals[0].channel} in {rivals[0].unit} as well"
+        if rivals
+        else ""
+        if is_clear
+        else HARDLY
+    )
     if not rivals and not is_clear and hint == STRONG:
         asked = f"sign: {HARDLY}" if column.unit else f"sign and unit: {HARDLY}"
     if not asked and column.hint(best.channel) < 0.0:
         asked = "the motion contradicts its name"
     evidence = (best.in_words or "its name alone", *_name_evidence(column, *REFERENCES))
-    others = tuple(dict.fromkeys(f"{one.channel} {one.unit}" for one in found if one is not best)) if asked else ()
-    proposal = Proposal(column.name, best.channel, best.unit, best.sign, evidence, asked, others=others)
+    others = (
+        tuple(dict.fromkeys(f"{one.channel} {one.unit}" for one in found if one is not best))
+        if asked
+        else ()
+    )
+    proposal = Proposal(
+        column.name, best.channel, best.unit, best.sign, evidence, asked, others=others
+    )
     return Offer(_score(best.strength, LEAST, hint), column, proposal)
 
 
@@ -214,11 +286,18 @@ def _score(strength: float, least: float, hint: float) -> float:
 def _is_plausible(known: Motion, column: Candidate, one: Agreement) -> bool:
     """Whether a car can slide like that, within a factor of what is rare."""
     size = float(np.quantile(np.abs(column.values), 0.9)) * si_factor(one.unit, one.channel)
-    return size < 1.5 * float(np.quantile(known.vx, 0.9)) if one.channel == "vy_ref" else 5e-4 < size < 1.6
+    return (
+        size < 1.5 * float(np.quantile(known.vx, 0.9))
+        if one.channel == "vy_ref"
+        else 5e-4 < size < 1.6
+    )
 
 
 def _name_evidence(column: Candidate, *wanted: str) -> Sequence[str]:
-    parts = [*(["name"] if any(role in column.hints for role in wanted) else []), *(["unit"] if column.unit else [])]
+    parts = [
+        *(["name"] if any(role in column.hints for role in wanted) else []),
+        *(["unit"] if column.unit else []),
+    ]
     return [f"its {' and '.join(parts)}"] if parts else []
 
 
@@ -228,17 +307,28 @@ def longitudinal(known: Motion, column: Candidate, units: Sequence[str] = ()) ->
     return min(found, key=lambda one: one.mismatch)
 
 
-def agreement(known: Motion, column: Candidate, channel: str, unit: str, left: str, *, offset: float = 0.0) -> Agreement:
+def agreement(
+    known: Motion, column: Candidate, channel: str, unit: str, left: str, *, offset: float = 0.0
+) -> Agreement:
     """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
     samples = (column.values - offset) * si_factor(unit, channel)
     velocity = channel if channel in REFERENCES else ""
     with np.errstate(all="ignore"):
-        relations = relations_of(replace(known, channels={**known.channels, channel: samples}, velocity=velocity))
+        relations = relations_of(
+            replace(known, channels={**known.channels, channel: samples}, velocity=velocity)
+        )
     for one in relations:
         if one.left == left:
             scale = f", {abs(one.scale):.3g} times as large" if math.isfinite(one.tolerance) else ""
             text = f"{one.text} agree {one.correlation:.2f}{scale}"
-            return Agreement(channel, unit, abs(one.correlation), -1 if one.correlation < 0.0 else 1, abs(one.scale), text)
+            return Agreement(
+                channel,
+                unit,
+                abs(one.correlation),
+                -1 if one.correlation < 0.0 else 1,
+                abs(one.scale),
+                text,
+            )
     return Agreement(channel, unit)
 
 
@@ -257,7 +347,15 @@ def angles(known: Motion, column: Candidate) -> list[Angle]:
             shortest = SMALL if is_model and channel == "steer" else low
             straight = channel == "handwheel" or abs(offset) * factor < STRAIGHT_AHEAD
             if shortest <= length <= high and reach * factor <= LARGEST[channel] and straight:
-                found.append(Angle(abs(math.log(length / USUAL_LENGTH[channel])), channel, unit, length, reach * factor))
+                found.append(
+                    Angle(
+                        abs(math.log(length / USUAL_LENGTH[channel])),
+                        channel,
+                        unit,
+                        length,
+                        reach * factor,
+                    )
+                )
     return found
 
 
@@ -265,8 +363,16 @@ def _driven(known: Motion) -> BoolArray:
     return known.moving & (known.vx > 0.2 * float(np.quantile(known.vx, 0.99)))
 
 
-def _regressed(known: Motion, column: Candidate, used: BoolArray, *more: FloatArray) -> tuple[float, float]:
+def _regressed(
+    known: Motion, column: Candidate, used: BoolArray, *more: FloatArray
+) -> tuple[float, float]:
     """Change of a column by yaw_rate/vx [its unit · m], and its value straight ahead; further regressors are fitted beside them."""
-    rows = [known["yaw_rate"][used] / known.vx[used], *(samples[used] for samples in more), np.ones(int(used.sum()))]
-    slope, *_, offset = np.linalg.lstsq(np.stack(rows, axis=1), column.values[used], rcond=None)[0].tolist()
+    rows = [
+        known["yaw_rate"][used] / known.vx[used],
+        *(samples[used] for samples in more),
+        np.ones(int(used.sum())),
+    ]
+    slope, *_, offset = np.linalg.lstsq(np.stack(rows, axis=1), column.values[used], rcond=None)[
+        0
+    ].tolist()
     return slope, offset

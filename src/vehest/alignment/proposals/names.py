@@ -51,8 +51,12 @@ _REFERENCE = re.compile(
     r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys|"
     r"from (yaw|pose|positions?)\b"
 )
-_BUS = re.compile(r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d")
-_STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
+_BUS = re.compile(
+    r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d"
+)
+_STEERING_RATE = re.compile(
+    r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta"
+)
 _FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
 _UNTELLING = re.compile(r"\b(body|frame|chassis)\b")
 _CORNERS = {
@@ -65,7 +69,9 @@ _NO_SPEED_OF_A_WHEEL = re.compile(
     r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|winkel|disp|damp|tyre|tire"
 )
 _AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
-_WHEEL_SPEED = re.compile(r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel")
+_WHEEL_SPEED = re.compile(
+    r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel"
+)
 _EXPLAINED = {
     "yaw_rate": ("heading", "vx", "vy_ref", "position_x", "position_y"),
     "handwheel": ("steer",),
@@ -79,10 +85,33 @@ _EXPLAINED = {
     "heading": ("yaw_rate",),
 }
 """Role -> roles that a part of its names suggests: the yaw in a yaw rate is no heading."""
-_QUANTITIES = {**dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"), **dict.fromkeys(("m/s²", "g"), "acc")}
+_QUANTITIES = {
+    **dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"),
+    **dict.fromkeys(("m/s²", "g"), "acc"),
+}
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2)$")
-_PLAIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ψ": "psi", "β": "beta", "δ": "delta"})
-_PAIRS = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
+_PLAIN = str.maketrans(
+    {
+        "ä": "ae",
+        "ö": "oe",
+        "ü": "ue",
+        "Ä": "Ae",
+        "Ö": "Oe",
+        "Ü": "Ue",
+        "ß": "ss",
+        "ψ": "psi",
+        "β": "beta",
+        "δ": "delta",
+    }
+)
+_PAIRS = (
+    ("x", "y"),
+    ("u", "v"),
+    ("long", "lat"),
+    ("lng", "lat"),
+    ("lon", "lat"),
+    ("laengs", "quer"),
+)
 
 
 def bare(name: str) -> str:
@@ -98,7 +127,9 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
     alone = _WITHOUT_UNIT.sub("", words).replace(" ", "")
-    texts = "\n".join([compact, *([alone, alone + _QUANTITIES[unit]] if unit in _QUANTITIES else [])])
+    texts = "\n".join(
+        [compact, *([alone, alone + _QUANTITIES[unit]] if unit in _QUANTITIES else [])]
+    )
     corner = _corner(words)
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
@@ -108,15 +139,39 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     found = {
         role: WEAK
         for role, pattern in _WEAK.items()
-        if re.search(pattern, texts, re.MULTILINE) or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
+        if re.search(pattern, texts, re.MULTILINE)
+        or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
     }
-    found |= {role: STRONG for role, own in _STRONG.items() if re.search(own, texts, re.MULTILINE) or role in words.split()}
+    found |= {
+        role: STRONG
+        for role, own in _STRONG.items()
+        if re.search(own, texts, re.MULTILINE) or role in words.split()
+    }
     strong = {role for role, strength in found.items() if strength == STRONG}
-    is_other = "other" in strong and not strong & {"yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref", "handwheel"}
+    is_other = "other" in strong and not strong & {
+        "yaw_rate",
+        "ay",
+        "ax",
+        "sideslip_ref",
+        "vy_ref",
+        "handwheel",
+    }
     if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):
         return {"other": STRONG}
-    parts = {part for role in strong for part in _EXPLAINED.get(role, ()) if role != "vx" or part not in strong}
-    parts |= {"other", *(("heading", "latitude", "longitude", "position_x", "position_y") if unit in _QUANTITIES else ())}
+    parts = {
+        part
+        for role in strong
+        for part in _EXPLAINED.get(role, ())
+        if role != "vx" or part not in strong
+    }
+    parts |= {
+        "other",
+        *(
+            ("heading", "latitude", "longitude", "position_x", "position_y")
+            if unit in _QUANTITIES
+            else ()
+        ),
+    }
     return {role: strength for role, strength in found.items() if role not in parts}
 
 
@@ -135,12 +190,17 @@ def _corner(words: str) -> str:
 def is_pair(longitudinal: str, lateral: str) -> bool:
     """Whether two names differ by x and y, u and v, or long and lat alone."""
     ahead, aside = bare(longitudinal), bare(lateral)
-    return ahead != aside and any(re.sub(rf"{one}(?![a-z]*{one})", other, ahead) == aside for one, other in _PAIRS)
+    return ahead != aside and any(
+        re.sub(rf"{one}(?![a-z]*{one})", other, ahead) == aside for one, other in _PAIRS
+    )
 
 
 def is_reference(name: str) -> bool:
     """Whether a name suggests a reference sensor."""
-    return bool(_REFERENCE.search(bare(name)) or re.search(r"gps|gnss|mocap|vicon", bare(name).replace(" ", "")))
+    return bool(
+        _REFERENCE.search(bare(name))
+        or re.search(r"gps|gnss|mocap|vicon", bare(name).replace(" ", ""))
+    )
 
 
 def is_of_bus(name: str) -> bool:

@@ -27,18 +27,29 @@ def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
     return found
 
 
-def find_pose(columns: Sequence[Candidate], known: Motion | None) -> tuple[tuple[str, str, str], ...]:
+def find_pose(
+    columns: Sequence[Candidate], known: Motion | None
+) -> tuple[tuple[str, str, str], ...]:
     """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty where there is none, or no motion."""
     pose = named_pose(columns)
-    if known is None or len(pose) < len(PARTS) or pose[0].unit not in ("", *LENGTHS) or not pose[2].measures("sideslip_ref"):
+    if (
+        known is None
+        or len(pose) < len(PARTS)
+        or pose[0].unit not in ("", *LENGTHS)
+        or not pose[2].measures("sideslip_ref")
+    ):
         return ()
     x, y, yaw = pose
     driven = np.abs(slow_of(known.vx, known.rate_hz))
     for unit in [x.unit] if x.unit else LENGTHS:
         scale = factor_to_si(unit, "m") * known.rate_hz
-        speed = np.hypot(*(slow_of(np.gradient(one.values) * scale, known.rate_hz) for one in (x, y)))
+        speed = np.hypot(
+            *(slow_of(np.gradient(one.values) * scale, known.rate_hz) for one in (x, y))
+        )
         if 1.0 / SCALE < rms(speed) / rms(driven) < SCALE and correlation(speed, driven) > AGREEING:
-            unit_of_yaw = yaw.unit or ("rad" if float(np.abs(yaw.values).max()) < LARGEST_RADIANS else "deg")
+            unit_of_yaw = yaw.unit or (
+                "rad" if float(np.abs(yaw.values).max()) < LARGEST_RADIANS else "deg"
+            )
             if abs(turning_of(yaw, unit_of_yaw, known)) > AGREEING:
                 return (("x", x.name, unit), ("y", y.name, unit), ("yaw", yaw.name, unit_of_yaw))
     return ()

@@ -12,7 +12,19 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.units import factor_to_si
 
-LATERAL = frozenset({"yaw_rate", "ay", "steer", "handwheel", "vy_ref", "sideslip_ref", "yaw_rate_ref", "roll", "roll_rate"})
+LATERAL = frozenset(
+    {
+        "yaw_rate",
+        "ay",
+        "steer",
+        "handwheel",
+        "vy_ref",
+        "sideslip_ref",
+        "yaw_rate_ref",
+        "roll",
+        "roll_rate",
+    }
+)
 """Channels whose sign depends on which way is left."""
 
 
@@ -43,7 +55,9 @@ class Proposal:
     def beyond(self, values: FloatArray) -> NDArray[np.bool_]:
         """Which values of the column no vehicle can have, (T,)."""
         channel = CHANNELS[self.channel]
-        samples = self.sign * self.factor * factor_to_si(self.unit, channel.unit) * (values - self.offset)
+        samples = (
+            self.sign * self.factor * factor_to_si(self.unit, channel.unit) * (values - self.offset)
+        )
         return np.asarray((samples < channel.low) | (samples > channel.high))
 
     def with_evidence(self, *more: str) -> Proposal:
@@ -57,10 +71,16 @@ class Proposals:
 
     channels: tuple[Proposal, ...]
     left_right: str = ""  # evidence of which way is left; empty where a log has none, and signs hold against each other only
-    wheel_radius: float | None = None  # rolling radius by which the wheels make the speed [m]; None where the speed has a column
-    rate_hz: float | None = None  # of a log without times, as far as accelerations decide it [Hz]; None where it has times
+    wheel_radius: float | None = (
+        None  # rolling radius by which the wheels make the speed [m]; None where the speed has a column
+    )
+    rate_hz: float | None = (
+        None  # of a log without times, as far as accelerations decide it [Hz]; None where it has times
+    )
     unused: tuple[str, ...] = ()  # columns that belong to no channel
-    pose: tuple[tuple[str, str, str], ...] = ()  # part (``x``, ``y``, ``yaw``), column and unit, of which a reference can be made
+    pose: tuple[
+        tuple[str, str, str], ...
+    ] = ()  # part (``x``, ``y``, ``yaw``), column and unit, of which a reference can be made
     notes: tuple[str, ...] = ()  # further remarks
 
     @property
@@ -70,10 +90,18 @@ class Proposals:
 
     def keeping(self, channels: Sequence[Proposal], notes: Sequence[str] = ()) -> Proposals:
         """The same with these of its channels and further remarks; a radius stays only beside a wheel's speed."""
-        radius = self.wheel_radius if any(one.channel.startswith("wheel_speed") for one in channels) else None
-        return replace(self, channels=tuple(channels), wheel_radius=radius, notes=(*self.notes, *notes))
+        radius = (
+            self.wheel_radius
+            if any(one.channel.startswith("wheel_speed") for one in channels)
+            else None
+        )
+        return replace(
+            self, channels=tuple(channels), wheel_radius=radius, notes=(*self.notes, *notes)
+        )
 
     def mirrored(self) -> Proposals:
         """The same for a car seen in a mirror, which reverses the signs of `LATERAL` channels."""
-        turned = (replace(one, sign=-one.sign) if one.channel in LATERAL else one for one in self.channels)
+        turned = (
+            replace(one, sign=-one.sign) if one.channel in LATERAL else one for one in self.channels
+        )
         return replace(self, channels=tuple(turned))

@@ -21,7 +21,11 @@ RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mis
 CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
 EVIDENT = 0.1  # likewise: within, the scale alone indicates an acceleration
 APART = 0.2  # by which the next best units must be worse
-RANGES = {"vx": (0.5, 110.0), "yaw_rate": (0.02, 8.0), "ay": (0.3, 60.0)}  # of the 99th percentile, SI
+RANGES = {
+    "vx": (0.5, 110.0),
+    "yaw_rate": (0.02, 8.0),
+    "ay": (0.3, 60.0),
+}  # of the 99th percentile, SI
 MOST_COLUMNS = 60
 MOST_KEPT = 8
 LEAST_SCORE = 6.0
@@ -41,7 +45,9 @@ LIKELY = 2  # units to try; a speed that seems to be in others may be in counts
 class Turning:
     """Columns that may be speed, yaw rate and lateral acceleration."""
 
-    columns: Mapping[str, Candidate]  # by channel; without ``ay`` where only names suggest the other two
+    columns: Mapping[
+        str, Candidate
+    ]  # by channel; without ``ay`` where only names suggest the other two
     units: Mapping[str, str]  # by channel
     decided: bool  # whether no other units explain the scale as well
     correlation: float = 0.0  # of ay with vx·yaw_rate, with its sign
@@ -57,7 +63,10 @@ class Turning:
     def motion(self, rate_hz: float) -> Motion:
         """The motion by these columns."""
         signs = self.signs
-        channels = {name: column.values * signs[name] * si_factor(self.units[name], name) for name, column in self.columns.items()}
+        channels = {
+            name: column.values * signs[name] * si_factor(self.units[name], name)
+            for name, column in self.columns.items()
+        }
         moving = np.abs(channels["vx"]) > STANDING * largest(channels["vx"])
         return Motion(rate_hz, channels, "vx", "", moving)
 
@@ -68,7 +77,9 @@ class Search:
 
     turning: Turning  # speed, yaw rate and lateral acceleration
     known: Motion  # by these, ay = +vx·yaw_rate
-    free: list[Candidate]  # columns without a channel that repeat none; those that get one are removed
+    free: list[
+        Candidate
+    ]  # columns without a channel that repeat none; those that get one are removed
 
 
 def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
@@ -81,12 +92,22 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
     for speed in speeds:
         turning, scales = _centred(np.stack([one.slow for one in rates]) * speed.slow)
         with np.errstate(all="ignore"):
-            agreeing = np.nan_to_num((turning @ shown.T) / shown.shape[1] / np.outer(scales, sizes), posinf=0.0, neginf=0.0)
+            agreeing = np.nan_to_num(
+                (turning @ shown.T) / shown.shape[1] / np.outer(scales, sizes),
+                posinf=0.0,
+                neginf=0.0,
+            )
         for i, j in zip(*np.nonzero(np.abs(agreeing) >= LEAST_CORRELATION), strict=True):
             if len({id(one) for one in (speed, rates[i], accelerations[j])}) == 3:
                 named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
-                found.append(_scored(columns, named, float(agreeing[i, j]), float(sizes[j] / scales[i])))
-    return [one for one in sorted(found, key=lambda one: -one.score)[:MOST_KEPT] if one.score >= LEAST_SCORE]
+                found.append(
+                    _scored(columns, named, float(agreeing[i, j]), float(sizes[j] / scales[i]))
+                )
+    return [
+        one
+        for one in sorted(found, key=lambda one: -one.score)[:MOST_KEPT]
+        if one.score >= LEAST_SCORE
+    ]
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
@@ -97,9 +118,14 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         if not pool:
             return None
         ahead = [one for one in pool if channel == "vx" and _is_forward(one.slow)]
-        named[channel] = column = max(ahead or pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
+        named[channel] = column = max(
+            ahead or pool,
+            key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)),
+        )
         offered = column.units(channel)
-        units[channel] = next((unit for unit in offered if _is_plausible(column, channel, unit)), offered[0])
+        units[channel] = next(
+            (unit for unit in offered if _is_plausible(column, channel, unit)), offered[0]
+        )
     is_one = named["vx"] is named["yaw_rate"]
     return None if is_one else Turning(named, units, all(one.unit for one in named.values()))
 
@@ -112,9 +138,19 @@ def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     """Columns that could be a channel, those whose names suggest it first."""
-    own = [one for one in columns if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)]
-    own = [one for one in own if one.measures(channel) and (channel != "vx" or "vx" in one.hints or _is_forward(one.slow))]
-    return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
+    own = [
+        one
+        for one in columns
+        if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)
+    ]
+    own = [
+        one
+        for one in own
+        if one.measures(channel) and (channel != "vx" or "vx" in one.hints or _is_forward(one.slow))
+    ]
+    return sorted(
+        own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS))
+    )[:MOST_COLUMNS]
 
 
 def _is_forward(slow: FloatArray) -> bool:
@@ -133,18 +169,40 @@ def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
     return low <= column.size * si_factor(unit, channel) <= high
 
 
-def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float) -> Turning:
+def _scored(
+    columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float
+) -> Turning:
     """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, others than by the header only where these
     are far from it, and the score of all evidence."""
     ranked = []
-    tried = [{*column.units(channel), *(() if column.is_made else UNITS[channel])} for channel, column in named.items()]
+    tried = [
+        {*column.units(channel), *(() if column.is_made else UNITS[channel])}
+        for channel, column in named.items()
+    ]
     for units in product(*tried):
-        speed, rate, acceleration = (si_factor(unit, channel) for unit, channel in zip(units, named, strict=True))
+        speed, rate, acceleration = (
+            si_factor(unit, channel) for unit, channel in zip(units, named, strict=True)
+        )
         left = scale / (speed * rate / acceleration)
-        implausible = sum(not _is_plausible(column, channel, unit) for (channel, column), unit in zip(named.items(), units, strict=True))
+        implausible = sum(
+            not _is_plausible(column, channel, unit)
+            for (channel, column), unit in zip(named.items(), units, strict=True)
+        )
         rare = 0.0 if named["vx"].unit == units[0] else RARE.get(units[0], 0.0)
-        against = sum(column.unit not in ("", unit) for column, unit in zip(named.values(), units, strict=True))
-        ranked.append((abs(math.log(left)) + rare + implausible + against, abs(math.log(left)), units, left, implausible, against))
+        against = sum(
+            column.unit not in ("", unit)
+            for column, unit in zip(named.values(), units, strict=True)
+        )
+        ranked.append(
+            (
+                abs(math.log(left)) + rare + implausible + against,
+                abs(math.log(left)),
+                units,
+                left,
+                implausible,
+                against,
+            )
+        )
     ranked.sort()
     cost, mismatch, units, left, implausible, against = ranked[0]
     decided = mismatch < FAR and (len(ranked) == 1 or ranked[1][0] - cost > APART)
@@ -152,8 +210,14 @@ def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreei
     for channel, one in named.items():
         score += one.hint(channel) + (1.5 if one.unit else 0.0) - 0.5 * is_filtered(one.name)
         if channel not in one.hints:
-            score -= UNNAMED * max((other.hints.get(channel, 0.0) for other in columns), default=0.0) / STRONG
-    score -= (3.0 if any(one.is_of_bus and "ay" in one.hints for one in columns) else 0.5) * named["ay"].is_reference + 5.0 * implausible
+            score -= (
+                UNNAMED
+                * max((other.hints.get(channel, 0.0) for other in columns), default=0.0)
+                / STRONG
+            )
+    score -= (3.0 if any(one.is_of_bus and "ay" in one.hints for one in columns) else 0.5) * named[
+        "ay"
+    ].is_reference + 5.0 * implausible
     level = np.abs(named["vx"].slow)
     if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
         score -= 2.0
@@ -173,15 +237,26 @@ class Repeat(NamedTuple):
 def repeated(search: Search) -> Iterator[Proposal]:
     """Proposals for speeds, yaw rates and lateral accelerations that are measured twice, those of the motion among them."""
     for channel in SAME_NAMED:
-        first = Repeat(search.turning.columns[channel], search.turning.units[channel], search.turning.signs[channel])
+        first = Repeat(
+            search.turning.columns[channel],
+            search.turning.units[channel],
+            search.turning.signs[channel],
+        )
         same, scaled = [], []
         for column in search.free:
             agreeing = correlation(column.slow, first.column.slow)
             unit = _unit(column, first, channel, agreeing)
             if unit:
                 same.append(Repeat(column, unit, -first.sign if agreeing < 0.0 else first.sign))
-            elif channel == "vx" and column.hints.get("vx") == STRONG and not column.unit and abs(agreeing) > SAME_NAMED["vx"]:
-                scaled.append(column)  # named as a speed, and one but for its scale, as a motor's speed is
+            elif (
+                channel == "vx"
+                and column.hints.get("vx") == STRONG
+                and not column.unit
+                and abs(agreeing) > SAME_NAMED["vx"]
+            ):
+                scaled.append(
+                    column
+                )  # named as a speed, and one but for its scale, as a motor's speed is
         for one in same:
             search.free.remove(one.column)
         family = [*(() if first.column.is_made else (first,)), *same]
@@ -192,10 +267,16 @@ def repeated(search: Search) -> Iterator[Proposal]:
             yield from _scaled_speed(scaled[0], first, search.turning.decided)
     ay = search.turning.columns.get("ay")
     for column in list(search.free):
-        if ay is not None and abs(correlation(column.slow, ay.slow)) > SAME_AY and column.hint("ay") >= 0.0:
+        if (
+            ay is not None
+            and abs(correlation(column.slow, ay.slow)) > SAME_AY
+            and column.hint("ay") >= 0.0
+        ):
             search.free.remove(column)
             text = f"'{column.name}' agrees {abs(correlation(column.slow, ay.slow)):.3f}, as of another place or filtered"
-            yield Proposal(ay.name, "ay", search.turning.units["ay"], search.turning.signs["ay"], (text,))
+            yield Proposal(
+                ay.name, "ay", search.turning.units["ay"], search.turning.signs["ay"], (text,)
+            )
 
 
 def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
@@ -219,7 +300,10 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
     if abs(agreeing) < least or column.hint(channel) < 0.0 or not column.measures(channel):
         return ""
     size = rms(first.column.slow) * si_factor(first.unit, channel)
-    ranked = [(abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit) for unit in column.units(channel)[:LIKELY]]
+    ranked = [
+        (abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit)
+        for unit in column.units(channel)[:LIKELY]
+    ]
     return min(ranked)[1] if min(ranked)[0] < SAME_SCALE else ""
 
 
@@ -233,7 +317,9 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
     evidence = f"follows '{name}' ({correlation(column.slow, first.column.slow):.2f}), no unit of speed explains its scale"
     asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{name}' is then the reference's"
     sign = -1 if factor < 0.0 else 1
-    yield Proposal(column.name, "vx", "m/s", sign, (evidence,), asked, factor=float(f"{abs(factor):.5g}"))
+    yield Proposal(
+        column.name, "vx", "m/s", sign, (evidence,), asked, factor=float(f"{abs(factor):.5g}")
+    )
     asked = f"the reference's speed, or the car's own ('{column.name}' in counts)"
     yield Proposal(name, "vx_ref", first.unit, first.sign, (f"'{column.name}' follows it",), asked)
 
@@ -241,27 +327,52 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     """The car's own and the reference's of columns that measure the same; more than these two are left out."""
     plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
-    own = [one for one in plain if one.column.is_of_bus] or [one for one in plain if not one.column.is_reference]
+    own = [one for one in plain if one.column.is_of_bus] or [
+        one for one in plain if not one.column.is_reference
+    ]
     own = own or [one for one in family if not one.column.is_reference]  # filtered, but the car's
-    references = [one for one in plain if one.column.is_reference] or [one for one in plain if one not in own]
+    references = [one for one in plain if one.column.is_reference] or [
+        one for one in plain if one not in own
+    ]
     text = f"agrees {min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain):.2f} with the other {channel}"
 
-    def proposal(one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()) -> Proposal:
-        return Proposal(one.column.name, name, one.unit, one.sign, (text, *more), asked, others=others)
+    def proposal(
+        one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()
+    ) -> Proposal:
+        return Proposal(
+            one.column.name, name, one.unit, one.sign, (text, *more), asked, others=others
+        )
 
     reference = f"{channel}_ref"
     if own and references:
         own.sort(key=lambda one: -max(one.column.hints.values(), default=0.0))
         asked = f"{len(own)} columns could be the car's own {channel}" if len(own) > 1 else ""
-        first = proposal(own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:]))
+        first = proposal(
+            own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:])
+        )
         other = references[0].column
-        why = "named as a reference" if other.is_reference else "the other one is of the car's own bus"
-        asked = "" if other.is_reference or channel in other.hints else f"whether it is the reference's {channel}: no name says so"
+        why = (
+            "named as a reference"
+            if other.is_reference
+            else "the other one is of the car's own bus"
+        )
+        asked = (
+            ""
+            if other.is_reference or channel in other.hints
+            else f"whether it is the reference's {channel}: no name says so"
+        )
         return [first, proposal(references[0], reference, why, asked=asked)]
     if len(plain) < 2:
-        return [Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",)) for one in plain]
+        return [
+            Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",))
+            for one in plain
+        ]
     asked = f"which is the car's own {channel}, and which the reference's: no name decides"
-    roughness = {id(one): float(np.std(np.diff(one.column.values, 2))) / max(float(np.std(one.column.values)), 1e-12) for one in plain}
+    roughness = {
+        id(one): float(np.std(np.diff(one.column.values, 2)))
+        / max(float(np.std(one.column.values)), 1e-12)
+        for one in plain
+    }
     rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]
     return [
         proposal(rough, channel, "the rougher of the two", asked=asked, others=(reference,)),

@@ -24,7 +24,10 @@ SLOWEST = 1.0
 AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
 APART = 0.25
-SAME = (0.98, 1.08)  # a speedometer over the wheels' speed at the rim: none reads too little, many too much
+SAME = (
+    0.98,
+    1.08,
+)  # a speedometer over the wheels' speed at the rim: none reads too little, many too much
 
 Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 
@@ -42,18 +45,26 @@ def find_wheels(columns: Sequence[Candidate]) -> Wheels:
 def turning_left(wheels: Wheels, known: Motion) -> float:
     """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is missing."""
     rate = slow_of(known["yaw_rate"], known.rate_hz)
-    axles = [(wheels[left].slow, wheels[right].slow) for left, right in (("fl", "fr"), ("rl", "rr")) if {left, right} <= set(wheels)]
+    axles = [
+        (wheels[left].slow, wheels[right].slow)
+        for left, right in (("fl", "fr"), ("rl", "rr"))
+        if {left, right} <= set(wheels)
+    ]
     return max((correlation(right - left, rate) for left, right in axles), key=abs, default=0.0)
 
 
-def speed_of_wheels(columns: Sequence[Candidate], wheels: Wheels, rate_hz: float) -> list[Candidate]:
+def speed_of_wheels(
+    columns: Sequence[Candidate], wheels: Wheels, rate_hz: float
+) -> list[Candidate]:
     """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that make ay = vx·yaw_rate."""
     if not wheels or any("vx" in column.hints for column in columns):
         return []
     mean = _mean(wheels)
     rate, ay = (_named(columns, channel) for channel in ("yaw_rate", "ay"))
     ranked = []
-    for unit, of_rate, of_ay in product(_units(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]):
+    for unit, of_rate, of_ay in product(
+        _units(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]
+    ):
         implausible, scale = False, None
         if rate:
             turning = rate.slow * si_factor(of_rate, "yaw_rate")
@@ -61,35 +72,64 @@ def speed_of_wheels(columns: Sequence[Candidate], wheels: Wheels, rate_hz: float
         if rate and ay:
             every = max(round(len(mean) / max(len(rate.slow), 1)), 1)
             size = float(np.std(mean[::every][: len(turning)] * turning))
-            scale = float(np.std(ay.slow)) * si_factor(of_ay, "ay") / size if size > 0.0 else math.nan
+            scale = (
+                float(np.std(ay.slow)) * si_factor(of_ay, "ay") / size if size > 0.0 else math.nan
+            )
         cost, radius = _cost(unit, scale, mean)
         ranked.append((cost + 3.0 * implausible, unit, radius))
     _, unit, radius = min(ranked)
-    speed = mean * (si_factor(unit, "vx") if unit in AT_RIM else radius * si_factor(unit, "wheel_speed_fl"))
-    return [Candidate("mean of the wheels", "m/s", speed, slow_of(speed, rate_hz), {"vx": WEAK}, is_made=True)]
+    speed = mean * (
+        si_factor(unit, "vx") if unit in AT_RIM else radius * si_factor(unit, "wheel_speed_fl")
+    )
+    return [
+        Candidate(
+            "mean of the wheels", "m/s", speed, slow_of(speed, rate_hz), {"vx": WEAK}, is_made=True
+        )
+    ]
 
 
-def wheel_proposals(wheels: Wheels, known: Motion | None, *, has_speed: bool, is_made: bool) -> tuple[list[Proposal], float | None]:
+def wheel_proposals(
+    wheels: Wheels, known: Motion | None, *, has_speed: bool, is_made: bool
+) -> tuple[list[Proposal], float | None]:
     """A channel each, and the rolling radius by which they make the speed, if it has no column; of it, the motion's may be made."""
     mean, units = _mean(wheels), _units(wheels)
     evidence, radius = ["its name"], NOMINAL_RADIUS
     if known is None:
-        unit, asked = ("rad/s", "nothing to compare the wheels with") if len(units) > 1 else (units[0], "")
+        unit, asked = (
+            ("rad/s", "nothing to compare the wheels with") if len(units) > 1 else (units[0], "")
+        )
     else:
         scale = rms(known.vx) / (rms(mean) or 1.0)
         ranked = sorted((*_cost(unit, scale, mean), unit) for unit in units)
         cost, radius, unit = ranked[0]
-        asked = f"could be in {ranked[1][2]} as well" if len(ranked) > 1 and ranked[1][0] - cost < APART else ""
+        asked = (
+            f"could be in {ranked[1][2]} as well"
+            if len(ranked) > 1 and ranked[1][0] - cost < APART
+            else ""
+        )
         if unit in AT_RIM and not is_made:
             radius = NOMINAL_RADIUS * scale / si_factor(unit, "vx")
         by = "ay over the yaw rate" if is_made else "the speed"
-        evidence += [f"{unit} at the rim by {by}" if unit in AT_RIM else f"a radius of {radius:.3g} m by {by} in {unit}"]
+        evidence += [
+            f"{unit} at the rim by {by}"
+            if unit in AT_RIM
+            else f"a radius of {radius:.3g} m by {by} in {unit}"
+        ]
     factor = 1.0
     if unit in AT_RIM:
         factor, unit = float(f"{si_factor(unit, 'vx') / NOMINAL_RADIUS:.7g}"), "rad/s"
     others = UNITS if asked else ()
     found = [
-        Proposal(column.name, f"wheel_speed_{corner}", unit, 1, tuple(evidence), asked, factor=factor, others=others)
+        Proposal(
+            column.name,
+            f"wheel_speed_{corner}",
+            unit,
+            1,
+            tuple(evidence),
+            asked,
+            factor=factor,
+            others=others,
+        )
         for corner, column in sorted(wheels.items())
     ]
     return found, None if has_speed else float(f"{radius:.3g}")
@@ -97,13 +137,22 @@ def wheel_proposals(wheels: Wheels, known: Motion | None, *, has_speed: bool, is
 
 def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -> float | None:
     """Speed of the wheels at the rim over a speed [m/s]; None where they are in no unit of a speed at the rim."""
-    found = [(one.slow, proposals.by_channel.get(f"wheel_speed_{corner}")) for corner, one in wheels.items()]
-    at_rim = [slow * NOMINAL_RADIUS * own.factor for slow, own in found if own is not None and own.factor != 1.0]
+    found = [
+        (one.slow, proposals.by_channel.get(f"wheel_speed_{corner}"))
+        for corner, one in wheels.items()
+    ]
+    at_rim = [
+        slow * NOMINAL_RADIUS * own.factor
+        for slow, own in found
+        if own is not None and own.factor != 1.0
+    ]
     return rms(np.mean(at_rim, axis=0)) / rms(speed) if at_rim else None
 
 
 def _mean(wheels: Wheels) -> FloatArray:
-    return np.asarray(np.mean([column.values for column in wheels.values()], axis=0), dtype=np.float64)
+    return np.asarray(
+        np.mean([column.values for column in wheels.values()], axis=0), dtype=np.float64
+    )
 
 
 def _units(wheels: Wheels) -> Sequence[str]:

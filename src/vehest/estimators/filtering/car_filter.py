@@ -13,9 +13,21 @@ from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilabl
 from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, compiled_noise, with_entropy
+from vehest.filters.noise_models import (
+    ConstantNoise,
+    StateDependentNoise,
+    compiled_noise,
+    with_entropy,
+)
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, StepNoise, TorchModel, moved, unscented_scan
+from vehest.filters.unscented_scan import (
+    NonlinearFiltered,
+    PointModel,
+    StepNoise,
+    TorchModel,
+    moved,
+    unscented_scan,
+)
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
@@ -26,7 +38,12 @@ FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
 OBSERVATION = (50.0, 50.0, 0.1, 0.1)
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
 PACE = 10.0  # by which noise learns faster than in units of its deviations
-OBSERVED_EXACTLY = (0.0, 0.0, 0.0, 1e-3)  # added to variances: the rim speed is measured, and is its own reference
+OBSERVED_EXACTLY = (
+    0.0,
+    0.0,
+    0.0,
+    1e-3,
+)  # added to variances: the rim speed is measured, and is its own reference
 KAPPA = -2.0  # of the symmetric sigma points
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
@@ -62,7 +79,9 @@ class CarFilter(nn.Module):
         self.dynamics, self.constant = dynamics, noise == "constant"
         n = len(STATES)
         self.process_noise, self.observation_noise = (
-            ConstantNoise(variances, correlated) if self.constant else StateDependentNoise(variances, n, correlated=correlated)
+            ConstantNoise(variances, correlated)
+            if self.constant
+            else StateDependentNoise(variances, n, correlated=correlated)
             for variances in ((*PROCESS, FRICTION[noise]), OBSERVATION)
         )
         self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
@@ -95,7 +114,9 @@ class CarFilter(nn.Module):
 
     def initial_covariance(self) -> Tensor:
         """Of a state that is known, (5, 5)."""
-        covariance: Tensor = self.initial_noise(self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0))
+        covariance: Tensor = self.initial_noise(
+            self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0)
+        )
         return covariance
 
     def filtered(
@@ -119,7 +140,10 @@ class CarFilter(nn.Module):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            process, observation = with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY), self.observation_noise(at, inputs)
+            process, observation = (
+                with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY),
+                self.observation_noise(at, inputs),
+            )
         else:
             process, observation = self.noise_at()  # type: ignore[assignment]
         return unscented_scan(
@@ -138,7 +162,9 @@ class CarFilter(nn.Module):
     def noise_at(self) -> tuple[StepNoise, StepNoise]:
         """Process and observation noise of filters at work."""
         if not self.constant:
-            return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(self.observation_noise)
+            return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(
+                self.observation_noise
+            )
         nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
             process = with_entropy(self.process_noise(nothing, nothing), LEAST_ENTROPY)
@@ -151,17 +177,31 @@ class CarFilter(nn.Module):
         that may start anywhere within a spread: it has the variance of that.
         """
         with torch.no_grad():
-            steps = torch.cat([self.moved(d.states[:-1], d.inputs[:-1]) - d.states[1:] for d in drives])
-            expected = torch.cat([d.measurements - self.dynamics.observation(d.states, d.inputs) for d in drives])
+            steps = torch.cat(
+                [self.moved(d.states[:-1], d.inputs[:-1]) - d.states[1:] for d in drives]
+            )
+            expected = torch.cat(
+                [d.measurements - self.dynamics.observation(d.states, d.inputs) for d in drives]
+            )
             size = torch.cat([drive.states for drive in drives]).square().mean(0).sqrt()
-            process, observation = steps.T @ steps / len(steps), expected.T @ expected / len(expected)
+            process, observation = (
+                steps.T @ steps / len(steps),
+                expected.T @ expected / len(expected),
+            )
             friction = len(STATES) - 1
-            process[friction, friction] = FRICTION["constant" if self.constant else "state_dependent"]
+            process[friction, friction] = FRICTION[
+                "constant" if self.constant else "state_dependent"
+            ]
             observation += observation.new_tensor(OBSERVED_EXACTLY).diag()
-        for noise, covariance in ((self.process_noise, process), (self.observation_noise, observation)):
+        for noise, covariance in (
+            (self.process_noise, process),
+            (self.observation_noise, observation),
+        ):
             noise.begin(covariance, PACE, size)
         initial = self.initial_covariance().detach().clone()
-        initial[friction, friction] = torch.clamp(initial[friction, friction], min=start_spread**2 / 3.0)
+        initial[friction, friction] = torch.clamp(
+            initial[friction, friction], min=start_spread**2 / 3.0
+        )
         self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
@@ -178,9 +218,13 @@ class CarFilter(nn.Module):
             begin, end = max(first - 1, 0), min(first + (steps or total), total)
             measurements = drives.measurements[:, begin:end]
             if first:
-                measurements = torch.cat([torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1)
+                measurements = torch.cat(
+                    [torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1
+                )
             states = None if self.constant else drives.states[:, begin:end]
-            filtered = self.filtered(measurements, drives.inputs[:, begin:end], initial, states, model).steps.filtered
+            filtered = self.filtered(
+                measurements, drives.inputs[:, begin:end], initial, states, model
+            ).steps.filtered
             means.append(filtered.mean[:, first - begin :])
             covariances.append(filtered.covariance[:, first - begin :])
             initial = Gaussian(filtered.mean[:, -1].detach(), filtered.covariance[:, -1].detach())

@@ -55,7 +55,9 @@ def fit_dugoff(
     """
     for recording in recordings:
         if np.isnan(recording["ax"]).any():
-            raise DataError(f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known")
+            raise DataError(
+                f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known"
+            )
     motion = axle_motion(recordings, car, minimum_speed, measured_forces=measured_forces)
     thin = max(1, -(-motion.slip.shape[1] // MOST_SAMPLES))
     vx, steer, ax = (torch.as_tensor(row) for row in motion.driven[:, ::thin])
@@ -68,7 +70,14 @@ def fit_dugoff(
         rms = float(np.sqrt(np.mean(forces[axle] ** 2)))
         force = torch.as_tensor(forces[axle])
 
-        def cost(candidates: FloatArray, tangent=tangent, force=force, load=loads[axle], scale=scale, rms=rms):  # type: ignore[no-untyped-def]
+        def cost(  # type: ignore[no-untyped-def]
+            candidates: FloatArray,
+            tangent=tangent,
+            force=force,
+            load=loads[axle],
+            scale=scale,
+            rms=rms,
+        ):
             axle = DugoffAxle(*torch.as_tensor(candidates * scale[:, None])[:, :, None])
             error = axle.force(tangent, load, vx, tyres) - force
             return error.square().mean(-1).sqrt().numpy() / rms

@@ -13,7 +13,9 @@ class GatedFilter(Estimator):
     """A filter that may refuse measurements in use; it learns without, because noise that is too small would close the gate."""
 
     gate: float | None = setting(
-        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
+        None,
+        "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken",
+        positive=True,
     )
 
     def gate_in_use(self) -> Gate | None:
@@ -33,4 +35,7 @@ class GatedFilter(Estimator):
     def c_values(self) -> dict[str, Any]:
         """Limit and patience of the gate; patience is 0 without one."""
         gate = self.gate_in_use()
-        return {"limit": 0.0 if gate is None else gate.deviations**2, "patience": 0 if gate is None else gate.patience}
+        return {
+            "limit": 0.0 if gate is None else gate.deviations**2,
+            "patience": 0 if gate is None else gate.patience,
+        }

@@ -30,7 +30,9 @@ class FilteredStates(NamedTuple):
     """What a filter knows after T samples."""
 
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
-    deviation: FloatArray | None  # standard deviations of all states, (T, n), where the filter gives them
+    deviation: (
+        FloatArray | None
+    )  # standard deviations of all states, (T, n), where the filter gives them
     covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
     innovation: FloatArray  # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T, 2)
     innovation_covariance: FloatArray  # (T, 2, 2)
@@ -41,7 +43,9 @@ class FilteredStates(NamedTuple):
         """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured; (T,) each."""
         (first, both), (_, second) = np.moveaxis(self.innovation_covariance, 0, 2)
         one, other = self.innovation.T
-        nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (first * second - both**2)
+        nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (
+            first * second - both**2
+        )
         return nis, np.sum(self.measured, axis=1, dtype=np.float64)
 
 
@@ -61,30 +65,47 @@ class SideslipFilter(GatedFilter, Recursive):
     refuses = ("NaN", "infinite")
     covariance_of = ("vy", "yaw_rate")
     car: SingleTrackParameters = setting(FERRARI_250LM, "parameters of the car")
-    minimum_speed: float = setting(3.0, "speed below which the model is held at this speed", unit="m/s", positive=True)
+    minimum_speed: float = setting(
+        3.0, "speed below which the model is held at this speed", unit="m/s", positive=True
+    )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
         """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k]."""
-        return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(1.0 / self.rate_hz)
+        return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(
+            1.0 / self.rate_hz
+        )
 
-    def first_motion(self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+    def first_motion(
+        self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]
+    ) -> Gaussian[FloatArray]:
         """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over."""
         mean, variance = np.zeros(len(deviation)), np.square(deviation)
         if "vy" in given:
-            mean[0], variance[0] = math.atan2(given["vy"], max(sample[1], self.minimum_speed)), KNOWN**2
+            mean[0], variance[0] = (
+                math.atan2(given["vy"], max(sample[1], self.minimum_speed)),
+                KNOWN**2,
+            )
         if "yaw_rate" in given:
             mean[1], variance[1] = given["yaw_rate"], KNOWN**2
         return Gaussian(mean, np.diag(variance))
 
     @abstractmethod
-    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+    def first_gaussian(
+        self, sample: FloatArray, given: Mapping[str, float]
+    ) -> Gaussian[FloatArray]:
         """State before the first sample; see `first_state`."""
 
     def filter_samples(
-        self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
+        self,
+        samples: FloatArray,
+        first: Gaussian[FloatArray],
+        gate: Gate | None = None,
+        refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement; ``refused``: see `Gate`."""
-        raise NotImplementedError(f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'")
+        raise NotImplementedError(
+            f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'"
+        )
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
         """What further states, (T, n), say: name -> (T,)."""
@@ -92,7 +113,9 @@ class SideslipFilter(GatedFilter, Recursive):
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> FilterState:
         """State before the first sample, its gate closed."""
-        return FilterState(None, self.first_gaussian(sample, given), np.zeros(len(self.skippable), np.int64))
+        return FilterState(
+            None, self.first_gaussian(sample, given), np.zeros(len(self.skippable), np.int64)
+        )
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
         """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what further states say."""
@@ -116,7 +139,9 @@ class SideslipFilter(GatedFilter, Recursive):
         return values | self.quantities(mean), FilterState(samples[-1], found.last, refused)
 
 
-def read_levels(recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0) -> dict[str, float]:
+def read_levels(
+    recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0
+) -> dict[str, float]:
     """Standard deviations of measured channels of all recordings above a frequency, by name.
 
     The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise. Raises `DataError`: a channel has too many
@@ -128,7 +153,11 @@ def read_levels(recordings: Sequence[Recording], names: Sequence[str], cutoff: f
         try:
             levels[name] = high_passed_level([recording[name] for recording in recordings], cutoff)
         except ValueError as error:
-            raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
+            raise DataError(
+                f"{among}: channel '{name}': {error}; give estimator.noise.{name}"
+            ) from None
         if not levels[name] > least:
-            raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
+            raise DataError(
+                f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}"
+            )
     return levels

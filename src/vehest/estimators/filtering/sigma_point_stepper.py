@@ -55,5 +55,12 @@ class SigmaPointStepper(Stepper):
         if self._filter is None:
             self._filter = estimator.new_filter(step)
         dtype, of_vy = self._filter.state.mean.dtype, estimator.states.index("vy")
-        mean = self._filter.step(step.measurement.astype(dtype), step.inputs.astype(dtype), step.process_noise, step.observation_noise)
-        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.state.covariance[of_vy, of_vy])}
+        mean = self._filter.step(
+            step.measurement.astype(dtype),
+            step.inputs.astype(dtype),
+            step.process_noise,
+            step.observation_noise,
+        )
+        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {
+            "vy_variance": float(self._filter.state.covariance[of_vy, of_vy])
+        }

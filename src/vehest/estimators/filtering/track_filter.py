@@ -23,7 +23,10 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
 
-UNKNOWN = (0.5, 0.2)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+UNKNOWN = (
+    0.5,
+    0.2,
+)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
 ROLLING = np.diag(np.square(UNKNOWN))
 KNOWN = 1e-6  # the same of a state that is handed over
 KAPPA = 1.0  # n + κ = 3
@@ -79,7 +82,9 @@ class TrackFilter:
             gate=gate,
         )
 
-    def start(self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None) -> Gaussian[Tensor]:
+    def start(
+        self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None
+    ) -> Gaussian[Tensor]:
         """State before the first measurement: straight ahead and unknown, rolling where the car is slow, or what is handed over.
 
         Args:
@@ -96,7 +101,9 @@ class TrackFilter:
         return Gaussian(mean, torch.diag_embed(deviation.square()))
 
 
-def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:
+def in_nonlinear_range(
+    ay: FloatArray, enter: float, leave: float, before: bool = False
+) -> NDArray[np.bool_]:
     """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, less than that.
 
     Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first sample.
@@ -141,7 +148,16 @@ def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
     longest = max(len(array) for array in arrays)
     return np.stack(
         [
-            np.concatenate([array, np.repeat(array[-1:] if fill is None else np.full_like(array[-1:], fill), longest - len(array), axis=0)])
+            np.concatenate(
+                [
+                    array,
+                    np.repeat(
+                        array[-1:] if fill is None else np.full_like(array[-1:], fill),
+                        longest - len(array),
+                        axis=0,
+                    ),
+                ]
+            )
             for array in arrays
         ]
     )

@@ -28,13 +28,21 @@ from vehest.vehicle.rational_tyres import rational_axle
 
 Kind = Literal["linear", "rational"]
 
-PARAMETERS: dict[str, tuple[str, ...]] = {"linear": ("cornering_stiffness",), "rational": ("c1", "c2")}
+PARAMETERS: dict[str, tuple[str, ...]] = {
+    "linear": ("cornering_stiffness",),
+    "rational": ("c1", "c2"),
+}
 """Names of an axle's parameters, by the kind of its curve: [N/rad]; [rad²], [N/rad]."""
 
 BOUNDS = {"cornering_stiffness": (1e2, 1e8), "c1": (1e-5, 1.0), "c2": (1e2, 1e8)}
-PEAK_SLIP = math.radians(9.0)  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+PEAK_SLIP = math.radians(
+    9.0
+)  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
 PEAK_SPREAD = 0.4  # standard deviation of its logarithm
-KNOWN_C1 = (math.log(0.5 * PEAK_SLIP**2), 2.0 * PEAK_SPREAD)  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
+KNOWN_C1 = (
+    math.log(0.5 * PEAK_SLIP**2),
+    2.0 * PEAK_SPREAD,
+)  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
 LEAST_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
 PASSES = 3  # of weighing what is known against what the drives leave unexplained
 SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
@@ -110,14 +118,24 @@ def axle_motion(
     for recording in recordings:
         length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
         if length <= SMOOTHING_ORDER:
-            raise DataError(f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more")
+            raise DataError(
+                f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more"
+            )
         if len(recording) < length:
             continue
-        slip, force, inputs = _motion_of(recording, parameters, minimum_speed, length, measured_forces=measured_forces)
+        slip, force, inputs = _motion_of(
+            recording, parameters, minimum_speed, length, measured_forces=measured_forces
+        )
         block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
         first_block = int(block[-1]) + 1
-        usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
-        parts.append(AxleMotion(slip[:, usable], force[:, usable], block[usable], inputs[:, usable]))
+        usable = (
+            (recording["vx"] >= minimum_speed)
+            & np.isfinite(slip).all(0)
+            & np.isfinite(force).all(0)
+        )
+        parts.append(
+            AxleMotion(slip[:, usable], force[:, usable], block[usable], inputs[:, usable])
+        )
     count = sum(len(part.block) for part in parts)
     if count < FEWEST_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
@@ -129,28 +147,60 @@ def axle_motion(
 
 
 def _motion_of(
-    recording: Recording, parameters: SingleTrackParameters | LoadedCar, minimum_speed: float, length: int, *, measured_forces: bool
+    recording: Recording,
+    parameters: SingleTrackParameters | LoadedCar,
+    minimum_speed: float,
+    length: int,
+    *,
+    measured_forces: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Slips and forces of one drive, (2, T) each, and what it was driven with, (3, T)."""
     front, rear, mass, inertia = (
-        float(value) for value in (parameters.cg_to_front_axle, parameters.cg_to_rear_axle, parameters.mass, parameters.yaw_inertia)
+        float(value)
+        for value in (
+            parameters.cg_to_front_axle,
+            parameters.cg_to_rear_axle,
+            parameters.mass,
+            parameters.yaw_inertia,
+        )
     )
 
     def smoothed(samples: FloatArray, derivative: int = 0) -> FloatArray:
         step = 1.0 / recording.rate_hz
-        fitted = signal.savgol_filter(samples, length, SMOOTHING_ORDER, deriv=derivative, delta=step, mode="constant", cval=np.nan)
+        fitted = signal.savgol_filter(
+            samples,
+            length,
+            SMOOTHING_ORDER,
+            deriv=derivative,
+            delta=step,
+            mode="constant",
+            cval=np.nan,
+        )
         return np.asarray(fitted, dtype=np.float64)  # nothing at the ends and around gaps
 
     u = np.maximum(recording["vx"], minimum_speed)
-    sideslip = recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], u)
+    sideslip = (
+        recording["sideslip_ref"]
+        if "sideslip_ref" in recording
+        else np.arctan2(recording["vy_ref"], u)
+    )
     turn = recording["yaw_rate"] / u
-    slip = np.stack([smoothed(recording["steer"] - sideslip - front * turn), smoothed(rear * turn - sideslip)])
+    slip = np.stack(
+        [smoothed(recording["steer"] - sideslip - front * turn), smoothed(rear * turn - sideslip)]
+    )
     ax = smoothed(recording["ax"]) if "ax" in recording else np.full(len(u), np.nan)
     driven = np.stack([smoothed(u), smoothed(recording["steer"]), ax])
     if measured_forces:
         wheels = [recording[f"fy_{wheel}"] for wheel in ("fl", "fr", "rl", "rr")]
-        return slip, np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])]), driven
-    total, moment = mass * smoothed(recording["ay"]), inertia * smoothed(recording["yaw_rate"], derivative=1)
+        return (
+            slip,
+            np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])]),
+            driven,
+        )
+    total, moment = (
+        mass * smoothed(recording["ay"]),
+        inertia * smoothed(recording["yaw_rate"], derivative=1),
+    )
     return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear), driven
 
 
@@ -165,12 +215,19 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
 
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
-    axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
+    axles = [
+        _fitted(kind, slip, force, motion.block)
+        for slip, force in zip(motion.slip, motion.force, strict=True)
+    ]
     (front, rear), covariances, rms = zip(*axles, strict=True)
-    return TyreFit(kind, front, rear, np.stack(covariances), np.array(rms), motion.slip, motion.force)
+    return TyreFit(
+        kind, front, rear, np.stack(covariances), np.array(rms), motion.slip, motion.force
+    )
 
 
-def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, float]:
+def _fitted(
+    kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray, float]:
     """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted, so that all stay positive."""
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
@@ -188,12 +245,21 @@ def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.i
 
     def misfit(at: FloatArray, weight: float) -> FloatArray:
         left = weight * (axle_force(kind, np.exp(at), slip) - force)
-        return np.append(left, (at[names.index("c1")] - KNOWN_C1[0]) / KNOWN_C1[1]) if "c1" in names else left
+        return (
+            np.append(left, (at[names.index("c1")] - KNOWN_C1[0]) / KNOWN_C1[1])
+            if "c1" in names
+            else left
+        )
 
     for _ in range(PASSES):
         weight = math.sqrt(blocks / len(slip)) / max(spread, LEAST_SPREAD * scale)
-        found = optimize.least_squares(misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,))
-        logarithms, spread = found.x, math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight
+        found = optimize.least_squares(
+            misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,)
+        )
+        logarithms, spread = (
+            found.x,
+            math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight,
+        )
     of_data, of_knowledge = found.jac[: len(slip)], found.jac[len(slip) :]
     scores = of_data * found.fun[: len(slip), None]
     sums = np.stack([np.bincount(member, weights=column) for column in scores.T], axis=1)

@@ -69,7 +69,9 @@ def _compiled_sigmoid(x):  # type: ignore[no-untyped-def]
 @intrinsic  # type: ignore[untyped-decorator]
 def _of_bits(typing: Any, bits: Any) -> Any:
     """The float32 with the bits of an int32."""
-    return types.float32(types.int32), lambda context, builder, sig, args: builder.bitcast(args[0], ir.FloatType())
+    return types.float32(types.int32), lambda context, builder, sig, args: builder.bitcast(
+        args[0], ir.FloatType()
+    )
 
 
 @overload(softplus)
@@ -88,7 +90,9 @@ def _compiled_softplus(x):  # type: ignore[no-untyped-def]
         z = e / (_F(2.0) + e)
         s = z * z
         p = _F(1 / 9) + s * (_F(1 / 11) + s * (_F(1 / 13) + s * _F(1 / 15)))
-        return max(x, _F(0.0)) + _F(2.0) * z * (_F(1.0) + s * (_F(1 / 3) + s * (_F(1 / 5) + s * (_F(1 / 7) + s * p))))
+        return max(x, _F(0.0)) + _F(2.0) * z * (
+            _F(1.0) + s * (_F(1 / 3) + s * (_F(1 / 5) + s * (_F(1 / 7) + s * p)))
+        )
 
     return compute
 
@@ -103,8 +107,12 @@ def _compiled_arctan(x):  # type: ignore[no-untyped-def]
         a = abs(x)
         y = min(a, _F(1.0)) / max(a, _F(1.0))
         s = y * y
-        p = _F(-0.0752896400) + s * (_F(0.0429096138) + s * (_F(-0.0161657367) + s * _F(0.0028662257)))
-        p = _F(-0.3333314528) + s * (_F(0.1999355085) + s * (_F(-0.1420889944) + s * (_F(0.1065626393) + s * p)))
+        p = _F(-0.0752896400) + s * (
+            _F(0.0429096138) + s * (_F(-0.0161657367) + s * _F(0.0028662257))
+        )
+        p = _F(-0.3333314528) + s * (
+            _F(0.1999355085) + s * (_F(-0.1420889944) + s * (_F(0.1065626393) + s * p))
+        )
         angle = y + y * s * p
         return math.copysign(_F(1.57079633) - angle if a > _F(1.0) else angle, x)
 

@@ -26,7 +26,11 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     With ``_nrt=False`` it counts no references of arrays, which compiles sooner; it may then neither make nor return one.
     """
     return numba.njit(  # type: ignore[no-any-return]
-        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", **options
+        forceinline=True,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        error_model="numpy",
+        **options,
     )
 
 
@@ -41,4 +45,6 @@ def has_to_compile(where: str) -> bool:
         return False
     folder, source = function.stats.cache_path, Path(str(module.__file__))
     kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{entry_name}-*.nbi")
-    return folder is not None and not any(index.stat().st_mtime >= source.stat().st_mtime for index in kept)
+    return folder is not None and not any(
+        index.stat().st_mtime >= source.stat().st_mtime for index in kept
+    )

@@ -27,8 +27,19 @@ class CompiledDugoffTrack(PointModel):
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
-        numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
-        axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
+        numbers = [
+            car.mass,
+            car.yaw_inertia,
+            car.cg_to_front_axle,
+            car.cg_to_rear_axle,
+            car.cg_height,
+            track.step,
+            track.minimum_speed,
+        ]
+        axles = [
+            [axle.cornering_stiffness, axle.friction, axle.reduction]
+            for axle in (track.front, track.rear)
+        ]
         self.car = (np.array(numbers), np.array(axles), track.tyres == "smooth")
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
@@ -47,8 +58,17 @@ def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
     gravity = car.dtype.type(GRAVITY)
     front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
     least, steer = car.dtype.type(LEAST_LOAD), at_row(inputs, 1, b)
-    load_front, load_rear = mass * most(front - transfer, least * front), mass * most(rear + transfer, least * rear)
-    return most(at_row(inputs, 0, b), minimum_speed), each(math.tan, steer), each(math.cos, steer), load_front, load_rear
+    load_front, load_rear = (
+        mass * most(front - transfer, least * front),
+        mass * most(rear + transfer, least * rear),
+    )
+    return (
+        most(at_row(inputs, 0, b), minimum_speed),
+        each(math.tan, steer),
+        each(math.cos, steer),
+        load_front,
+        load_rear,
+    )
 
 
 @piece
@@ -88,7 +108,14 @@ def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
     by_course = choose(across > least, -(1 + turned * turned) / (across * across), -1 / least)
     front, front_slope = _axle(tangent, load_front, vx, axles[0], smooth)
     rear, rear_slope = _axle(-course_rear, load_rear, vx, axles[1], smooth)
-    return vy, yaw_rate, front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
+    return (
+        vy,
+        yaw_rate,
+        front * cosine,
+        rear,
+        front_slope * cosine * by_course / vx,
+        -rear_slope / vx,
+    )
 
 
 @piece
@@ -169,4 +196,10 @@ def _observation_adjoint(points, inputs, track, upstream, out, gradients, first,
             if m == 5:
                 bar += at_row(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
             _put(out, 2 * s, b, bar, end)
-            _put(out, 2 * s + 1, b, at_row(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar, end)
+            _put(
+                out,
+                2 * s + 1,
+                b,
+                at_row(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar,
+                end,
+            )

@@ -17,7 +17,14 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.estimators.kernels.activation import tanh
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.estimators.kernels.recursion import Recursion, add, gather, slopes_of, squared_error, step_of_adam
+from vehest.estimators.kernels.recursion import (
+    Recursion,
+    add,
+    gather,
+    slopes_of,
+    squared_error,
+    step_of_adam,
+)
 from vehest.lanes import choose, least, load, most, store, total, width
 
 LINEAR = 8  # parameters of a local model besides its neurons
@@ -27,11 +34,15 @@ CHANNELS = 4
 
 def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int, ...]]:
     """Parameters of a network by name, with their shapes."""
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gamma", "beta", "linear_weight"), (n_local, 2))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("gamma", "beta", "linear_weight"), (n_local, 2)
+    )
     shapes |= {"linear_bias": (n_local, 2)} if bias else {}
     if n_hidden:
         shapes |= dict.fromkeys(("hidden_weight", "output_weight"), (n_local, 2, n_hidden))
-        shapes |= {"hidden_bias": (n_local, 2, n_hidden), "output_bias": (n_local, 2)} if bias else {}
+        shapes |= (
+            {"hidden_bias": (n_local, 2, n_hidden), "output_bias": (n_local, 2)} if bias else {}
+        )
     return shapes
 
 
@@ -41,15 +52,23 @@ def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
     bias = p.get("linear_bias", np.zeros_like(gamma))
     if "output_bias" in p:
         bias = bias + p["output_bias"]
-    pieces = [gamma, p["beta"], np.stack([p["linear_weight"], bias], -1).reshape(*gamma.shape[:-1], 4)]
+    pieces = [
+        gamma,
+        p["beta"],
+        np.stack([p["linear_weight"], bias], -1).reshape(*gamma.shape[:-1], 4),
+    ]
     if "hidden_weight" in p:
         weight = p["hidden_weight"]
-        neurons = np.stack([weight, p.get("hidden_bias", np.zeros_like(weight)), p["output_weight"]], -1)
+        neurons = np.stack(
+            [weight, p.get("hidden_bias", np.zeros_like(weight)), p["output_weight"]], -1
+        )
         pieces.append(neurons.reshape(*gamma.shape[:-1], -1))
     return np.concatenate(pieces, -1)
 
 
-def c_tables(theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool) -> dict[str, Any]:
+def c_tables(
+    theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool
+) -> dict[str, Any]:
     """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their biases are left out."""
     n_local, n_hidden = len(theta), (theta.shape[1] - LINEAR) // 6
     return {
@@ -75,7 +94,17 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
         first += int(np.prod(shape))
     slots = packed(views).reshape(len(one), -1).argmax(1)
     step, per_width = 1.0 / own.rate_hz, (own.n_local - 1) / yaw_rate_max
-    return Recursion(loop, lambda number: (slots, own.n_local, own.n_hidden, own.window, number(step), number(per_width)))
+    return Recursion(
+        loop,
+        lambda number: (
+            slots,
+            own.n_local,
+            own.n_hidden,
+            own.window,
+            number(step),
+            number(per_width),
+        ),
+    )
 
 
 @entry(nogil=True)
@@ -87,7 +116,10 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
     sums, scratch = np.empty(theta.size * lanes, flat.dtype), np.empty(lanes, flat.dtype)
     measured, rows = series.ravel(), np.empty(lanes, np.int64)
     seen = np.empty(n_window * CHANNELS * lanes, flat.dtype)
-    kept, outputs = np.empty(n_window * KEPT * lanes, flat.dtype), np.empty(max(n_window * neurons * 3, 1) * lanes, flat.dtype)
+    kept, outputs = (
+        np.empty(n_window * KEPT * lanes, flat.dtype),
+        np.empty(max(n_window * neurons * 3, 1) * lanes, flat.dtype),
+    )
     car, room = (theta, n_local, n_hidden, step, per_width), (seen, kept, outputs)
     for m in range(flat.shape[0]):
         for number, start in enumerate(range(0, starts.shape[1], batch)):
@@ -135,8 +167,18 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
     w1, f1, w2, f2 = phi * theta[4], phi * theta[5], phi * theta[6], phi * theta[7]
     for p in range(1, n_local):
         phi, own = most(1 - abs(position - p), 0), p * row
-        g1, g2, b1, b2 = g1 + phi * theta[own + 0], g2 + phi * theta[own + 1], b1 + phi * theta[own + 2], b2 + phi * theta[own + 3]
-        w1, f1, w2, f2 = w1 + phi * theta[own + 4], f1 + phi * theta[own + 5], w2 + phi * theta[own + 6], f2 + phi * theta[own + 7]
+        g1, g2, b1, b2 = (
+            g1 + phi * theta[own + 0],
+            g2 + phi * theta[own + 1],
+            b1 + phi * theta[own + 2],
+            b2 + phi * theta[own + 3],
+        )
+        w1, f1, w2, f2 = (
+            w1 + phi * theta[own + 4],
+            f1 + phi * theta[own + 5],
+            w2 + phi * theta[own + 6],
+            f2 + phi * theta[own + 7],
+        )
     error = u - speed
     f1, f2 = f1 + w1 * error, f2 + w2 * error
     if n_hidden:
@@ -183,10 +225,18 @@ def _model(position, n_local):  # type: ignore[no-untyped-def]
 @part(_nrt=False)
 def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
     """w₂, b₂, w₃ of one neuron of the lanes' active models."""
-    w2, b2, w3 = model * 0 + theta[column], model * 0 + theta[column + 1], model * 0 + theta[column + 2]
+    w2, b2, w3 = (
+        model * 0 + theta[column],
+        model * 0 + theta[column + 1],
+        model * 0 + theta[column + 2],
+    )
     for p in range(1, n_local - 1):
         at, here = column + p * row, model == p
-        w2, b2, w3 = choose(here, theta[at], w2), choose(here, theta[at + 1], b2), choose(here, theta[at + 2], w3)
+        w2, b2, w3 = (
+            choose(here, theta[at], w2),
+            choose(here, theta[at + 1], b2),
+            choose(here, theta[at + 2], w3),
+        )
     return w2, b2, w3
 
 
@@ -197,7 +247,12 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
     seen, kept, outputs = room
     lanes, row = width(theta), LINEAR + 6 * n_hidden
     now, then, neuron = k * CHANNELS * lanes, k * KEPT * lanes, k * 4 * n_hidden * 3 * lanes
-    omega, speed, v, u = load(seen, now), load(seen, now + lanes), load(kept, then), load(kept, then + lanes)
+    omega, speed, v, u = (
+        load(seen, now),
+        load(seen, now + lanes),
+        load(kept, then),
+        load(kept, then + lanes),
+    )
     error, position = u - speed, least(abs(omega) * per_width, n_local - 1)
     slip = step * (load(seen, now + 2 * lanes) - speed * omega)
     thrust = step * (load(seen, now + 3 * lanes) + v * omega)
@@ -212,8 +267,14 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
         add(sums, at + 5 * lanes, phi * to_f1)
         add(sums, at + 6 * lanes, phi * to_f2 * error)
         add(sums, at + 7 * lanes, phi * to_f2)
-    next_v = load(kept, then + 2 * lanes) * to_v + load(kept, then + 4 * lanes) * step * omega * to_u
-    next_u = load(kept, then + 3 * lanes) * to_u + load(kept, then + 5 * lanes) * to_f1 + load(kept, then + 6 * lanes) * to_f2
+    next_v = (
+        load(kept, then + 2 * lanes) * to_v + load(kept, then + 4 * lanes) * step * omega * to_u
+    )
+    next_u = (
+        load(kept, then + 3 * lanes) * to_u
+        + load(kept, then + 5 * lanes) * to_f1
+        + load(kept, then + 6 * lanes) * to_f2
+    )
     if n_hidden:
         model = _model(position, n_local)
         for side in range(min(2, n_local)):

@@ -26,7 +26,17 @@ from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.filters.unscented_scan import Array, PointModel
 from vehest.lanes import width
-from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
+from vehest.vehicle.dynamics import (
+    TURN,
+    UNSCALED,
+    Dynamics,
+    NeuralCar,
+    PacejkaCar,
+    Perceptron,
+    ResidualCar,
+    TyreNetworkCar,
+    physical_of,
+)
 from vehest.vehicle.tyres import STILL
 
 BLOCK = 110  # points at a time
@@ -57,7 +67,9 @@ class CompiledPlanarCar(PointModel):
 
     is_compiled = True
 
-    def __init__(self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype) -> None:
+    def __init__(
+        self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype
+    ) -> None:
         network = getattr(dynamics, "network", None)
         if isinstance(network, Perceptron):
             (W1, b1), (W2, b2), (W3, b3) = network.layers()
@@ -74,7 +86,12 @@ class CompiledPlanarCar(PointModel):
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [*known, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
-        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), _kind_of(dynamics))
+        self.car = (
+            (*arrays[:6], *matrices),
+            arrays[6],
+            np.array(numbers, scalar),
+            _kind_of(dynamics),
+        )
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
@@ -173,7 +190,11 @@ def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Writes ``f_bar``, and adds to the gradients when learning."""
     _, _, _, _, W3, _, W1, W2, _ = layers
-    h2_bar, h1_bar, out_bar = np.empty_like(h2), np.empty_like(h1), np.empty((f.shape[0], 4), f.dtype)
+    h2_bar, h1_bar, out_bar = (
+        np.empty_like(h2),
+        np.empty_like(h1),
+        np.empty((f.shape[0], 4), f.dtype),
+    )
     for p in range(f.shape[0]):
         for k in range(4):
             out_bar[p, k] = o_bar[k, p]
@@ -302,7 +323,9 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 size = softplus(value)
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
-                slips_bar[1 - k, p] = through * size * turn * _rise(one - direction, one + direction, flat, nothing)
+                slips_bar[1 - k, p] = (
+                    through * size * turn * _rise(one - direction, one + direction, flat, nothing)
+                )
                 x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
     elif kind == UNSCALED_FORCES:
         for k in range(4):
@@ -358,7 +381,16 @@ def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
         out[0, p] = (rear_x + front_x * cosine - front_y * sine - drag) / mass
         out[1, p] = (sideways + rear_y) / mass
         out[2, p] = (sideways * lf - rear_y * lr) / inertia
-        out[3, p] = radius / powertrain * (torque * current - radius * (front_x + rear_x) - viscous * rim - coulomb * np.sign(rim))
+        out[3, p] = (
+            radius
+            / powertrain
+            * (
+                torque * current
+                - radius * (front_x + rear_x)
+                - viscous * rim
+                - coulomb * np.sign(rim)
+            )
+        )
 
 
 @piece
@@ -375,9 +407,17 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
         vx, rim = x[0, p], x[3, p]
         sine, cosine, current = u[1, p], u[2, p], u[3, p]
         front_x, rear_y, front_y = forces[1, p], forces[2, p], forces[3, p]
-        ax, ay, turning, spinning = out_bar[0, p] / mass, out_bar[1, p] / mass, out_bar[2, p] / inertia, out_bar[3, p]
+        ax, ay, turning, spinning = (
+            out_bar[0, p] / mass,
+            out_bar[1, p] / mass,
+            out_bar[2, p] / inertia,
+            out_bar[3, p],
+        )
         twisting = spinning * radius / powertrain
-        along, across = ax * cosine + ay * sine + turning * sine * lf, ay * cosine - ax * sine + turning * cosine * lf
+        along, across = (
+            ax * cosine + ay * sine + turning * sine * lf,
+            ay * cosine - ax * sine + turning * cosine * lf,
+        )
         slope[0, p] = ax - radius * twisting
         slope[1, p] = along - radius * twisting
         slope[2, p] = ay - turning * lr
@@ -563,7 +603,9 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
         _, rates = _stages(x0, u, car, (room, room, room, room))
         for i in range(n):
             for p in range(x0.shape[1]):
-                x0[i, p] += sixth * (rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p])
+                x0[i, p] += sixth * (
+                    rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p]
+                )
         _put(x0, out, first, end)
 
 
@@ -595,14 +637,20 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
         x, _ = _stages(x0, u, car, rooms)
         up = np.empty_like(x0)
         _columns(upstream, first, end, 0, up)
-        total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
+        total, stage_bar, rates_bar = (
+            up.copy(),
+            np.zeros_like(up),
+            np.empty((4, columns), points.dtype),
+        )
         for k in range(4):
             at = 3 - k
             weight = points.dtype.type(step / 3 if at in (1, 2) else step / 6)
             later = points.dtype.type(step if at == 2 else step / 2)
             for i in range(4):
                 for p in range(columns):
-                    rates_bar[i, p] = weight * up[i, p] + (later * stage_bar[i, p] if at < 3 else nothing)
+                    rates_bar[i, p] = weight * up[i, p] + (
+                        later * stage_bar[i, p] if at < 3 else nothing
+                    )
             for p in range(columns):
                 stage_bar[0, p] = -rates_bar[1, p] * x[at, 2, p]
                 stage_bar[1, p] = rates_bar[0, p] * x[at, 2, p]

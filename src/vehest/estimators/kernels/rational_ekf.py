@@ -63,7 +63,9 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
             speed = max(samples[k - 1, 1], minimum_speed)
             for i, index in enumerate(adapted):
                 parameters[index] = nominal[index] * math.exp(mean[4 + i])
-            front = _move(mean, car, parameters, adapted, speed, samples[k - 1, 3], step, per_rate, per_turn)
+            front = _move(
+                mean, car, parameters, adapted, speed, samples[k - 1, 3], step, per_rate, per_turn
+            )
             _spread(cov, per_rate, per_turn, step, left)
             _add_noise(cov, front, car, speed, step, variances, abs(speed * mean[1]) >= adapt_above)
             _clip(mean, bounds)
@@ -74,7 +76,18 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
                 _roll(mean, cov, rolling, car, vx, steer)
         held = abs(vx * mean[1]) < adapt_above
         _innovate(
-            mean, cov, samples[k], tyres < n, variances, limit, patience, refused, cross, innovation[k], innovation_cov[k], measured[k]
+            mean,
+            cov,
+            samples[k],
+            tyres < n,
+            variances,
+            limit,
+            patience,
+            refused,
+            cross,
+            innovation[k],
+            innovation_cov[k],
+            measured[k],
         )
         _gain(cross, innovation_cov[k], held, gain)
         for i in range(n):
@@ -95,7 +108,9 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
     per_rate[0] = -(front.per_slip + rear.per_slip) * along
     per_rate[1] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / speed * along - 1.0
     per_turn[0] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / inertia
-    per_turn[1] = -(front_arm * front_arm * front.per_slip + rear_arm * rear_arm * rear.per_slip) / (inertia * speed)
+    per_turn[1] = -(
+        front_arm * front_arm * front.per_slip + rear_arm * rear_arm * rear.per_slip
+    ) / (inertia * speed)
     for i, index in enumerate(adapted):
         by_front, by_rear = 0.0, 0.0
         if index == 0:
@@ -163,7 +178,20 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
 
 
 @numba.njit(inline="always")
-def _innovate(mean, cov, sample, crossfall, variances, limit, patience, refused, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
+def _innovate(  # type: ignore[no-untyped-def]
+    mean,
+    cov,
+    sample,
+    crossfall,
+    variances,
+    limit,
+    patience,
+    refused,
+    cross,
+    innovation,
+    S,
+    measured,
+):
     """Innovations of yaw rate and ay, their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0.
 
     What is refused counts as not measured.
@@ -183,7 +211,9 @@ def _innovate(mean, cov, sample, crossfall, variances, limit, patience, refused,
         expected = mean[1] if j == 0 else ay
         if measured[j] and limit < math.inf:
             spread = cross[1, 0] if j == 0 else spread_of_ay
-            measured[j] = not refuses(value - expected, spread + variances[j], limit, patience, refused, j)
+            measured[j] = not refuses(
+                value - expected, spread + variances[j], limit, patience, refused, j
+            )
         innovation[j] = value - expected if measured[j] else 0.0
         if not measured[j]:
             cross[:, j] = 0.0

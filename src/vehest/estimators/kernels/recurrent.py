@@ -25,8 +25,14 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
     lanes, channels = width(series), series.shape[1]
     measured, rows, scratch = series.ravel(), np.empty(lanes, np.int64), np.empty(lanes, flat.dtype)
     inputs = channels + states  # rows of ``seen`` a sample: measurements, and the state before
-    seen, state = np.empty(n_window * inputs * lanes, flat.dtype), np.empty(2 * states * lanes, flat.dtype)
-    kept, sums = np.empty(n_window * KEPT * states * lanes, flat.dtype), np.empty(flat.shape[1] * lanes, flat.dtype)
+    seen, state = (
+        np.empty(n_window * inputs * lanes, flat.dtype),
+        np.empty(2 * states * lanes, flat.dtype),
+    )
+    kept, sums = (
+        np.empty(n_window * KEPT * states * lanes, flat.dtype),
+        np.empty(flat.shape[1] * lanes, flat.dtype),
+    )
     size, room = (gates, states, channels), (seen, kept, state)
     read = gates * states * (inputs + 1)  # where the read-out's weights begin
     for m in range(flat.shape[0]):
@@ -56,7 +62,9 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                     add(sums, (read + states) * lanes, slope)
                     for i in range(states):
                         add(sums, (read + i) * lanes, slope * load(state, i * lanes))
-                        store(state, i * lanes, slope * own[read + i])  # from here on the adjoint of the state
+                        store(
+                            state, i * lanes, slope * own[read + i]
+                        )  # from here on the adjoint of the state
                         store(state, (states + i) * lanes, slope * 0)
                     for k in range(n_window - 1, -1, -1):
                         if gates == GRU:
@@ -138,11 +146,20 @@ def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     now, first = k * (channels + states) * lanes, k * KEPT * row
     for i in range(states):
         at, unit = first + i * lanes, i * lanes
-        reset, update, candidate, recurrent = load(kept, at), load(kept, at + row), load(kept, at + 2 * row), load(kept, at + 3 * row)
+        reset, update, candidate, recurrent = (
+            load(kept, at),
+            load(kept, at + row),
+            load(kept, at + 2 * row),
+            load(kept, at + 3 * row),
+        )
         bar = load(state, unit)
         inner = bar * (1 - update) * (1 - candidate * candidate)
         store(kept, at, inner * recurrent * reset * (1 - reset))
-        store(kept, at + row, bar * (load(seen, now + (channels + i) * lanes) - candidate) * update * (1 - update))
+        store(
+            kept,
+            at + row,
+            bar * (load(seen, now + (channels + i) * lanes) - candidate) * update * (1 - update),
+        )
         store(kept, at + 2 * row, inner)
         store(kept, at + 3 * row, inner * reset)
         store(state, unit, bar * update)
@@ -157,7 +174,12 @@ def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     first = k * KEPT * row
     for i in range(states):
         at, unit = first + i * lanes, i * lanes
-        admit, keep, show, offer = load(kept, at), load(kept, at + row), load(kept, at + 2 * row), load(kept, at + 3 * row)
+        admit, keep, show, offer = (
+            load(kept, at),
+            load(kept, at + row),
+            load(kept, at + 2 * row),
+            load(kept, at + 3 * row),
+        )
         shown, bar = load(kept, at + 4 * row), load(state, unit)
         cell = load(state, row + unit) + bar * show * (1 - shown * shown)
         store(kept, at, cell * offer * admit * (1 - admit))
@@ -182,7 +204,10 @@ def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
     for j in range(states):
         bar = load(state, j * lanes)
         for g in range(gates):
-            weights, at = gates * states * channels + g * states * states + j, first + _row_of_state(gates, g) * row
+            weights, at = (
+                gates * states * channels + g * states * states + j,
+                first + _row_of_state(gates, g) * row,
+            )
             for i in range(states):
                 bar = bar + flat[weights + i * states] * load(kept, at + i * lanes)
         store(state, j * lanes, bar)
@@ -204,10 +229,18 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
             for k in range(steps):
                 offset = offset + load(kept, k * KEPT * row + at)
             store(sums, (gates * states * (channels + states) + unit) * lanes, offset)
-            for first in range(0, channels + 1, channels):  # measurements, then states; a zero by itself would be compiled for anew
+            for first in range(
+                0, channels + 1, channels
+            ):  # measurements, then states; a zero by itself would be compiled for anew
                 here = (g if first == 0 else _row_of_state(gates, g)) * row + i * lanes
-                weights, count = (unit * channels, channels) if first == 0 else (gates * states * channels + unit * states, states)
-                _sum_block(seen, kept, sums, here, first, count, (steps, row, inputs), weights * lanes)
+                weights, count = (
+                    (unit * channels, channels)
+                    if first == 0
+                    else (gates * states * channels + unit * states, states)
+                )
+                _sum_block(
+                    seen, kept, sums, here, first, count, (steps, row, inputs), weights * lanes
+                )
 
 
 @part(_nrt=False)
@@ -217,7 +250,12 @@ def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: i
     lanes = width(sums)
     for block in range(0, count, BLOCK):
         c = (first + block) * lanes
-        one, two, three, four = load(sums, 0) * 0, load(sums, 0) * 0, load(sums, 0) * 0, load(sums, 0) * 0
+        one, two, three, four = (
+            load(sums, 0) * 0,
+            load(sums, 0) * 0,
+            load(sums, 0) * 0,
+            load(sums, 0) * 0,
+        )
         left = count - block
         for k in range(steps):
             bar, x = load(kept, k * KEPT * row + at), k * inputs + c

@@ -39,14 +39,22 @@ class Recursion(NamedTuple):
         none = np.empty((0, 0), flat.dtype)
         return self._over(flat, series, starts, none, starts.shape[1], none, np.empty(0))
 
-    def gradient(self, flat: Floats, series: Floats, starts: NDArray[np.int64], weights: Floats) -> Floats:
+    def gradient(
+        self, flat: Floats, series: Floats, starts: NDArray[np.int64], weights: Floats
+    ) -> Floats:
         """Derivatives of the `values`, summed with weights (M, B), by the parameters, (M, K)."""
         gradient = np.empty_like(flat)
         self._over(flat, series, starts, weights, starts.shape[1], gradient, np.empty(0))
         return gradient
 
     def descend(
-        self, flat: Floats, series: Floats, starts: NDArray[np.int64], targets: Floats, batch: int, adam: tuple[Any, ...]
+        self,
+        flat: Floats,
+        series: Floats,
+        starts: NDArray[np.int64],
+        targets: Floats,
+        batch: int,
+        adam: tuple[Any, ...],
     ) -> Floats:
         """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,), float64.
 
@@ -61,11 +69,28 @@ class Recursion(NamedTuple):
                 `vehest.training.supervised_settings.SupervisedSettings`.
         """
         losses = np.zeros(len(flat))
-        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, (*adam[:-1], *DECAYS, EPSILON, adam[-1]))
+        self._over(
+            flat,
+            series,
+            starts,
+            targets,
+            batch,
+            np.empty_like(flat),
+            losses,
+            (*adam[:-1], *DECAYS, EPSILON, adam[-1]),
+        )
         return losses
 
     def _over(
-        self, flat: Floats, series: Floats, starts: Any, targets: Floats, batch: int, gradient: Floats, losses: Floats, adam: Any = None
+        self,
+        flat: Floats,
+        series: Floats,
+        starts: Any,
+        targets: Floats,
+        batch: int,
+        gradient: Floats,
+        losses: Floats,
+        adam: Any = None,
     ) -> Floats:
         """Values, (M, B), by all threads."""
         values, given = np.empty(starts.shape, flat.dtype), self.given(flat.dtype.type)
@@ -74,7 +99,15 @@ class Recursion(NamedTuple):
 
         def work(m: int, end: int) -> None:
             own = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
-            parts = (starts[m:end], targets[m:end], batch, values[m:end], gradient[m:end], losses[m:end], own)
+            parts = (
+                starts[m:end],
+                targets[m:end],
+                batch,
+                values[m:end],
+                gradient[m:end],
+                losses[m:end],
+                own,
+            )
             self.loop(flat[m:end], given, series, *parts)
 
         over_members(work, len(flat))
@@ -103,7 +136,11 @@ def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-unty
     for lane in range(scratch.size):
         at, slope = first + lane, scratch.dtype.type(0)
         if at < count:
-            slope = (values[at] - targets[at]) * scratch.dtype.type(2 / count) if squared else targets[at]
+            slope = (
+                (values[at] - targets[at]) * scratch.dtype.type(2 / count)
+                if squared
+                else targets[at]
+            )
         scratch[lane] = slope
 
 
@@ -129,11 +166,15 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
     for j in range(flat.size):
         g = gradient[j]
         first[m, j] += (g - first[m, j]) * number(1 - decay)
-        second[m, j] = second[m, j] * number(decay_of_squares) + g * g * number(1 - decay_of_squares)
+        second[m, j] = second[m, j] * number(decay_of_squares) + g * g * number(
+            1 - decay_of_squares
+        )
         moved = flat[j] - size * first[m, j] / (np.sqrt(second[m, j]) / root + number(epsilon))
         flat[j] = min(max(moved, bounds[0, j]), bounds[1, j])
         if averaging:
-            average[m, j] += (flat[j] - average[m, j]) * number((1 - averaging) / (1 - averaging**t))
+            average[m, j] += (flat[j] - average[m, j]) * number(
+                (1 - averaging) / (1 - averaging**t)
+            )
 
 
 @part(_nrt=False)

@@ -26,7 +26,9 @@ Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
 """Of outputs (B, O) and targets (B,): the mean loss; its gradient by the outputs, (B, O), is written into the last argument."""
 
 
-def outputs_of(inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | None = None, dropout: float = 0.0) -> Tensor:
+def outputs_of(
+    inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | None = None, dropout: float = 0.0
+) -> Tensor:
     """Outputs of M members, (M, B, O), differentiable in the parameters; h = d(relu(W x + b)) twice, then W h + b.
 
     Args:
@@ -44,7 +46,13 @@ def outputs_of(inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | Non
 
 
 def losses_of(
-    table: Tensor, targets: Tensor, rows: Tensor, parameters: Sequence[Tensor], seeds: Tensor, dropout: float, criterion: Criterion
+    table: Tensor,
+    targets: Tensor,
+    rows: Tensor,
+    parameters: Sequence[Tensor],
+    seeds: Tensor,
+    dropout: float,
+    criterion: Criterion,
 ) -> Tensor:
     """Losses of M members, each on rows of its own, (M,), differentiable in the parameters.
 
@@ -57,21 +65,37 @@ def losses_of(
         parameters: see `outputs_of`; likewise ``seeds`` and ``dropout``.
         criterion: see `Criterion`; compiled, or it keeps members from running side by side.
     """
-    losses: Tensor = _Losses.apply(table, targets, rows, seeds, round(LEVELS * dropout), criterion, *parameters)  # type: ignore[no-untyped-call]
+    losses: Tensor = _Losses.apply(
+        table, targets, rows, seeds, round(LEVELS * dropout), criterion, *parameters
+    )  # type: ignore[no-untyped-call]
     return losses
 
 
 class _Outputs(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor) -> Tensor:
-        x, weights = inputs.contiguous().numpy(), [parameter.detach().contiguous().numpy() for parameter in parameters]
+    def forward(
+        ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor
+    ) -> Tensor:
+        x, weights = (
+            inputs.contiguous().numpy(),
+            [parameter.detach().contiguous().numpy() for parameter in parameters],
+        )
         members, samples = len(weights[0]), x.shape[1]
-        layers = [np.empty((members, samples, weights[2 * layer].shape[2]), x.dtype) for layer in range(LAYERS)]
+        layers = [
+            np.empty((members, samples, weights[2 * layer].shape[2]), x.dtype)
+            for layer in range(LAYERS)
+        ]
 
         def work(first: int, end: int) -> None:
             for m in range(first, end):
                 own = [weight[m] for weight in weights]
-                _forward(x[m if len(x) > 1 else 0], *own, seeds[m], hidden, *[layer[m] for layer in layers])
+                _forward(
+                    x[m if len(x) > 1 else 0],
+                    *own,
+                    seeds[m],
+                    hidden,
+                    *[layer[m] for layer in layers],
+                )
 
         over_members(work, members)
         ctx.kept = (x, weights, layers[:-1], hidden)
@@ -86,7 +110,16 @@ class _Outputs(torch.autograd.Function):
         def work(first: int, end: int) -> None:
             for m in range(first, end):
                 own = [gradient[m] for gradient in gradients]
-                _backward(x[m if len(x) > 1 else 0], weights[2][m], weights[4][m], hidden, layers[0][m], layers[1][m], up[m], *own)
+                _backward(
+                    x[m if len(x) > 1 else 0],
+                    weights[2][m],
+                    weights[4][m],
+                    hidden,
+                    layers[0][m],
+                    layers[1][m],
+                    up[m],
+                    *own,
+                )
 
         over_members(work, len(gradients[0]))
         return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
@@ -95,7 +128,14 @@ class _Outputs(torch.autograd.Function):
 class _Losses(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, table: Tensor, targets: Tensor, rows: Tensor, seeds: Tensor, hidden: int, criterion: Criterion, *parameters: Tensor
+        ctx: Any,
+        table: Tensor,
+        targets: Tensor,
+        rows: Tensor,
+        seeds: Tensor,
+        hidden: int,
+        criterion: Criterion,
+        *parameters: Tensor,
     ) -> Tensor:
         x, y, chosen, drawn = (tensor.numpy() for tensor in (table, targets, rows, seeds))
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
@@ -103,10 +143,17 @@ class _Losses(torch.autograd.Function):
         losses = np.empty(len(chosen), x.dtype)
 
         def work(first: int, end: int) -> None:
-            layers = [np.empty((chosen.shape[1], weights[2 * layer].shape[2]), x.dtype) for layer in range(LAYERS)]
+            layers = [
+                np.empty((chosen.shape[1], weights[2 * layer].shape[2]), x.dtype)
+                for layer in range(LAYERS)
+            ]
             up = np.empty_like(layers[-1])
             for m in range(first, end):
-                seen, own, bars = x[chosen[m]], [weight[m] for weight in weights], [gradient[m] for gradient in gradients]
+                seen, own, bars = (
+                    x[chosen[m]],
+                    [weight[m] for weight in weights],
+                    [gradient[m] for gradient in gradients],
+                )
                 _forward(seen, *own, drawn[m], hidden, *layers)
                 losses[m] = criterion(layers[-1], y[chosen[m]], up)
                 _backward(seen, own[2], own[4], hidden, layers[0], layers[1], up, *bars)
@@ -117,7 +164,10 @@ class _Losses(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        scaled = (torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1))) for gradient in ctx.kept)
+        scaled = (
+            torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1)))
+            for gradient in ctx.kept
+        )
         return (None, None, None, None, None, None, *scaled)
 
 
@@ -187,7 +237,9 @@ def _activate(values, bias, seed, layer, hidden):  # type: ignore[no-untyped-def
         return
     words = (columns + 7) // 8
     mask = np.empty(8 * words, np.uint8)
-    start = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(layer + 1) * np.uint64(0xA0761D6478BD642F)
+    start = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(layer + 1) * np.uint64(
+        0xA0761D6478BD642F
+    )
     for row in range(rows):
         for word in range(words):
             z = start + np.uint64(row * words + word + 1) * np.uint64(0x9E3779B97F4A7C15)

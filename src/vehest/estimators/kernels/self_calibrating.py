@@ -29,11 +29,25 @@ SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
 # rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
-AT = np.array([[min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)] for i in range(STATES)])
+AT = np.array(
+    [
+        [min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)]
+        for i in range(STATES)
+    ]
+)
 AT = (STATES + AT) * (BYTES // 8)
-GRIP, WEIGHT, KNOWN = range(STATES + 36, STATES + 39)  # grip limit, weight among all filters and among those without the network's
-COST, TOTAL = STATES + 39, STATES + 41  # of both measurements: what lowers the log likelihood, variance of the residual
-ROW, SHARED, ROWS = STATES + 43, STATES + 51, STATES + 59  # derivatives of a measurement, its covariances with the states
+GRIP, WEIGHT, KNOWN = range(
+    STATES + 36, STATES + 39
+)  # grip limit, weight among all filters and among those without the network's
+COST, TOTAL = (
+    STATES + 39,
+    STATES + 41,
+)  # of both measurements: what lowers the log likelihood, variance of the residual
+ROW, SHARED, ROWS = (
+    STATES + 43,
+    STATES + 51,
+    STATES + 59,
+)  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
@@ -59,8 +73,12 @@ def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
     """
     lanes = width(f)
     grip = load(f, GRIP * lanes)
-    force = (lags[AY] - load(f, OFFSET_Y * lanes)) * (1.0 - load(f, LEAKAGE * lanes)) - load(f, REAR * lanes) * turning
-    limit = choose(grip > 0.0, root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip)), 1.0)
+    force = (lags[AY] - load(f, OFFSET_Y * lanes)) * (1.0 - load(f, LEAKAGE * lanes)) - load(
+        f, REAR * lanes
+    ) * turning
+    limit = choose(
+        grip > 0.0, root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip)), 1.0
+    )
     rest = 1.0 - least(abs(force) / limit, n.largest_share)
     store(f, SHARED * lanes, rest)
     for k in range(SHARED * lanes, (SHARED + 1) * lanes):
@@ -77,7 +95,11 @@ def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # t
     """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
     lanes = width(f)
     v, v_v, v_u, u_u = load(f, V * lanes), load(f, AT[V, V]), load(f, AT[V, U]), load(f, AT[U, U])
-    store(f, V * lanes, v + n.dt * (ay * (1.0 - load(f, LEAKAGE * lanes)) - load(f, OFFSET_Y * lanes) - turn))
+    store(
+        f,
+        V * lanes,
+        v + n.dt * (ay * (1.0 - load(f, LEAKAGE * lanes)) - load(f, OFFSET_Y * lanes) - turn),
+    )
     store(f, U * lanes, load(f, U * lanes) + n.dt * (ax - load(f, OFFSET_X * lanes) + yaw_rate * v))
     u_v = v_u + n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X]))  # here of A P, below of A P A'
     u_u += n.dt * (yaw_rate * v_u - load(f, AT[U, OFFSET_X]))
@@ -117,16 +139,26 @@ def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-
     Returns the residual, its variance, and half the square of what the grip limit rules out, over a sample.
     """
     lanes = width(f)
-    offset, rear, compliance = load(f, OFFSET_Y * lanes), load(f, REAR * lanes), load(f, COMPLIANCE * lanes)
+    offset, rear, compliance = (
+        load(f, OFFSET_Y * lanes),
+        load(f, REAR * lanes),
+        load(f, COMPLIANCE * lanes),
+    )
     own = 1.0 - load(f, LEAKAGE * lanes)
     slip, slope, excess = _rear_slip(f, lags, turning, n)
     smooth = load(f, V * lanes) - lags[SUM_AY] * own + offset * lags[SUM_ONE] + lags[SUM_TURN]
-    residual = rear * lags[YAW_RATE] - compliance * speed * slip - size * load(f, ERROR * lanes) - smooth
+    residual = (
+        rear * lags[YAW_RATE] - compliance * speed * slip - size * load(f, ERROR * lanes) - smooth
+    )
     gain = compliance * speed * slope
     store(f, (ROW + V) * lanes, 1.0)
     store(f, (ROW + OFFSET_Y) * lanes, lags[SUM_ONE] - gain * own)
     store(f, (ROW + LEAKAGE) * lanes, lags[SUM_AY] - gain * (lags[AY] - offset))
-    store(f, (ROW + REAR) * lanes, choose(load(f, GRIP * lanes) > 0.0, -lags[YAW_RATE] - gain * turning, 0.0))
+    store(
+        f,
+        (ROW + REAR) * lanes,
+        choose(load(f, GRIP * lanes) > 0.0, -lags[YAW_RATE] - gain * turning, 0.0),
+    )
     store(f, (ROW + COMPLIANCE) * lanes, speed * slip)
     store(f, (ROW + ERROR) * lanes, size)
     variance = 0.0 * slip + n.axle_white**2 + n.axle_white_share * size**2
@@ -183,7 +215,10 @@ def _network(theta, yaw_rate_max, series, first, steps, dt):  # type: ignore[no-
     for at in range(first, first + steps):
         yaw_rate, speed = load(series, at), load(series, row + at)
         place = least(abs(yaw_rate) * ((local - 1) / yaw_rate_max), local - 1.0)
-        slip, thrust = dt * (load(series, 2 * row + at) - speed * yaw_rate), dt * (load(series, 3 * row + at) + v * yaw_rate)
+        slip, thrust = (
+            dt * (load(series, 2 * row + at) - speed * yaw_rate),
+            dt * (load(series, 3 * row + at) + v * yaw_rate),
+        )
         error, next_v, next_u = u - speed, 0.0 * u, 0.0 * u
         for m in range(local):
             share = most(1.0 - abs(place - m), 0.0)
@@ -205,7 +240,11 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
     for at, value in ((YAW_RATE, sample[0]), (AY, sample[2]), (AX, sample[3])):
         lags[at] += g * (value - lags[at])
     lags[SPEED] += g_1 * (sample[1] - lags[SPEED])
-    ay, ax, turn = (last[2] + sample[2]) / 2.0, (last[3] + sample[3]) / 2.0, (last[0] * last[1] + sample[0] * sample[1]) / 2.0
+    ay, ax, turn = (
+        (last[2] + sample[2]) / 2.0,
+        (last[3] + sample[3]) / 2.0,
+        (last[0] * last[1] + sample[0] * sample[1]) / 2.0,
+    )
     for at, value in ((SUM_AY, ay), (SUM_TURN, turn), (SUM_ONE, 1.0)):
         lags[at] = (1.0 - g) * (lags[at] + n.dt * value)
     for at, value in ((SUM_AY_1, ay), (SUM_TURN_1, turn), (SUM_AX_1, ax)):
@@ -238,9 +277,15 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
             one[CROSS_Y] = one[CROSS_Y] * keep + y * ay * n.dt
             one[SQUARE_X] = one[SQUARE_X] * keep + x * x * n.dt
         time = max(lags[TIME], n.dt)
-        leakage = min(max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage)
-        left[c] = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
-        score = n.lateral_power * math.log(left[c] + floor) + n.longitudinal_power * math.log(one[SQUARE_X] / time + floor)
+        leakage = min(
+            max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage
+        )
+        left[c] = (
+            max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
+        )
+        score = n.lateral_power * math.log(left[c] + floor) + n.longitudinal_power * math.log(
+            one[SQUARE_X] / time + floor
+        )
         weights[c] = odds[c] - 0.5 * score * lags[TIME] / (lags[TIME] + n.decision_time)
     _normalise(weights, weights, CANDIDATES)
 
@@ -261,18 +306,32 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         found: output, vy and its variance, (T, 2).
         parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample alone.
     """
-    g, g_1, g_slow = -math.expm1(-n.dt / n.axle_lag), -math.expm1(-n.dt / n.residual_time), -math.expm1(-n.dt / n.slow_time)
-    lags, log_weights, lanes, count, steps = state.lags, state.log_weights, width(grips), len(grips), len(state.window)
+    g, g_1, g_slow = (
+        -math.expm1(-n.dt / n.axle_lag),
+        -math.expm1(-n.dt / n.residual_time),
+        -math.expm1(-n.dt / n.slow_time),
+    )
+    lags, log_weights, lanes, count, steps = (
+        state.lags,
+        state.log_weights,
+        width(grips),
+        len(grips),
+        len(state.window),
+    )
     bank, own = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes)), np.zeros((3, 4))
     values, left, sample, last = own[0], own[1], own[2], state.last
-    for k in range(len(bank) * lanes):  # lanes beyond the last filter are as that one, without weight
+    for k in range(
+        len(bank) * lanes
+    ):  # lanes beyond the last filter are as that one, without weight
         j, f = min(k, count - 1), bank[k // lanes]
         f[GRIP * lanes + k % lanes] = grips[j]
         for i in range(STATES):
             f[i * lanes + k % lanes] = state.means[j, i]
             for c in range(i, STATES):
                 f[AT[i, c] + k % lanes] = state.covariances[j, i, c]
-    series = np.zeros((5, steps + len(samples) + lanes))  # the window and the samples after it, and the network's v
+    series = np.zeros(
+        (5, steps + len(samples) + lanes)
+    )  # the window and the samples after it, and the network's v
     for t in range(steps + len(samples)):
         for i in range(4):
             series[i, t] = state.window[t, i] if t < steps else samples[t - steps, i]
@@ -287,7 +346,9 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for i in range(4):
             sample[i] = series[i, steps + t]
         turning = _advance_lags(lags, sample, last, n, g, g_1, g_slow)
-        slip = (n.rear * sample[0] - series[4, t]) / (n.compliance * max(sample[1], n.minimum_speed))
+        slip = (n.rear * sample[0] - series[4, t]) / (
+            n.compliance * max(sample[1], n.minimum_speed)
+        )
         lags[SLIP] += g * (slip - lags[SLIP])
         speed, moving = sample[1], sample[1] > n.minimum_speed
         yaw_rate, turn = (last[0] + sample[0]) / 2.0, (last[0] * last[1] + sample[0] * speed) / 2.0
@@ -295,34 +356,65 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         size = 0.0
         for b in range(len(bank) if moving else 0):
             slips, slope, _ = _rear_slip(bank[b], lags, turning, n)
-            bent = n.axle_per_slip * abs(slips) + n.axle_per_bend * most(slope - 1.0, 0.0) + n.axle_per_slope * slope
+            bent = (
+                n.axle_per_slip * abs(slips)
+                + n.axle_per_bend * most(slope - 1.0, 0.0)
+                + n.axle_per_slope * slope
+            )
             sizes = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
             size += total(load(bank[b], WEIGHT * lanes) * sizes)
         for b in range(len(bank)):
             f = bank[b]
             _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, turning * speed)
-            for k in range(2):  # the speed is measured, and the rear axle, which rolls (v = b ω) where the car is slow
+            for k in range(
+                2
+            ):  # the speed is measured, and the rear axle, which rolls (v = b ω) where the car is slow
                 surplus = 0.0 * load(f, 0)
                 if k == 0:
                     residual, variance = _of_two(f, U, U, 0.0, speed, n.noise_speed**2)
                 elif moving:
-                    residual, variance, surplus = _axle(f, n, lags, turning, speed, size, len(prior))
+                    residual, variance, surplus = _axle(
+                        f, n, lags, turning, speed, size, len(prior)
+                    )
                 else:
                     residual, variance = _of_two(f, V, REAR, -sample[0], 0.0, ROLLING**2)
                 store(f, (TOTAL + k) * lanes, variance)
-                store(f, (COST + k) * lanes, _update(f, residual, variance, n.gate, moving, len(prior)) + surplus)
+                store(
+                    f,
+                    (COST + k) * lanes,
+                    _update(f, residual, variance, n.gate, moving, len(prior)) + surplus,
+                )
         if moving:
             for j in range(count):
                 f, lane = bank[j // lanes], j % lanes
                 cost = f[COST * lanes + lane] + f[(COST + 1) * lanes + lane]
-                likelihood = -cost - 0.5 * math.log(f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane])
-                log_weights[j] = start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
+                likelihood = -cost - 0.5 * math.log(
+                    f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane]
+                )
+                log_weights[j] = (
+                    start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
+                )
             _weigh(bank, log_weights)
         known = parameters[min(t, len(parameters) - 1)]
         rear = _mixture(bank, known)
-        values[BANK], values[NETWORK] = known[V] + n.rear_known * (n.rear - rear) * sample[0], series[4, t]
+        values[BANK], values[NETWORK] = (
+            known[V] + n.rear_known * (n.rear - rear) * sample[0],
+            series[4, t],
+        )
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
-        _judge(values, state.candidates, state.weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving)
+        _judge(
+            values,
+            state.candidates,
+            state.weights,
+            left,
+            lags,
+            sample,
+            yaw_rate,
+            n,
+            g_1,
+            g_slow,
+            moving,
+        )
         _combine(values, state.weights, left, known, sample, n, found[t])
         for i in range(4):
             last[i] = sample[i]
@@ -395,7 +487,11 @@ def _combine(values, weights, left, parameters, sample, n, found):  # type: igno
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
-    mean, spread, unexplained = own[0] * values[0] + own[1] * values[1] + own[2] * values[2], 0.0, 0.0
+    mean, spread, unexplained = (
+        own[0] * values[0] + own[1] * values[1] + own[2] * values[2],
+        0.0,
+        0.0,
+    )
     for c in range(CANDIDATES):
         spread += own[c] * (values[c] - mean) ** 2
         unexplained += own[c] * left[c]

@@ -41,7 +41,9 @@ def over_members(work: Callable[[int, int], None], members: int, pieces: int = P
         work(0, members)
         return
     pieces = min(pieces * threads, members)
-    left = iter([(members * piece // pieces, members * (piece + 1) // pieces) for piece in range(pieces)])
+    left = iter(
+        [(members * piece // pieces, members * (piece + 1) // pieces) for piece in range(pieces)]
+    )
 
     def take() -> None:
         for first, end in left:  # whoever is free takes the next
@@ -59,5 +61,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="vehest-members")
 
 
-if hasattr(os, "register_at_fork"):  # a forked process does not inherit the threads; Windows forks none
+if hasattr(
+    os, "register_at_fork"
+):  # a forked process does not inherit the threads; Windows forks none
     os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -19,20 +19,37 @@ class CompiledNetwork(ABC):
     def recursion(self) -> Recursion:
         """The compiled recursion."""
 
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+    def compiled_members(
+        self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor
+    ) -> Tensor:
         """Predictions of M members, each on its own windows, (M, B)."""
         flat = torch.cat([values.reshape(len(values), -1) for values in parameters.values()], 1)
         result: Tensor = _Predict.apply(flat, prepared, starts, self.recursion())  # type: ignore[no-untyped-call]
         return result
 
     def compiled_descent(
-        self, flat: Tensor, moments: Mapping[str, Tensor], prepared: Tensor, starts: Tensor, targets: Tensor, batch: int, *rest: Any
+        self,
+        flat: Tensor,
+        moments: Mapping[str, Tensor],
+        prepared: Tensor,
+        starts: Tensor,
+        targets: Tensor,
+        batch: int,
+        *rest: Any,
     ) -> Tensor:
         """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq`` as torch names them, and ``average``."""
         rate, bounds, averaging = rest
         names = ("exp_avg", "exp_avg_sq", "average" if "average" in moments else "exp_avg")
-        adam = (*(moments[name].numpy() for name in names), bounds.numpy(), float(moments["step"]), float(rate), float(averaging))
-        series, rows, wanted = (tensor.contiguous().numpy() for tensor in (prepared, starts, targets))
+        adam = (
+            *(moments[name].numpy() for name in names),
+            bounds.numpy(),
+            float(moments["step"]),
+            float(rate),
+            float(averaging),
+        )
+        series, rows, wanted = (
+            tensor.contiguous().numpy() for tensor in (prepared, starts, targets)
+        )
         losses = self.recursion().descend(flat.numpy(), series, rows, wanted, batch, adam)
         moments["step"] += -(-starts.shape[1] // batch)
         return torch.from_numpy(losses)
@@ -40,10 +57,20 @@ class CompiledNetwork(ABC):
 
 class _Predict(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, flat: Tensor, prepared: Tensor, starts: Tensor, recursion: Recursion) -> Tensor:
-        ctx.recursion, ctx.arrays = recursion, [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)]
+    def forward(
+        ctx: Any, flat: Tensor, prepared: Tensor, starts: Tensor, recursion: Recursion
+    ) -> Tensor:
+        ctx.recursion, ctx.arrays = (
+            recursion,
+            [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)],
+        )
         return torch.from_numpy(recursion.values(*ctx.arrays))
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return torch.from_numpy(ctx.recursion.gradient(*ctx.arrays, upstream[0].contiguous().numpy())), None, None, None
+        return (
+            torch.from_numpy(ctx.recursion.gradient(*ctx.arrays, upstream[0].contiguous().numpy())),
+            None,
+            None,
+            None,
+        )

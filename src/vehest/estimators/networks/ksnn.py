@@ -48,14 +48,18 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         self.settings = settings
         self.step = 1.0 / settings.rate_hz
         self.register_buffer("yaw_rate_max", torch.tensor(float(yaw_rate_max)))
-        for name, shape in kernel.shapes_of(settings.n_local, settings.n_hidden, bias=settings.bias).items():
+        for name, shape in kernel.shapes_of(
+            settings.n_local, settings.n_hidden, bias=settings.bias
+        ).items():
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw initial weights near the kinematic observer: γ ≈ 0.98, β ≈ 1, small feedback."""
         with torch.no_grad():
             for name, parameter in self.named_parameters():
-                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64).to(parameter.dtype)
+                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64).to(
+                    parameter.dtype
+                )
                 if name == "gamma":
                     parameter.copy_((GAMMA_START + GAMMA_SPREAD * noise).clamp(max=1.0))
                 elif name == "beta":
@@ -75,7 +79,9 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
 
     def activations(self, yaw_rate: Tensor) -> Tensor:
         """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the last one alone."""
-        position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(max=self.settings.n_local - 1)
+        position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(
+            max=self.settings.n_local - 1
+        )
         centres = torch.arange(self.settings.n_local, dtype=yaw_rate.dtype)
         return (1.0 - (position.unsqueeze(-1) - centres).abs()).clamp(min=0.0)
 
@@ -104,8 +110,14 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
             f = self.feedback(u - speed[..., k])
             slip = self.step * (ay[..., k] - speed[..., k] * omega)
             thrust = self.step * (ax[..., k] + v * omega)
-            v_local = self.gamma[:, 0] * v[..., None] + self.beta[:, 0] * slip[..., None] - omega[..., None] * f[..., 0]
-            u_local = self.gamma[:, 1] * u[..., None] + self.beta[:, 1] * thrust[..., None] - f[..., 1]
+            v_local = (
+                self.gamma[:, 0] * v[..., None]
+                + self.beta[:, 0] * slip[..., None]
+                - omega[..., None] * f[..., 0]
+            )
+            u_local = (
+                self.gamma[:, 1] * u[..., None] + self.beta[:, 1] * thrust[..., None] - f[..., 1]
+            )
             v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
         return v
 

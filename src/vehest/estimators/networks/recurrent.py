@@ -18,7 +18,9 @@ from vehest.estimators.networks.compiled import CompiledNetwork
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.estimators.networks.windowed import WindowedEstimator
 
-TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
+TRIAL = Trial(
+    7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)"
+)
 
 
 class HiddenStateEstimator(Network):
@@ -67,7 +69,9 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
                 if name.endswith("bias"):
                     parameter.zero_()
                     continue
-                fan_out, fan_in = parameter.shape[-2:] if parameter.dim() > 1 else (1, parameter.shape[0])
+                fan_out, fan_in = (
+                    parameter.shape[-2:] if parameter.dim() > 1 else (1, parameter.shape[0])
+                )
                 limit = (6.0 / (fan_in + fan_out)) ** 0.5
                 draw = torch.rand(parameter.shape, generator=generator, dtype=torch.float64)
                 parameter.copy_((2.0 * draw - 1.0) * limit)
@@ -83,8 +87,15 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
 
     def recursion(self) -> Recursion:
         """The compiled recursion."""
-        gates, own, mean, scale = self.n_gates, self.settings, float(self.output_mean), float(self.output_scale)
-        return Recursion(loop, lambda number: (gates, own.n_states, own.window, number(mean), number(scale)))
+        gates, own, mean, scale = (
+            self.n_gates,
+            self.settings,
+            float(self.output_mean),
+            float(self.output_scale),
+        )
+        return Recursion(
+            loop, lambda number: (gates, own.n_states, own.window, number(mean), number(scale))
+        )
 
 
 class RecurrentEstimator(HiddenStateEstimator, WindowedEstimator):

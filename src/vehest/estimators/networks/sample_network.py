@@ -24,7 +24,10 @@ from vehest.training.sequences import record_of_phases, train_phases
 
 CORNERS = ("fl", "fr", "rl", "rr")
 IMU = ("ax", "ay", "vx", "steer", "yaw_rate")
-INPUTS: dict[str, tuple[str, ...]] = {"full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)), "imu": IMU}
+INPUTS: dict[str, tuple[str, ...]] = {
+    "full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)),
+    "imu": IMU,
+}
 """Sets of inputs: with tyre forces (Bertipaglia et al. 2024, Section III-A, 17 of them), and without."""
 
 Normalisation = Literal["range", "standard"]
@@ -41,20 +44,29 @@ class SampleNetworkEstimator(Network):
     network: SampleNetwork
     network_inputs: tuple[str, ...]  # measured channels that the network sees
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
-    dropout: float = setting(0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0)
-    normalisation: Normalisation = setting("range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1")
+    dropout: float = setting(
+        0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0
+    )
+    normalisation: Normalisation = setting(
+        "range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1"
+    )
 
     def check(self) -> None:
         """Layers have neurons."""
         super().check()
         if min(self.hidden) < 1:
-            raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}")
+            raise ConfigurationError(
+                f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}"
+            )
 
     def prepare_network(
         self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
     ) -> tuple[SampleNetwork, Samples, Samples]:
         """A new network with initial weights, a seed a member, and samples of training and validation as it takes them."""
-        raw, judged = (learnt_samples(part, self.network_inputs, self.name, minimum_speed) for part in (data.train, data.validation))
+        raw, judged = (
+            learnt_samples(part, self.network_inputs, self.name, minimum_speed)
+            for part in (data.train, data.validation)
+        )
         network = self.network = self.new_network().to(getattr(torch, training.dtype))
         network.scale(*raw, self.normalisation)
         network.reset([torch.Generator().manual_seed(seed) for seed in seeds])
@@ -83,7 +95,9 @@ class SampleNetworkEstimator(Network):
             lambda draw: network.losses(train, draw, self.dropout, criterion) * unit,
             lambda: network.validation_losses(validation, criterion) * unit,
         )
-        return record_of_phases(train_phases([phase], self._seed, context, index, training.checkpoint_seconds))
+        return record_of_phases(
+            train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
+        )
 
 
 class SampleNetwork(nn.Module):
@@ -100,14 +114,18 @@ class SampleNetwork(nn.Module):
     input_span: Tensor
     unit: Tensor
 
-    def __init__(self, n_inputs: int, hidden: tuple[int, int], n_outputs: int, members: int = 1) -> None:
+    def __init__(
+        self, n_inputs: int, hidden: tuple[int, int], n_outputs: int, members: int = 1
+    ) -> None:
         super().__init__()
         self.members = members
         self.register_buffer("input_low", torch.zeros(n_inputs))
         self.register_buffer("input_span", torch.ones(n_inputs))
         self.register_buffer("unit", torch.ones(()))
         for layer, (before, after) in enumerate(pairwise((n_inputs, *hidden, n_outputs)), start=1):
-            self.register_parameter(f"weight_{layer}", nn.Parameter(torch.zeros(members, before, after)))
+            self.register_parameter(
+                f"weight_{layer}", nn.Parameter(torch.zeros(members, before, after))
+            )
             self.register_parameter(f"bias_{layer}", nn.Parameter(torch.zeros(members, after)))
 
     def reset(self, generators: Sequence[torch.Generator]) -> None:
@@ -122,7 +140,9 @@ class SampleNetwork(nn.Module):
                     draw = torch.rand(parameter.shape[1:], generator=generator, dtype=torch.float64)
                     parameter[member].copy_((2.0 * draw - 1.0) * limit)
 
-    def scale(self, inputs: FloatArray, sideslip: FloatArray, normalisation: Normalisation = "range") -> None:
+    def scale(
+        self, inputs: FloatArray, sideslip: FloatArray, normalisation: Normalisation = "range"
+    ) -> None:
         """Take scales of inputs, (N, C), and the unit of targets, (N,) [rad], from training samples.
 
         ``range`` maps inputs to [0, 1] by their extremes, ``standard`` to a mean of 0 and a standard deviation of 1.
@@ -140,7 +160,9 @@ class SampleNetwork(nn.Module):
 
     def samples(self, inputs: FloatArray, sideslip: FloatArray) -> Samples:
         """Measured inputs (N, C) and sideslip angles (N,) [rad] as the network takes them."""
-        seen, wanted = (torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip))
+        seen, wanted = (
+            torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip)
+        )
         return Samples(self.scaled(seen).contiguous(), wanted / self.unit)
 
     def forward(self, inputs: Tensor, seeds: Tensor | None = None, dropout: float = 0.0) -> Tensor:
@@ -149,7 +171,9 @@ class SampleNetwork(nn.Module):
 
     def losses(self, samples: Samples, draw: Draw, dropout: float, criterion: Criterion) -> Tensor:
         """Losses of a batch, (M,); see `losses_of`."""
-        return losses_of(*samples, draw.rows, list(self.parameters()), draw.seeds, dropout, criterion)
+        return losses_of(
+            *samples, draw.rows, list(self.parameters()), draw.seeds, dropout, criterion
+        )
 
     def outputs(self, inputs: FloatArray) -> NDArray[Any]:
         """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's own units."""
@@ -162,7 +186,10 @@ class SampleNetwork(nn.Module):
 
     def c_values(self) -> dict[str, Any]:
         """Weights and ranges, and the largest angle, for a C template."""
-        return {name: tensor.detach().numpy().astype(np.float64) for name, tensor in self.state_dict().items()} | {"steepest": STEEPEST}
+        return {
+            name: tensor.detach().numpy().astype(np.float64)
+            for name, tensor in self.state_dict().items()
+        } | {"steepest": STEEPEST}
 
     def validation_losses(self, samples: Samples, criterion: Criterion) -> Tensor:
         """Losses on samples without dropout, (M,)."""
@@ -177,7 +204,10 @@ class SampleNetwork(nn.Module):
 
 
 def learnt_samples(
-    recordings: Sequence[Recording], channels: Sequence[str], estimator: str, minimum_speed: float = -np.inf
+    recordings: Sequence[Recording],
+    channels: Sequence[str],
+    estimator: str,
+    minimum_speed: float = -np.inf,
 ) -> tuple[FloatArray, FloatArray]:
     """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,) [rad], recordings one after another.
 
@@ -190,9 +220,13 @@ def learnt_samples(
     require_learnable(recordings, (*channels, "vy_ref"), estimator, hints=hints)
     fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
     if not fast.any():
-        raise DataError(f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s")
+        raise DataError(
+            f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s"
+        )
     inputs = np.concatenate([recording.stack(channels) for recording in recordings])
-    return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
+    return inputs[fast], np.concatenate(
+        [reference_sideslip(recording) for recording in recordings]
+    )[fast]
 
 
 def reference_sideslip(recording: Recording) -> FloatArray:

@@ -30,9 +30,17 @@ class StandardisedNetwork(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(shape))
             self.register_buffer(f"{name}_scale", torch.ones(shape))
 
-    def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = ("vy_ref",)) -> None:
+    def standardise(
+        self,
+        train: Sequence[Recording],
+        channels: Sequence[str],
+        references: Sequence[str] = ("vy_ref",),
+    ) -> None:
         """Take means and standard deviations from recordings."""
-        parts = ((self.input_mean, self.input_scale, channels), (self.output_mean, self.output_scale, references))
+        parts = (
+            (self.input_mean, self.input_scale, channels),
+            (self.output_mean, self.output_scale, references),
+        )
         for mean, scale, names in parts:
             samples = np.concatenate([recording.stack(names) for recording in train])
             mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))

@@ -47,16 +47,29 @@ class SequenceSettings(Group):
     version: ClassVar[str] = "1"
     phase: PhaseSettings = setting(PhaseSettings(), "the one phase of the training")
     sequence_steps: int = setting(300, "samples in a training sequence, the dropped ones included")
-    validation_steps: int = setting(1000, "samples in a validation sequence, the dropped ones included")
-    dropped_steps: int = setting(200, "first samples of every sequence, on which the hidden state settles, without loss", least=0)
-    validation_dropped_steps: int | None = setting(None, "the same of validation sequences; null: as in training", least=0)
+    validation_steps: int = setting(
+        1000, "samples in a validation sequence, the dropped ones included"
+    )
+    dropped_steps: int = setting(
+        200,
+        "first samples of every sequence, on which the hidden state settles, without loss",
+        least=0,
+    )
+    validation_dropped_steps: int | None = setting(
+        None, "the same of validation sequences; null: as in training", least=0
+    )
     truncate_steps: int = setting(
         0,
         "samples that gradients reach back: drives are then cut whole into sequences of sequence_steps and less, with a step after every "
         "so many samples, the hidden state carried on; 0: to the start of the sequence, and remainders are left out",
         least=0,
     )
-    mirrored: float = setting(0.0, "share of training sequences that are seen in a mirror, left for right", least=0.0, most=1.0)
+    mirrored: float = setting(
+        0.0,
+        "share of training sequences that are seen in a mirror, left for right",
+        least=0.0,
+        most=1.0,
+    )
     batch_size: int = setting(4, "sequences in a batch", least=1)
     weight_vx: float = setting(0.2225, "of the squared error of vx in the loss", least=0.0)
     weight_vy: float = setting(0.5064, "of vy", least=0.0)
@@ -66,14 +79,23 @@ class SequenceSettings(Group):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, dropped in (("sequence_steps", self.dropped_steps), ("validation_steps", self.settling_steps)):
+        for name, dropped in (
+            ("sequence_steps", self.dropped_steps),
+            ("validation_steps", self.settling_steps),
+        ):
             if getattr(self, name) <= dropped:
-                raise ConfigurationError(f"training.{name} must be more than dropped_steps ({dropped}), not {getattr(self, name)}")
+                raise ConfigurationError(
+                    f"training.{name} must be more than dropped_steps ({dropped}), not {getattr(self, name)}"
+                )
 
     @property
     def settling_steps(self) -> int:
         """First samples of a validation sequence that do not count."""
-        return self.dropped_steps if self.validation_dropped_steps is None else self.validation_dropped_steps
+        return (
+            self.dropped_steps
+            if self.validation_dropped_steps is None
+            else self.validation_dropped_steps
+        )
 
 
 class VelocityNetwork(StandardisedNetwork):
@@ -90,12 +112,20 @@ class VelocityNetwork(StandardisedNetwork):
         """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden state for gates; biases alike."""
         with torch.no_grad():
             for module in self.modules():
-                n = module.hidden_size if isinstance(module, nn.RNNBase) else module.in_features if isinstance(module, nn.Linear) else 0
+                n = (
+                    module.hidden_size
+                    if isinstance(module, nn.RNNBase)
+                    else module.in_features
+                    if isinstance(module, nn.Linear)
+                    else 0
+                )
                 for parameter in module.parameters(recurse=False):
                     draw = torch.rand(parameter.shape, generator=generator, dtype=torch.float64)
                     parameter.copy_((2.0 * draw - 1.0) / math.sqrt(n))
 
-    def forward(self, measured: Tensor, state: State, mask: Tensor | None = None) -> tuple[Tensor, State]:
+    def forward(
+        self, measured: Tensor, state: State, mask: Tensor | None = None
+    ) -> tuple[Tensor, State]:
         """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the last, of measurements (B, T, C) [SI].
 
         The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B, T, H), is what the hidden state is
@@ -130,11 +160,19 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     template = "velocity_recurrent"
     network: VelocityNetwork
     inputs: tuple[str, ...] = setting(
-        ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"), "measured channels that the network sees"
+        ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"),
+        "measured channels that the network sees",
     )
-    outputs: tuple[str, ...] = setting(("vx", "vy", "yaw_rate"), "what it estimates, each learnt from its _ref channel")
+    outputs: tuple[str, ...] = setting(
+        ("vx", "vy", "yaw_rate"), "what it estimates, each learnt from its _ref channel"
+    )
     n_states: int = setting(64, "size of the hidden state", least=1)
-    dropout: float = setting(0.0, "share of the hidden state that is hidden from later layers in training", least=0.0, below=1.0)
+    dropout: float = setting(
+        0.0,
+        "share of the hidden state that is hidden from later layers in training",
+        least=0.0,
+        below=1.0,
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -146,20 +184,31 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         """Raises `ConfigurationError`: inputs or outputs that repeat or are unknown, or a reference among the inputs."""
         for name in ("inputs", "outputs"):
             if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
-                raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}")
+                raise ConfigurationError(
+                    f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}"
+                )
         for name in self.inputs:
             try:
                 reference = channel(name).is_reference
             except DataError as error:
                 raise ConfigurationError(f"estimator.inputs: {error}") from None
             if reference:
-                raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
+                raise ConfigurationError(
+                    f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees"
+                )
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
-            raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
+            raise ConfigurationError(
+                f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}"
+            )
 
-    def fit_member(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
+    def fit_member(
+        self, data: FitData, training: SequenceSettings, context: FitContext, index: int
+    ) -> FitRecord:
         """Train on sequences."""
-        train, validation = (_Drives(self, part, getattr(torch, training.dtype)) for part in (data.train, data.validation))
+        train, validation = (
+            _Drives(self, part, getattr(torch, training.dtype))
+            for part in (data.train, data.validation)
+        )
         network = self.network = self.new_network().to(getattr(torch, training.dtype))
         network.standardise(data.train, self.inputs, self.learns_from)
         network.reset(torch.Generator().manual_seed(self._seed))
@@ -171,24 +220,36 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             "skipped_steps": record.skipped_steps,
             "train_seconds": record.seconds,
         }
-        return record_of_epochs(record.train_loss, record.validation_loss, metrics, record.interrupted)
+        return record_of_epochs(
+            record.train_loss, record.validation_loss, metrics, record.interrupted
+        )
 
     def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
         """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read, and 0 for the lateral velocity."""
         n = len(channels["vx"])
-        columns = [channels[name] if name in self.channels and name != "vy" else np.zeros(n) for name in self.outputs]
+        columns = [
+            channels[name] if name in self.channels and name != "vy" else np.zeros(n)
+            for name in self.outputs
+        ]
         return np.stack(columns, axis=1)
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> State:
         """State of the network that starts from given velocities, else measured ones."""
-        measured = self._measured_velocities({name: np.array([value]) for name, value in zip(self.channels, sample.tolist(), strict=True)})
+        measured = self._measured_velocities(
+            {
+                name: np.array([value])
+                for name, value in zip(self.channels, sample.tolist(), strict=True)
+            }
+        )
         values = [given.get(name, own) for name, own in zip(self.outputs, measured[0], strict=True)]
         with torch.no_grad():
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
         """Velocities [m/s, rad/s]."""
-        inputs = torch.from_numpy(samples.take(self._columns, 1)).to(self.network.input_mean.dtype)[None]
+        inputs = torch.from_numpy(samples.take(self._columns, 1)).to(self.network.input_mean.dtype)[
+            None
+        ]
         pieces = []
         with torch.no_grad():
             for first in range(0, len(samples), CHUNK):
@@ -198,7 +259,10 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
     def c_values(self) -> dict[str, Any]:
         """Weights, sizes, and what estimates start from."""
-        s, weights = self.settings, {name: array.astype(np.float64) for name, array in self.weights().items()}
+        s, weights = (
+            self.settings,
+            {name: array.astype(np.float64) for name, array in self.weights().items()},
+        )
         return {
             **{name.replace(".", "_"): array for name, array in weights.items()},
             "states": s.n_states,
@@ -207,7 +271,9 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             "dense": getattr(s, "n_dense", 0),
             "inputs": s.inputs,
             "outputs": s.outputs,
-            "starts": [name if name in self.channels and name != "vy" else None for name in s.outputs],
+            "starts": [
+                name if name in self.channels and name != "vy" else None for name in s.outputs
+            ],
         }
 
 
@@ -218,29 +284,52 @@ class _Batch(NamedTuple):
     inputs: Tensor  # measurements, (B, T, C)
     targets: Tensor  # references, (B, T, O)
     mask: Tensor | None = None  # of dropout, (B, T, H)
-    counted: Tensor | None = None  # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
-    goes_on: bool = False  # whether the batch continues the one before, whose hidden state it starts from
+    counted: Tensor | None = (
+        None  # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
+    )
+    goes_on: bool = (
+        False  # whether the batch continues the one before, whose hidden state it starts from
+    )
 
     def stretch(self, first: int, end: int) -> _Batch:
         """Its samples from ``first`` to ``end``."""
         parts = {name: getattr(self, name) for name in ("inputs", "targets", "mask", "counted")}
-        return self._replace(goes_on=first > 0, **{name: part[:, first:end] for name, part in parts.items() if part is not None})
+        return self._replace(
+            goes_on=first > 0,
+            **{name: part[:, first:end] for name, part in parts.items() if part is not None},
+        )
 
 
 class _Drives:
     """Recordings one after another as tensors, (N, …), from which sequences are cut by their first samples."""
 
-    def __init__(self, estimator: RecurrentVelocityEstimator, recordings: Sequence[Recording], dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        estimator: RecurrentVelocityEstimator,
+        recordings: Sequence[Recording],
+        dtype: torch.dtype,
+    ) -> None:
         require_learnable(recordings, (*estimator.channels, *estimator.learns_from), estimator.name)
-        self.names, self.lengths = [recording.id for recording in recordings], [len(recording) for recording in recordings]
+        self.names, self.lengths = (
+            [recording.id for recording in recordings],
+            [len(recording) for recording in recordings],
+        )
         parts = (
             [estimator._measured_velocities(recording.channels) for recording in recordings],
             [recording.stack(estimator.inputs) for recording in recordings],
             [recording.stack(estimator.learns_from) for recording in recordings],
         )
-        self.starts, self.inputs, self.targets = (torch.as_tensor(np.concatenate(part), dtype=dtype) for part in parts)
+        self.starts, self.inputs, self.targets = (
+            torch.as_tensor(np.concatenate(part), dtype=dtype) for part in parts
+        )
 
-    def cut(self, firsts: Tensor, places: Tensor, mask: Tensor | None = None, counted: Tensor | None = None) -> _Batch:
+    def cut(
+        self,
+        firsts: Tensor,
+        places: Tensor,
+        mask: Tensor | None = None,
+        counted: Tensor | None = None,
+    ) -> _Batch:
         """Sequences of the samples at ``places``, (T,) or (B, T), after the rows ``firsts`` (B,)."""
         rows = firsts.unsqueeze(1) + places
         return _Batch(self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted)
@@ -272,24 +361,43 @@ class _Drives:
                     f"recording '{name}' is {length} samples long: too short to validate on with training.dropped_steps "
                     f"{training.settling_steps}; choose a longer range in conf/split"
                 )
-            batches.append(self.cut(offset + steps * torch.arange(length // steps), torch.arange(steps)))
+            batches.append(
+                self.cut(offset + steps * torch.arange(length // steps), torch.arange(steps))
+            )
             offset += length
         return batches
 
 
-def _phase(network: VelocityNetwork, settings: Any, training: SequenceSettings, train: _Drives, validation: _Drives) -> Phase:
+def _phase(
+    network: VelocityNetwork,
+    settings: Any,
+    training: SequenceSettings,
+    train: _Drives,
+    validation: _Drives,
+) -> Phase:
     """Squared errors, each output with its weight, over sequences at random places of the drives."""
     steps, truncated, dtype = training.sequence_steps, training.truncate_steps, train.inputs.dtype
     if max(train.lengths) < steps:
-        lengths = ", ".join(f"'{name}' {length}" for name, length in zip(train.names, train.lengths, strict=True))
-        raise DataError(f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it")
+        lengths = ", ".join(
+            f"'{name}' {length}" for name, length in zip(train.names, train.lengths, strict=True)
+        )
+        raise DataError(
+            f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it"
+        )
     judged = validation.for_validation(training)
-    weights = torch.tensor([getattr(training, f"weight_{name}") for name in settings.outputs], dtype=dtype)
-    signs = [torch.tensor([-1.0 if name in ODD else 1.0 for name in names], dtype=dtype) for names in (settings.inputs, settings.outputs)]
+    weights = torch.tensor(
+        [getattr(training, f"weight_{name}") for name in settings.outputs], dtype=dtype
+    )
+    signs = [
+        torch.tensor([-1.0 if name in ODD else 1.0 for name in names], dtype=dtype)
+        for names in (settings.inputs, settings.outputs)
+    ]
     carried: list[State] = []
 
     def errors(batch: _Batch, dropped: int) -> Tensor:
-        outputs, state = network(batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask)
+        outputs, state = network(
+            batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask
+        )
         carried[:] = [tuple(part.detach() for part in state)]
         weighted: Tensor = (outputs - batch.targets)[:, dropped:].square() @ weights
         return weighted
@@ -297,7 +405,10 @@ def _phase(network: VelocityNetwork, settings: Any, training: SequenceSettings, 
     def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:
         if not settings.dropout:
             return None
-        kept = torch.rand(sequences, length, settings.n_states, generator=generator) >= settings.dropout
+        kept = (
+            torch.rand(sequences, length, settings.n_states, generator=generator)
+            >= settings.dropout
+        )
         return kept.to(dtype) / (1.0 - settings.dropout)
 
     def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
@@ -306,18 +417,30 @@ def _phase(network: VelocityNetwork, settings: Any, training: SequenceSettings, 
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
         inputs, outputs = (torch.where(turned, own, 1.0) for own in signs)
         return batch._replace(
-            inputs=batch.inputs * inputs.unsqueeze(1), targets=batch.targets * outputs.unsqueeze(1), starts=batch.starts * outputs
+            inputs=batch.inputs * inputs.unsqueeze(1),
+            targets=batch.targets * outputs.unsqueeze(1),
+            starts=batch.starts * outputs,
         )
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):
-            yield mirrored(train.cut(chosen, torch.arange(steps), mask_of(len(chosen), steps, generator)), generator)
+            yield mirrored(
+                train.cut(chosen, torch.arange(steps), mask_of(len(chosen), steps, generator)),
+                generator,
+            )
 
     def stretches(generator: torch.Generator) -> Iterator[_Batch]:
         pieces = train.pieces(steps, generator)
-        for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(training.batch_size):
+        for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(
+            training.batch_size
+        ):
             longest = int(chosen[:, 1].max())
-            batch = mirrored(train.padded(chosen, training.dropped_steps, mask_of(len(chosen), longest, generator)), generator)
+            batch = mirrored(
+                train.padded(
+                    chosen, training.dropped_steps, mask_of(len(chosen), longest, generator)
+                ),
+                generator,
+            )
             for first in range(0, longest, truncated):
                 yield batch.stretch(first, first + truncated)
 
@@ -327,7 +450,11 @@ def _phase(network: VelocityNetwork, settings: Any, training: SequenceSettings, 
         return (errors(batch, 0) * batch.counted).sum() / batch.counted.sum().clamp(min=1.0)
 
     def validate() -> float:
-        samples = torch.cat([errors(batch, training.settling_steps).reshape(-1) for batch in judged])
+        samples = torch.cat(
+            [errors(batch, training.settling_steps).reshape(-1) for batch in judged]
+        )
         return float(samples.double().mean())
 
-    return Phase("sequences", training.phase, network, stretches if truncated else batches, loss, validate)
+    return Phase(
+        "sequences", training.phase, network, stretches if truncated else batches, loss, validate
+    )

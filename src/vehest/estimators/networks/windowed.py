@@ -60,7 +60,9 @@ class WindowedEstimator(Network):
         return self.window - 1
 
     @classmethod
-    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(
+        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
         """Train members together (`train_members`).
 
         Raises `DataError`: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged. Raises
@@ -71,16 +73,25 @@ class WindowedEstimator(Network):
         from vehest.training.supervised import train_members
 
         first, dtype = members[0], getattr(torch, training.dtype)
-        train, validation = (windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation))
-        started = first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
+        train, validation = (
+            windows_of(part, first.channels, TARGET, first.window)
+            for part in (data.train, data.validation)
+        )
+        started = (
+            first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
+        )
         for member in members:
             member.network = member._seeded_network(list(data.train), dtype)
             if started:
-                member.network.load_state_dict({name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()})
+                member.network.load_state_dict(
+                    {name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()}
+                )
         seeds = [member._seed for member in members]
         compiled = training.compiled and hasattr(first.network, "compiled_descent")
         with threads_for_members() if compiled else nullcontext():
-            return train_members([member.network for member in members], seeds, train, validation, training, context)
+            return train_members(
+                [member.network for member in members], seeds, train, validation, training, context
+            )
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
@@ -107,7 +118,9 @@ class WindowedEstimator(Network):
             )
         return other.weights()
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+    def _estimate_one(
+        self, recording: Recording, initial_state: Mapping[str, float] | None
+    ) -> Estimate:
         if initial_state is not None:
             raise ConfigurationError(
                 f"estimator '{self.name}' has no state to start from: it sees a window of samples only; set evaluation.initial_state=false"
@@ -128,9 +141,13 @@ class WindowedEstimator(Network):
         self.network.eval()
         with torch.no_grad():
             prepared = prepare(self.network, torch.as_tensor(series, dtype=dtype))
-            parameters = {name: parameter.unsqueeze(0) for name, parameter in self.network.named_parameters()}
+            parameters = {
+                name: parameter.unsqueeze(0) for name, parameter in self.network.named_parameters()
+            }
             rows = torch.as_tensor(starts).unsqueeze(0)
-            result = predict_members(self.network, parameters, prepared, rows, self.window, compiled=True)
+            result = predict_members(
+                self.network, parameters, prepared, rows, self.window, compiled=True
+            )
         return np.asarray(result[0].double().numpy())
 
     def online(self) -> WindowStepper:
@@ -152,7 +169,11 @@ class WindowStepper(Stepper):
         self._window.append(self._estimator.checked_sample(sample))
         if len(self._window) < self._estimator.window:
             return {"vy": float("nan")}
-        return {"vy": float(self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0])}
+        return {
+            "vy": float(
+                self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0]
+            )
+        }
 
 
 def _check_state(network: nn.Module) -> None:
@@ -168,4 +189,6 @@ def _check_state(network: nn.Module) -> None:
             )
     for name, tensor in network.state_dict().items():
         if not tensor.is_floating_point():
-            raise ConfigurationError(f"{kind}: buffer '{name}' is {tensor.dtype}, no floating point; register it with persistent=False")
+            raise ConfigurationError(
+                f"{kind}: buffer '{name}' is {tensor.dtype}, no floating point; register it with persistent=False"
+            )

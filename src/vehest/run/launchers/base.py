@@ -55,10 +55,14 @@ def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> La
     from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher, slurm_parameters
 
     if name == "slurm" and address not in (None, "local"):
-        raise ConfigurationError(f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{address}'")
+        raise ConfigurationError(
+            f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{address}'"
+        )
     parameters, package = slurm_parameters(options.slurm), "submitit" if name == "slurm" else "ray"
     if importlib.util.find_spec(package) is None:
-        raise MissingError(f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'")
+        raise MissingError(
+            f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'"
+        )
     if name == "slurm":
         return SlurmLauncher(address or "slurm", jobs, parameters, output, messages)
     return RayLauncher(address, jobs, output, messages)

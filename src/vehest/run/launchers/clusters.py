@@ -37,11 +37,19 @@ from vehest.version import __version__
 
 TIMES = 3  # that a group is tried, if its tasks end without a report
 ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-ENVIRONMENT |= {"RAY_worker_niceness": "0", "RAY_task_oom_retries": str(TIMES - 1)}  # by default 15, and without end
+ENVIRONMENT |= {
+    "RAY_worker_niceness": "0",
+    "RAY_task_oom_retries": str(TIMES - 1),
+}  # by default 15, and without end
 """Of Ray, unless it is set otherwise."""
 QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
 STOP = "stop"  # file that asks all SLURM jobs to end
-PARAMETERS = {"account": "slurm_account", "constraint": "slurm_constraint", "memory_gb": "mem_gb", "minutes": "timeout_min"}
+PARAMETERS = {
+    "account": "slurm_account",
+    "constraint": "slurm_constraint",
+    "memory_gb": "mem_gb",
+    "minutes": "timeout_min",
+}
 PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
 """Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
 
@@ -71,7 +79,14 @@ def new_mark(output: Path) -> Path:
 
 def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
     """What a machine is sent of a group."""
-    return TaskSpec(position, group, output if output.is_absolute() else Path.cwd(), mark, versions_here(), current_limits())
+    return TaskSpec(
+        position,
+        group,
+        output if output.is_absolute() else Path.cwd(),
+        mark,
+        versions_here(),
+        current_limits(),
+    )
 
 
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
@@ -80,9 +95,15 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
     Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
     """
     here = versions_here()
-    unlike = [f"{name} {here.get(name, 'missing')} instead of {own}" for name, own in spec.versions.items() if here.get(name) != own]
+    unlike = [
+        f"{name} {here.get(name, 'missing')} instead of {own}"
+        for name, own in spec.versions.items()
+        if here.get(name) != own
+    ]
     if unlike:
-        raise MissingError(f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine")
+        raise MissingError(
+            f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine"
+        )
     shared = spec.mark.is_dir()
     if not shared and copies is None:
         raise NotShared(socket.gethostname())
@@ -91,13 +112,21 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
         if not shared:
             unpack(copies or {})
         outcome = guarded(spec.group.run, should_stop, lambda _: None)
-        made = {} if shared or isinstance(outcome, Failure) else pack(folders_of(outcome).difference(copies or ()))
+        made = (
+            {}
+            if shared or isinstance(outcome, Failure)
+            else pack(folders_of(outcome).difference(copies or ()))
+        )
     return Done(spec.position, outcome, made)
 
 
 def versions_here() -> dict[str, str]:
     """What must be the same everywhere for results to be those of one machine."""
-    return {"vehest": f"{__version__} {commit()}".strip(), "python": platform.python_version(), **library_versions()}
+    return {
+        "vehest": f"{__version__} {commit()}".strip(),
+        "python": platform.python_version(),
+        **library_versions(),
+    }
 
 
 def inputs_of(group: Group) -> set[Path]:
@@ -106,7 +135,11 @@ def inputs_of(group: Group) -> set[Path]:
     if group.evaluation is not None:
         data += [group.evaluation.data, group.evaluation.references]
     starts = {Path(start) for job in group.jobs if (start := job.training.get("start_from"))}
-    return folders_of(existing(group)) | {artefact.folder for own in data for artefact in own.values()} | starts
+    return (
+        folders_of(existing(group))
+        | {artefact.folder for own in data for artefact in own.values()}
+        | starts
+    )
 
 
 def folders_of(members: Sequence[Member]) -> set[Path]:
@@ -116,7 +149,14 @@ def folders_of(members: Sequence[Member]) -> set[Path]:
 
 def pack(folders: set[Path]) -> Files:
     """The files of artefacts, their manifests included."""
-    return {own: {file.relative_to(own).as_posix(): file.read_bytes() for file in own.rglob("*") if file.is_file()} for own in folders}
+    return {
+        own: {
+            file.relative_to(own).as_posix(): file.read_bytes()
+            for file in own.rglob("*")
+            if file.is_file()
+        }
+        for own in folders
+    }
 
 
 def unpack(packed: Files) -> None:
@@ -134,13 +174,17 @@ def unpack(packed: Files) -> None:
 class RayLauncher:
     """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default ``RAY_ADDRESS``, else a Ray of its own."""
 
-    def __init__(self, address: str | None, jobs: int | None, output: Path, messages: Messages) -> None:
+    def __init__(
+        self, address: str | None, jobs: int | None, output: Path, messages: Messages
+    ) -> None:
         self._address = address or os.environ.get("RAY_ADDRESS") or "local"
         self._jobs, self._output, self._messages = jobs, output, messages
         self._ray: Any = None
         self._task: Any = None
         self._mark = Path()
-        self._stored: dict[Path, Any] | None = None  # artefacts in Ray's object store; none while machines are taken to share the root
+        self._stored: dict[Path, Any] | None = (
+            None  # artefacts in Ray's object store; none while machines are taken to share the root
+        )
 
     @property
     def cores(self) -> int:
@@ -148,7 +192,9 @@ class RayLauncher:
         there = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
         return min(there, self._jobs or there)
 
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+    def launch(
+        self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
+    ) -> Iterator[Done]:
         """See `LocalLauncher`."""
         if self._ray is None:
             self._connect()
@@ -164,7 +210,9 @@ class RayLauncher:
                     position = waiting.popleft()
                     running[self._begin(position, groups[position])] = position
                     report(position, None)
-                for task in self._ray.wait(list(running), timeout=POLL_SECONDS)[0] if running else []:
+                for task in (
+                    self._ray.wait(list(running), timeout=POLL_SECONDS)[0] if running else []
+                ):
                     position = running.pop(task)
                     done = self._done(position, task)
                     if done is not None:
@@ -182,16 +230,24 @@ class RayLauncher:
         os.environ.update(ENVIRONMENT | os.environ)
         import ray
 
-        own: dict[str, Any] = {"num_cpus": self._jobs, "include_dashboard": False} if self._address == "local" else {}
+        own: dict[str, Any] = (
+            {"num_cpus": self._jobs, "include_dashboard": False} if self._address == "local" else {}
+        )
         handler = signal.getsignal(signal.SIGTERM)
         try:
-            ray.init(address=self._address, log_to_driver=False, logging_level=logging.CRITICAL, **own)
+            ray.init(
+                address=self._address, log_to_driver=False, logging_level=logging.CRITICAL, **own
+            )
         except Exception as error:  # ConnectionError, RuntimeError, ValueError, … by what is wrong
-            raise MissingError(f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one") from error
+            raise MissingError(
+                f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one"
+            ) from error
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
         # instead of standard output
-        ray._private.worker.print_to_stdstream = lambda data, **_: self._messages.line("again", "ray", data["lines"][0].partition("\n")[0])
+        ray._private.worker.print_to_stdstream = lambda data, **_: self._messages.line(
+            "again", "ray", data["lines"][0].partition("\n")[0]
+        )
         self._ray, self._mark = ray, new_mark(self._output)
         self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
@@ -202,7 +258,11 @@ class RayLauncher:
         spec, copies = task_of(position, group, self._output, self._mark), []
         if self._stored is not None:
             inputs = inputs_of(group)
-            self._stored |= {folder: self._ray.put(pack({folder})) for folder in inputs if folder not in self._stored}
+            self._stored |= {
+                folder: self._ray.put(pack({folder}))
+                for folder in inputs
+                if folder not in self._stored
+            }
             copies = [self._stored[folder] for folder in inputs]
         return self._task.options(name=group.name).remote(spec, *copies)
 
@@ -215,14 +275,19 @@ class RayLauncher:
             return None
         except errors.RayTaskError as error:
             if not isinstance(error.cause, NotShared):
-                raise MissingError(f"a machine of the cluster cannot run tasks: {_line(error.cause or error)}") from error
+                raise MissingError(
+                    f"a machine of the cluster cannot run tasks: {_line(error.cause or error)}"
+                ) from error
             if self._stored is None:
                 self._stored = {}
                 detail = "does not share the output root: recordings and artefacts are sent"
                 self._messages.line("note", "cluster", str(error.cause), detail)
             return None
         except errors.RayError as error:
-            return Done(position, Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"))
+            return Done(
+                position,
+                Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"),
+            )
         unpack(done.made)
         return done
 
@@ -247,8 +312,12 @@ def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
     for word in words:
         name, _, value = word.partition("=")
         if name not in PARAMETERS or not value:
-            raise ConfigurationError(f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}")
-        found[PARAMETERS[name]] = _positive(name, value) if name in ("memory_gb", "minutes") else value
+            raise ConfigurationError(
+                f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}"
+            )
+        found[PARAMETERS[name]] = (
+            _positive(name, value) if name in ("memory_gb", "minutes") else value
+        )
     return {**found, "timeout_min": max(round(found["timeout_min"]), 1)}
 
 
@@ -276,21 +345,39 @@ class SlurmTask:
 class SlurmLauncher:
     """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of this machine."""
 
-    def __init__(self, cluster: str, jobs: int | None, parameters: Mapping[str, Any], output: Path, messages: Messages) -> None:
+    def __init__(
+        self,
+        cluster: str,
+        jobs: int | None,
+        parameters: Mapping[str, Any],
+        output: Path,
+        messages: Messages,
+    ) -> None:
         if cluster == "slurm" and shutil.which("sbatch") is None:
-            raise MissingError("there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local")
-        self._cluster, self._parameters, self._output, self._messages = cluster, parameters, output, messages
+            raise MissingError(
+                "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local"
+            )
+        self._cluster, self._parameters, self._output, self._messages = (
+            cluster,
+            parameters,
+            output,
+            messages,
+        )
         self._jobs = jobs or (default_jobs() if cluster == "local" else None)
         self._executor: Any = None
         self._running: dict[Any, int] = {}
         self._lost: Counter[str] = Counter()  # jobs, by the name of their group
 
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+    def launch(
+        self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
+    ) -> Iterator[Done]:
         """See `LocalLauncher`."""
         if self._executor is None:
             import submitit
 
-            limit = {f"{self._cluster}_max_num_timeout": 100}  # times that a job whose time was up goes on
+            limit = {
+                f"{self._cluster}_max_num_timeout": 100
+            }  # times that a job whose time was up goes on
             self._executor = submitit.AutoExecutor(new_mark(self._output), self._cluster, **limit)
             self._executor.update_parameters(**self._parameters, slurm_array_parallelism=self._jobs)
         waiting = list(range(len(groups)))
@@ -299,8 +386,14 @@ class SlurmLauncher:
                 if stop.requested():
                     waiting = []
                     self._call_off()
-                room = self._jobs - len(self._running) if self._jobs and self._cluster == "local" else len(waiting)
-                self._running |= zip(self._begin(groups, waiting[:room]), waiting[:room], strict=True)
+                room = (
+                    self._jobs - len(self._running)
+                    if self._jobs and self._cluster == "local"
+                    else len(waiting)
+                )
+                self._running |= zip(
+                    self._begin(groups, waiting[:room]), waiting[:room], strict=True
+                )
                 waiting = waiting[room:]
                 for job, position in self._running.items():
                     if job.state in ("RUNNING", "COMPLETED"):
@@ -324,12 +417,17 @@ class SlurmLauncher:
                 shutil.rmtree(self._executor.folder, ignore_errors=True)
 
     def _begin(self, groups: Sequence[Group], positions: Sequence[int]) -> Sequence[Any]:
-        specs = [task_of(position, groups[position], self._output, self._executor.folder) for position in positions]
+        specs = [
+            task_of(position, groups[position], self._output, self._executor.folder)
+            for position in positions
+        ]
         try:
             return self._executor.map_array(SlurmTask(), specs) if specs else []
         except RuntimeError as error:
             reason = " ".join(str(error).split())[-300:]
-            raise MissingError(f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit") from error
+            raise MissingError(
+                f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit"
+            ) from error
 
     def _call_off(self) -> None:
         """Ask jobs to end after their batch, and take back those that have not begun."""
@@ -352,5 +450,10 @@ class SlurmLauncher:
                 self._messages.line("again", "train", name, why)
                 return None
             lines = str(error).splitlines()
-            reason = next((line for line in reversed(lines) if "Error: " in line and "submitit" not in line), lines[0])
-            raise MissingError(f"a machine of the cluster cannot run jobs: {reason.strip()}; {log}") from error
+            reason = next(
+                (line for line in reversed(lines) if "Error: " in line and "submitit" not in line),
+                lines[0],
+            )
+            raise MissingError(
+                f"a machine of the cluster cannot run jobs: {reason.strip()}; {log}"
+            ) from error

@@ -24,7 +24,9 @@ from vehest.training.context import Progress
 if TYPE_CHECKING:
     from vehest.run.group import Group  # with torch, which processes of an ingest do without
 
-Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]  # a function of (should_stop, on_progress), picklable
+Task = Callable[
+    [Callable[[], bool], Callable[[Progress | Waiting], None]], Any
+]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]
 POLL_SECONDS = 0.2
 Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> its files
@@ -45,7 +47,9 @@ class LocalLauncher:
 
     cores: int = 1
 
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+    def launch(
+        self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
+    ) -> Iterator[Done]:
         """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
 
         Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines cannot run them.
@@ -56,7 +60,9 @@ class LocalLauncher:
         """Nothing is kept."""
 
 
-def launch(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+def launch(
+    tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
+) -> Iterator[Done]:
     """Run tasks in their order, as many at a time as ``jobs`` says, and yield them as they end.
 
     Args:
@@ -81,7 +87,9 @@ def default_jobs() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def guarded(task: Task, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Any:
+def guarded(
+    task: Task, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]
+) -> Any:
     """Run a task; what it raises is returned as a `Failure`."""
     try:
         return task(should_stop, on_progress)
@@ -89,12 +97,16 @@ def guarded(task: Task, should_stop: Callable[[], bool], on_progress: Callable[[
         return failure_of(error)
 
 
-def _launch_in_processes(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+def _launch_in_processes(
+    tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
+) -> Iterator[Done]:
     context = get_context("spawn")
     stopping, messages = context.Event(), context.SimpleQueue()
     pool = ProcessPoolExecutor(jobs, context, _start_worker, (stopping, messages, current_limits()))
     with stop.deferred(), pool:
-        futures = {pool.submit(_work, position, task): position for position, task in enumerate(tasks)}
+        futures = {
+            pool.submit(_work, position, task): position for position, task in enumerate(tasks)
+        }
         waiting = set(futures)
         while waiting:
             ended, waiting = wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
@@ -107,7 +119,9 @@ def _launch_in_processes(tasks: Sequence[Task], jobs: int, stop: StopSignals | T
             for future in ended:
                 error = None if future.cancelled() else future.exception()
                 if error is not None:
-                    yield Done(futures[future], Failure(f"a worker process ended unexpectedly ({error})"))
+                    yield Done(
+                        futures[future], Failure(f"a worker process ended unexpectedly ({error})")
+                    )
                 elif not future.cancelled() and (done := future.result()) is not None:
                     yield done
 

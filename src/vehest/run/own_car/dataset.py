@@ -34,7 +34,10 @@ from vehest.sources.surveys import Log, RawColumn
 from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
 from vehest.sources.unit_spellings import plain_unit
 
-POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
+POLICIES = {
+    "vbo": ("strict", "interpolate"),
+    **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform")),
+}
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
@@ -42,7 +45,9 @@ GAPS = "samples are missing; only a table with a column of times may lack some, 
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
-GAIN_APART = 1.15  # factor between the gains of two files, of which each half is beyond the other file's
+GAIN_APART = (
+    1.15  # factor between the gains of two files, of which each half is beyond the other file's
+)
 LEAST_TURN, TURNING_SECONDS = 0.05, 5.0  # rad/s, and how long a half of a file turns as fast [s]
 
 
@@ -55,7 +60,9 @@ class Draft:
     late: Mapping[str, Late]  # channel -> its delay in the longest recording
     contents: list[RecordingSummary]  # of the recordings
     remarks: list[str]  # findings of the checks that concern the proposals
-    ratio: tuple[float, float] | None  # estimated steering ratio and its uncertainty; None where it is given or not needed
+    ratio: (
+        tuple[float, float] | None
+    )  # estimated steering ratio and its uncertainty; None where it is given or not needed
     notes: list[str]  # further remarks
     durations: dict[str, float]  # recording -> its length [s]
 
@@ -72,38 +79,64 @@ class Draft:
 
 def draft(examined: Examined) -> Draft:
     """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
-    whole = [one for one in examined.proposals.channels if not any(_has_gaps(examined, own, one.column) for own in examined.logs)]
-    gaps = [f"'{one.column}' ({one.channel}) is left out: {GAPS}" for one in examined.proposals.channels if one not in whole]
+    whole = [
+        one
+        for one in examined.proposals.channels
+        if not any(_has_gaps(examined, own, one.column) for own in examined.logs)
+    ]
+    gaps = [
+        f"'{one.column}' ({one.channel}) is left out: {GAPS}"
+        for one in examined.proposals.channels
+        if one not in whole
+    ]
     examined = replace(examined, proposals=examined.proposals.keeping(whole, gaps))
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")
     dataset = _dataset(examined)
-    speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
+    speed = (
+        [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}]
+        if proposals.wheel_radius is not None
+        else []
+    )
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
     bridging, notes = _bridging(examined, recordings), [*proposals.notes]
     if bridging:
         recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
-        notes.append("a few samples beyond what a vehicle can do are bridged by lines (bridge_impossible)")
+        notes.append(
+            "a few samples beyond what a vehicle can do are bridged by lines (bridge_impossible)"
+        )
     longest = max(recordings, key=lambda own: own.duration)
     late, ratio = late_channels(longest), None
     for stem, rows in dataset.get("drop_rows", {}).items():
         why = f"written twice, or {BRIDGED:g} s and more without a sample"
-        notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
+        notes.append(
+            f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}"
+        )
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
-            found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]
+            found = align(
+                longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"])
+            )["steering_ratio"]
             ratio = (found.value, found.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
     if pause := dataset.get("max_gap"):
         of_file = Counter(str(one.provenance.get("file")) for one in recordings)
-        notes += [f"'{file}' pauses for more than {pause:g} s and makes {n} recordings" for file, n in of_file.items() if n > 1]
-    made = _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))
+        notes += [
+            f"'{file}' pauses for more than {pause:g} s and makes {n} recordings"
+            for file, n in of_file.items()
+            if n > 1
+        ]
+    made = _transforms(
+        examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None)
+    )
     dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
-        replace(one, delay=late[one.channel].delay).with_evidence(late[one.channel].evidence) if one.channel in late else one
+        replace(one, delay=late[one.channel].delay).with_evidence(late[one.channel].evidence)
+        if one.channel in late
+        else one
         for one in proposals.channels
     )
     return Draft(
@@ -124,7 +157,10 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
         with suppress(DataError):
             own = dataset | {"clock": policy}
             recordings = _recordings(own)
-            if all(math.isclose(one.rate_hz, plain_rate(one.rate_hz, INTERPOLATED_TOLERANCE)) for one in recordings):
+            if all(
+                math.isclose(one.rate_hz, plain_rate(one.rate_hz, INTERPOLATED_TOLERANCE))
+                for one in recordings
+            ):
                 return own, recordings
     return dataset, _recordings(dataset)
 
@@ -137,17 +173,29 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
     """Findings of the longest recording, and contradictions in the longest one of each other file."""
     found = [("", one) for one in checks_of_recording(longest) if one.check in REMARKS]
-    by_file = {own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)}
+    by_file = {
+        own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)
+    }
     by_file.pop(longest.provenance.get("file"), None)
     unlike, gains = [], _gains(longest)
     for own in by_file.values():
-        found += [(f"in '{own.id}', ", one) for one in checks_of_recording(own) if one.check in CONTRADICTIONS]
+        found += [
+            (f"in '{own.id}', ", one)
+            for one in checks_of_recording(own)
+            if one.check in CONTRADICTIONS
+        ]
         for name, (low, high) in _gains(own).items():
             least, most = gains.get(name, (low, high))
             if low > GAIN_APART * most or least > GAIN_APART * high:
                 what = f"{math.sqrt(low * high / (least * most)):.2g} times as large in the same turn as in '{longest.id}'"
-                unlike.append(f"{name}: in '{own.id}', {what}; is it of another car? Then make a data set of each")
-    worded = [f"{one.channel}: {where}{one.message}" if one.channel else where + one.message for where, one in found if one.level != "note"]
+                unlike.append(
+                    f"{name}: in '{own.id}', {what}; is it of another car? Then make a data set of each"
+                )
+    worded = [
+        f"{one.channel}: {where}{one.message}" if one.channel else where + one.message
+        for where, one in found
+        if one.level != "note"
+    ]
     return worded + unlike
 
 
@@ -158,7 +206,11 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         return {}
     for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
         speed, rate = recording["vx"][half], recording["yaw_rate"][half]
-        used = (speed > 0.2 * float(np.quantile(speed, 0.99))) & (np.abs(rate) > LEAST_TURN) & (speed > 0.0)
+        used = (
+            (speed > 0.2 * float(np.quantile(speed, 0.99)))
+            & (np.abs(rate) > LEAST_TURN)
+            & (speed > 0.0)
+        )
         if np.count_nonzero(used) < TURNING_SECONDS * recording.rate_hz:
             return {}
         speed, rate = speed[used], rate[used]
@@ -166,13 +218,20 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         if "ay" in recording:
             found.setdefault("ay", []).append(rms(recording["ay"][half][used]) / rms(turn[:, 1]))
         for name in {"handwheel", "steer"} & set(recording.channels):
-            found.setdefault(name, []).append(abs(float(np.linalg.lstsq(turn, recording[name][half][used], rcond=None)[0][0])))
+            found.setdefault(name, []).append(
+                abs(float(np.linalg.lstsq(turn, recording[name][half][used], rcond=None)[0][0]))
+            )
     return {name: (min(own), max(own)) for name, own in found.items() if min(own) > 0.0}
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
     log, name, proposals = examined.log, examined.name, examined.proposals
-    dataset: dict[str, Any] = {"name": name, "title": f"Recordings of {name}", "kind": "real", "vehicle": name}
+    dataset: dict[str, Any] = {
+        "name": name,
+        "title": f"Recordings of {name}",
+        "kind": "real",
+        "vehicle": name,
+    }
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = {column.name: column for column in log.columns}
     if log.source == "rosbag":
@@ -181,29 +240,66 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         return dataset | _mdf_options(columns, proposals.channels)
     dataset |= log.options
     if log.source != "vbo":
-        dataset["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
+        dataset["time"] = (
+            None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
+        )
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
     dataset["clock"] = "strict"
     if log.source in TABLES:
-        gaps = {own.file.stem: np.array([_gaps(examined, own, one.column) for one in proposals.channels]) for own in examined.logs}
+        gaps = {
+            own.file.stem: np.array(
+                [_gaps(examined, own, one.column) for one in proposals.channels]
+            )
+            for own in examined.logs
+        }
         short = max(float(own[own <= BRIDGED].max(initial=0.0)) for own in gaps.values())
-        dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0} if short else {}
+        dataset |= (
+            {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0}
+            if short
+            else {}
+        )
         if log.clock is not None:
             holes = {
-                stem: [f"{first + 1}-{last}" for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))]
+                stem: [
+                    f"{first + 1}-{last}"
+                    for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))
+                ]
                 for stem, own in gaps.items()
             }
-            dropped = {own.file.stem: [*holes[own.file.stem], *_rows_written_twice(own)] for own in examined.logs}
-            dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
+            dropped = {
+                own.file.stem: [*holes[own.file.stem], *_rows_written_twice(own)]
+                for own in examined.logs
+            }
+            dataset |= (
+                {"drop_rows": named}
+                if (named := {stem: rows for stem, rows in dropped.items() if rows})
+                else {}
+            )
             if any(holes.values()) and "runs" not in log.options:
                 dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
     units = {name: own.unit if log.source == "vbo" else "" for name, own in columns.items()}
-    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place, units[one.column]) for one in proposals.channels}
+    dataset["channels"] = {
+        one.channel: _entry(one, columns[one.column].place, units[one.column])
+        for one in proposals.channels
+    }
     if proposals.pose:
-        rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
+        rate = (
+            rate_of(log.seconds)
+            if log.seconds is not None
+            else float(examined.rate_hz or EVIDENCE_HZ)
+        )
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
-        made = [name for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref") if name not in dataset["channels"]]
-        dataset["pose"] = {**parts, "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5), "order": 2, "channels": made}
+        made = [
+            name
+            for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
+            if name not in dataset["channels"]
+        ]
+        dataset["pose"] = {
+            **parts,
+            "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5),
+            "order": 2,
+            "channels": made,
+        }
     return dataset
 
 
@@ -218,7 +314,12 @@ def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[st
 
 def _rows_written_twice(log: Log) -> list[int]:
     """From 1."""
-    rows = np.nan_to_num([*([] if log.seconds is None else [log.seconds]), *(column.values for column in log.columns)])
+    rows = np.nan_to_num(
+        [
+            *([] if log.seconds is None else [log.seconds]),
+            *(column.values for column in log.columns),
+        ]
+    )
     return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)) + 1).tolist()
 
 
@@ -227,7 +328,9 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
     own = next(own for own in log.columns if own.name == column)
     known = np.flatnonzero(np.isfinite(own.values))
     if log.source in TABLES:
-        return not len(known) or (log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED))
+        return not len(known) or (
+            log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED)
+        )
     if log.source != "mdf" or own.stamps is None or not len(known):
         return len(known) < len(own.values)
     return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= BRIDGED).any())
@@ -236,13 +339,19 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without any, 0 in a row with one."""
     values = next(own.values for own in log.columns if own.name == column)
-    seconds = log.seconds if log.seconds is not None else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+    seconds = (
+        log.seconds
+        if log.seconds is not None
+        else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+    )
     found = np.zeros(len(values))
     for run in log.runs:
         times, known = seconds[run], np.isfinite(values[run])
         edges = np.concatenate([times[:1], times[known], times[-1:]])
         lengths = np.diff(edges) if known.any() else np.array([math.inf])
-        found[run] = np.where(known, 0.0, lengths[np.clip(np.searchsorted(edges, times) - 1, 0, len(lengths) - 1)])
+        found[run] = np.where(
+            known, 0.0, lengths[np.clip(np.searchsorted(edges, times) - 1, 0, len(lengths) - 1)]
+        )
     return found
 
 
@@ -256,7 +365,11 @@ def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
         if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
-    return {"rate_hz": plain_rate(max(rates), INTERPOLATED_TOLERANCE), **pause, "channels": channels}
+    return {
+        "rate_hz": plain_rate(max(rates), INTERPOLATED_TOLERANCE),
+        **pause,
+        "channels": channels,
+    }
 
 
 def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
@@ -270,10 +383,21 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
             rate, gap = _rate_and_gap(columns[one.column])
             rates.append(rate)
             max_gap = max(LEAST_GAP, math.ceil(150.0 * gap) / 100.0)
-            topics[short] = {"topic": place["topic"], "type": place["type"], "stamps": place["stamps"], "max_gap": max_gap}
+            topics[short] = {
+                "topic": place["topic"],
+                "type": place["type"],
+                "stamps": place["stamps"],
+                "max_gap": max_gap,
+            }
         entry = _entry(one, {"topic": short, "field": place["field"]})
-        channels[one.channel] = entry | ({"offset": float(f"{one.offset:.5g}")} if one.offset else {})
-    return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE), "topics": topics, "channels": channels}
+        channels[one.channel] = entry | (
+            {"offset": float(f"{one.offset:.5g}")} if one.offset else {}
+        )
+    return {
+        "rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE),
+        "topics": topics,
+        "channels": channels,
+    }
 
 
 def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:
@@ -286,29 +410,58 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
-    channels = [(CHANNELS[name], samples) for own in recordings for name, samples in own.channels.items()]
-    if not any(0.0 < ((samples < own.low) | (samples > own.high)).mean() <= MOST_BRIDGED for own, samples in channels):
+    channels = [
+        (CHANNELS[name], samples) for own in recordings for name, samples in own.channels.items()
+    ]
+    if not any(
+        0.0 < ((samples < own.low) | (samples > own.high)).mean() <= MOST_BRIDGED
+        for own, samples in channels
+    ):
         return []
     used = {one.column for one in examined.proposals.channels}
-    rates = [rate_of(own.stamps) for own in examined.log.columns if own.stamps is not None and own.name in used]
-    return [{"name": "bridge_impossible", **({"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {})}]
+    rates = [
+        rate_of(own.stamps)
+        for own in examined.log.columns
+        if own.stamps is not None and own.name in used
+    ]
+    return [
+        {
+            "name": "bridge_impossible",
+            **({"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {}),
+        }
+    ]
 
 
 def _transforms(
-    examined: Examined, longest: Recording, late: Mapping[str, Late], speed: Sequence[dict[str, Any]], ratio: float | None
+    examined: Examined,
+    longest: Recording,
+    late: Mapping[str, Late],
+    speed: Sequence[dict[str, Any]],
+    ratio: float | None,
 ) -> list[dict[str, Any]]:
     """Transforms that make the channels that estimators want.
 
     A reference that is late is put on the others' clock; a measured channel is not, since an estimator in the car would get it late, too.
     """
     references = {name: own.delay for name, own in late.items() if CHANNELS[name].is_reference}
-    made: list[dict[str, Any]] = [{"name": "delay_correction", "delay": own, "channels": [name]} for name, own in references.items()]
-    offsets = {one.channel: float(f"{one.factor * one.sign * one.offset:.5g}") for one in examined.proposals.channels if one.offset}
+    made: list[dict[str, Any]] = [
+        {"name": "delay_correction", "delay": own, "channels": [name]}
+        for name, own in references.items()
+    ]
+    offsets = {
+        one.channel: float(f"{one.factor * one.sign * one.offset:.5g}")
+        for one in examined.proposals.channels
+        if one.offset
+    }
     if offsets and examined.log.source != "rosbag":  # whose channels have an offset of their own
         made.append({"name": "offset_correction", "offsets": offsets})
     made += speed
     for name in ("vy_ref", "ax"):
-        supply = derivation_of(name, longest.channels, (), longest.rate_hz) if name not in longest else None
+        supply = (
+            derivation_of(name, longest.channels, (), longest.rate_hz)
+            if name not in longest
+            else None
+        )
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
     if "handwheel" in longest and "steer" not in longest and ratio:

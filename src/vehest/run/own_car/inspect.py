@@ -37,9 +37,20 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
-MOST_COMPARED, USUAL, EXACT = 4_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
+MOST_COMPARED, USUAL, EXACT = (
+    4_000,
+    0.99,
+    0.999,
+)  # rows, share of them, and correlation of a column with another's difference
 TABLES = ("tabular", "text_log")
-LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
+LAYOUT = {
+    "delimiter": ",",
+    "decimal": ".",
+    "encoding": "utf8",
+    "skip_rows": 0,
+    "rows_below_names": 0,
+    "runs": None,
+}
 """Options of a table's layout with their defaults."""
 VEHICLE = {
     "wheelbase": "wheelbase [m], if you know it (for the filter without a reference, the steering ratio, and baselines of the data sheet)",
@@ -75,7 +86,13 @@ class Examined:
         return lines + ([f"  no channel: {counted(list(found.unused))}"] if found.unused else [])
 
 
-def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
+def inspect(
+    name: str,
+    files: Sequence[Path],
+    vehicle: Mapping[str, float | None] | None = None,
+    *,
+    force: bool = False,
+) -> Examined:
     """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column.
 
     Raises `ConfigurationError` for a taken name or several formats or folders, `MissingError` without a file, `DataError` for a bad one.
@@ -83,7 +100,9 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
-        raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
+        raise ConfigurationError(
+            f"'{existing[0]}' is there already; take another name, or --force to write it anew"
+        )
     if name in source_names():
         raise ConfigurationError(f"'{name}' is a source that comes with vehest; take another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
@@ -98,34 +117,81 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     for log in others:
         held = {column.name: column for column in log.columns}
         lacking = [one for one in proposals.channels if one.column not in held]
-        notes = [f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it" for one in lacking]
+        notes = [
+            f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it"
+            for one in lacking
+        ]
         kept = [one for one in proposals.channels if one not in lacking]
         if lacking and not kept:
-            raise DataError(f"'{log.file}' has none of the columns that are channels in '{longest.file}'; give files of the same columns")
+            raise DataError(
+                f"'{log.file}' has none of the columns that are channels in '{longest.file}'; give files of the same columns"
+            )
         proposals = proposals.keeping(kept, notes)
         for own in longest.columns:
             if own.name in {one.column for one in kept} and held[own.name].unit != own.unit:
-                what = f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"
-                raise DataError(f"'{log.file}' {what}; write both alike, or make a data set of each")
+                what = (
+                    f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"
+                )
+                raise DataError(
+                    f"'{log.file}' {what}; write both alike, or make a data set of each"
+                )
         proposals = possible(proposals, {name: column.values for name, column in held.items()})
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
-        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}")
-    computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
+        raise DataError(
+            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}"
+        )
+    computed = [
+        f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement"
+        for own, of in differences.items()
+    ]
     used = {one.column: one.unit for one in proposals.channels}
-    foreign = [own for own in longest.columns if own.name in used and own.unit.strip("-[]() 1") and plain_unit(own.unit) is None]
-    computed += [f"'{own.unit}' of '{own.name}' is no unit that vehest knows; by size and motion it is {used[own.name]}" for own in foreign]
-    shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
-    proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))
-    timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
+    foreign = [
+        own
+        for own in longest.columns
+        if own.name in used and own.unit.strip("-[]() 1") and plain_unit(own.unit) is None
+    ]
+    computed += [
+        f"'{own.unit}' of '{own.name}' is no unit that vehest knows; by size and motion it is {used[own.name]}"
+        for own in foreign
+    ]
+    shadowed = (
+        [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"]
+        if name in choices("dataset")
+        else []
+    )
+    proposals = replace(
+        proposals,
+        notes=(
+            *proposals.notes,
+            *computed,
+            *_notes(longest, logs),
+            *(shadowed if not existing else []),
+        ),
+    )
+    timed = longest.seconds is not None or any(
+        column.stamps is not None for column in longest.columns
+    )
     place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
-    return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
+    return Examined(
+        name,
+        tuple(files),
+        (longest, *others),
+        proposals,
+        place,
+        rate,
+        dict.fromkeys(VEHICLE) | dict(vehicle or {}),
+    )
 
 
 def paths_of(name: str) -> tuple[Path, Path, Path]:
     """Data set, split and pipeline of that name, in ./conf and ./pipelines."""
-    return Path("conf") / "dataset" / f"{name}.yaml", Path("conf") / "split" / f"{name}.yaml", Path("pipelines") / f"{name}.yaml"
+    return (
+        Path("conf") / "dataset" / f"{name}.yaml",
+        Path("conf") / "split" / f"{name}.yaml",
+        Path("pipelines") / f"{name}.yaml",
+    )
 
 
 def rate_of(stamps: FloatArray) -> float:
@@ -134,27 +200,54 @@ def rate_of(stamps: FloatArray) -> float:
 
 
 def _longest(logs: Sequence[Log]) -> Log:
-    formats = {"text" if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq") else log.source for log in logs}
+    formats = {
+        "text"
+        if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq")
+        else log.source
+        for log in logs
+    }
     if len(formats) > 1:
-        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
-    longest = max(logs, key=lambda log: log.runs[0].stop - log.runs[0].start if log.runs else max(len(one.values) for one in log.columns))
+        raise ConfigurationError(
+            f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each"
+        )
+    longest = max(
+        logs,
+        key=lambda log: (
+            log.runs[0].stop - log.runs[0].start
+            if log.runs
+            else max(len(one.values) for one in log.columns)
+        ),
+    )
     expected = _layout(longest)
     for log in logs:
         for key, own in _layout(log).items():
             if own != expected[key]:
                 alike = "write both alike, or make a data set of each"
-                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {expected[key]!r}; {alike}")
+                raise DataError(
+                    f"'{log.file}' has {key} {own!r}, '{longest.file}' {expected[key]!r}; {alike}"
+                )
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
     options |= {"missing": marks} if marks else {}
     if "runs" not in options:
-        options |= {key: log.options[key] for log in logs for key in ("time_restarts", "max_gap") if key in log.options}
-    return replace(longest, options=options, source="text_log" if any(log.source == "text_log" for log in logs) else longest.source)
+        options |= {
+            key: log.options[key]
+            for log in logs
+            for key in ("time_restarts", "max_gap")
+            if key in log.options
+        }
+    return replace(
+        longest,
+        options=options,
+        source="text_log" if any(log.source == "text_log" for log in logs) else longest.source,
+    )
 
 
 def _layout(log: Log) -> dict[str, Any]:
     times = None if log.clock is None else f"{log.clock.column} in {log.clock.unit}"
-    return {key: log.options.get(key, default) for key, default in LAYOUT.items()} | {"times": times}
+    return {key: log.options.get(key, default) for key, default in LAYOUT.items()} | {
+        "times": times
+    }
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
@@ -177,25 +270,39 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     folder, *further = sorted({file.resolve().parent for file in files})
     if further:
         listed = ", ".join(map(str, (folder, *further)))
-        raise ConfigurationError(f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder")
+        raise ConfigurationError(
+            f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder"
+        )
     names = sorted({file.name for file in files})
     for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
         if Path(first).stem == Path(second).stem:
-            raise ConfigurationError(f"two files are called '{Path(first).stem}'; a recording's name must be unique")
+            raise ConfigurationError(
+                f"two files are called '{Path(first).stem}'; a recording's name must be unique"
+            )
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
     both = (names, [name[::-1] for name in names])
     start, end = (os.path.commonprefix(words).rstrip("0123456789") for words in both)  # noqa: RUF071 (of characters)
-    pattern = f"{glob.escape(start)}*{glob.escape(end[::-1])}" if len(names) > 1 else glob.escape(names[0])
-    beside = sorted(file.name for file in folder.iterdir() if file.is_file() and file.name not in names)
+    pattern = (
+        f"{glob.escape(start)}*{glob.escape(end[::-1])}"
+        if len(names) > 1
+        else glob.escape(names[0])
+    )
+    beside = sorted(
+        file.name for file in folder.iterdir() if file.is_file() and file.name not in names
+    )
     others = [Path(name).stem for name in matching(beside, pattern)]
     if others and source not in TABLES:
-        raise ConfigurationError(f"'{folder}' holds other files of that name ('{others[0]}'); use a folder of the data set's files alone")
+        raise ConfigurationError(
+            f"'{folder}' holds other files of that name ('{others[0]}'); use a folder of the data set's files alone"
+        )
     return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
 
 
-def _evidence(log: Log, differences: Collection[str]) -> tuple[list[tuple[str, str, FloatArray, str]], float | None]:
+def _evidence(
+    log: Log, differences: Collection[str]
+) -> tuple[list[tuple[str, str, FloatArray, str]], float | None]:
     """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz]; without times rows as they are.
 
     Of a long drive the minutes in which columns change most are taken.
@@ -206,24 +313,45 @@ def _evidence(log: Log, differences: Collection[str]) -> tuple[list[tuple[str, s
         cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
         factor = max(math.floor(rate / EVIDENCE_HZ), 1)
         whole = (n_rows - 2 * cut) // factor * factor
-        samples, rate = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2), rate / factor
+        samples, rate = (
+            samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2),
+            rate / factor,
+        )
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
-    columns = [(own, values) for own, values in zip(log.columns, samples, strict=True) if own.name not in differences]
-    return [(own.name, plain_unit(own.unit) or "", values, own.device) for own, values in columns], rate
+    columns = [
+        (own, values)
+        for own, values in zip(log.columns, samples, strict=True)
+        if own.name not in differences
+    ]
+    return [
+        (own.name, plain_unit(own.unit) or "", values, own.device) for own, values in columns
+    ], rate
 
 
 def _differences(log: Log) -> dict[str, str]:
     """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
     own = [column for column in log.columns if column.stamps is None]
-    middle = log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MOST_COMPARED) // 2, 0) if own else 0
-    rows = np.array([column.values[middle : min(middle + MOST_COMPARED, log.runs[0].stop)] for column in own])
-    velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()]
+    middle = (
+        log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MOST_COMPARED) // 2, 0)
+        if own
+        else 0
+    )
+    rows = np.array(
+        [column.values[middle : min(middle + MOST_COMPARED, log.runs[0].stop)] for column in own]
+    )
+    velocities = [
+        k
+        for k, column in enumerate(own)
+        if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()
+    ]
     found: dict[str, str] = {}
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
         usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
         agreeing = [abs(correlation(row[first:last][usual], steps[usual])) for row in rows]
-        found |= {own[j].name: own[k].name for j, one in enumerate(agreeing) if one > EXACT and j != k}
+        found |= {
+            own[j].name: own[k].name for j, one in enumerate(agreeing) if one > EXACT and j != k
+        }
     return found
 
 
@@ -233,9 +361,20 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
         sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
         runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
         longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
-        begin, end = (float(np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))) for edge in (0, -1))
-        rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), INTERPOLATED_TOLERANCE)
-        check_limit("samples", (end - begin) * rate, f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz")
+        begin, end = (
+            float(
+                np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))
+            )
+            for edge in (0, -1)
+        )
+        rate = plain_rate(
+            min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), INTERPOLATED_TOLERANCE
+        )
+        check_limit(
+            "samples",
+            (end - begin) * rate,
+            f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz",
+        )
         grid = np.arange(begin, end, 1.0 / rate)
         return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
@@ -243,7 +382,9 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
         return np.stack([column.values[run] for column in log.columns]), None
     stamps = log.seconds[run]
     rows = [bridged(column.values[run], stamps, BRIDGED) for column in log.columns]
-    step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
+    step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(
+        len(stamps) - 1, 1
+    )
     rate = plain_rate(1.0 / step, INTERPOLATED_TOLERANCE)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
     if is_even or (stamps[-1] - stamps[0]) * rate > 4 * len(stamps):
@@ -258,7 +399,10 @@ def _busiest(columns: FloatArray, most: int, minute: int) -> FloatArray:
         return columns
     starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
-        changes = [[np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts] for values in columns]
+        changes = [
+            [np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts]
+            for values in columns
+        ]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)
     first = int(starts[np.argmax(np.convolve(activity, np.ones(most // minute), mode="valid"))])
     return columns[:, first : first + most]

@@ -40,7 +40,9 @@ class Question:
         return plain | {"candidates": list(self.candidates), "evidence": list(self.evidence)}
 
 
-def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -> tuple[Examined, tuple[Question, ...]]:
+def ask(
+    examined: Examined, answers: Sequence[str] = (), *, interactive: bool
+) -> tuple[Examined, tuple[Question, ...]]:
     """Answer logs' open questions, by ``KEY=ANSWER`` or at the terminal; returns logs and questions left; raises `ConfigurationError`."""
     questions = list(questions_of(examined))
     keys = [question.key for question in questions]
@@ -48,14 +50,22 @@ def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -
     for text in answers:
         key, _, answer = text.rpartition("=")
         if not key:
-            raise ConfigurationError(f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no")
+            raise ConfigurationError(
+                f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no"
+            )
         if key not in keys:
-            raise ConfigurationError(f"no question has the key '{key}'; open questions: {', '.join(keys) or 'none'}")
+            raise ConfigurationError(
+                f"no question has the key '{key}'; open questions: {', '.join(keys) or 'none'}"
+            )
         given[key] = answer
     if interactive:
         known = {key for key, value in examined.vehicle.items() if value is not None}
         known |= set() if "handwheel" in examined.proposals.by_channel else {"steering_ratio"}
-        questions += [Question(key, text, "", hint="a number, or nothing") for key, text in VEHICLE.items() if key not in known]
+        questions += [
+            Question(key, text, "", hint="a number, or nothing")
+            for key, text in VEHICLE.items()
+            if key not in known
+        ]
     left = []
     for question in questions:
         if question.key in given:
@@ -73,7 +83,11 @@ def questions_of(examined: Examined) -> Iterator[Question]:
     proposals, clock, rate = examined.proposals, examined.log.clock, examined.rate_hz
     if rate is not None:
         text = f"'{examined.log.file.name}' has no column of times: at how many Hz was it sampled?"
-        evidence = (f"ax, in the unit of ay, is d(vx)/dt at about {rate:g} Hz",) if "ax" in proposals.by_channel else ()
+        evidence = (
+            (f"ax, in the unit of ay, is d(vx)/dt at about {rate:g} Hz",)
+            if "ax" in proposals.by_channel
+            else ()
+        )
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
         text = f"is '{clock.column}' the time, in {clock.unit}?"
@@ -82,18 +96,43 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         if one.asked:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            beyond = max(one.beyond(own.values).mean() for log in examined.logs for own in log.columns if own.name == one.column)
+            beyond = max(
+                one.beyond(own.values).mean()
+                for log in examined.logs
+                for own in log.columns
+                if own.name == one.column
+            )
             factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
-            declared = [one.channel, one.unit, *([f"{one.sign:+d}"] if factor or one.sign != 1 else []), *factor]
+            declared = [
+                one.channel,
+                one.unit,
+                *([f"{one.sign:+d}"] if factor or one.sign != 1 else []),
+                *factor,
+            ]
             proposed = LEAVE_OUT if beyond > MOST_BEYOND else " ".join(declared)
-            yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
+            yield Question(
+                one.column,
+                f"column '{one.column}': {one.asked}",
+                proposed,
+                others,
+                one.evidence,
+                hint,
+            )
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
-        yield Question("radius", text, f"{proposals.wheel_radius:g}", (), ("as it fits ay over the yaw rate, or the speed",))
+        yield Question(
+            "radius",
+            text,
+            f"{proposals.wheel_radius:g}",
+            (),
+            ("as it fits ay over the yaw rate, or the speed",),
+        )
     lateral = [one for one in proposals.channels if one.channel in LATERAL]
     if lateral and not proposals.left_right:
         own = next((one for one in lateral if one.channel == "yaw_rate"), lateral[0])
-        text = f"in a left turn, does column '{own.column}' count {'up' if own.sign == 1 else 'down'}?"
+        text = (
+            f"in a left turn, does column '{own.column}' count {'up' if own.sign == 1 else 'down'}?"
+        )
         signs = ", ".join(f"{one.column} {one.sign:+d}" for one in lateral)
         evidence = (f"signs that agree with each other, as they would all reversed: {signs}",)
         yield Question("left_right", text, "yes", ("no",), evidence, "yes or no")
@@ -108,11 +147,15 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
     text = printable(f"? {question.text} ({question.hint})")
     while True:
         try:
-            answer = str(typer.prompt(text, default=question.proposed, show_default=bool(question.proposed)))
+            answer = str(
+                typer.prompt(text, default=question.proposed, show_default=bool(question.proposed))
+            )
         except typer.Abort:
             if sys.stdin is not None and sys.stdin.isatty():
                 raise
-            raise ConfigurationError("no terminal for questions; add --yes to take what is proposed, or --answer KEY=ANSWER") from None
+            raise ConfigurationError(
+                "no terminal for questions; add --yes to take what is proposed, or --answer KEY=ANSWER"
+            ) from None
         try:
             return _answered(examined, question, answer)
         except ConfigurationError as error:
@@ -136,15 +179,23 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     if key == "left_right":
         if answer.lower() not in ("y", "yes", "n", "no"):
             raise ConfigurationError(f"'{answer}' is neither yes nor no")
-        return replace(examined, proposals=proposals.mirrored()) if answer.lower().startswith("n") else examined
-    return replace(examined, proposals=replace(proposals, channels=_declared(proposals.channels, key, answer)))
+        return (
+            replace(examined, proposals=proposals.mirrored())
+            if answer.lower().startswith("n")
+            else examined
+        )
+    return replace(
+        examined, proposals=replace(proposals, channels=_declared(proposals.channels, key, answer))
+    )
 
 
 def _with_time_unit(log: Log, unit: str) -> Log:
     if log.clock is None or log.seconds is None:
         return log
     factor = UNITS[unit] / UNITS[log.clock.unit]
-    return replace(log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor)
+    return replace(
+        log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor
+    )
 
 
 def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple[Proposal, ...]:
@@ -156,7 +207,10 @@ def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple
         return tuple(one for one in channels if one is not own)
     now = _parsed(answer, own)
     freed = own.channel if CHANNELS[now.channel].unit == CHANNELS[own.channel].unit else now.channel
-    declared = [now if one is own else replace(one, channel=freed) if one.channel == now.channel else one for one in channels]
+    declared = [
+        now if one is own else replace(one, channel=freed) if one.channel == now.channel else one
+        for one in channels
+    ]
     return tuple(one for one in declared if one is now or one.channel != now.channel)
 
 
@@ -172,7 +226,9 @@ def _parsed(answer: str, own: Proposal) -> Proposal:
     if sign not in ("", "1", "+1", "-1"):
         raise ConfigurationError(f"'{answer}': the sign must be 1 or -1, not '{sign}'")
     factor_of = _number(factor, f"'{answer}': the factor") if factor else own.factor
-    return replace(own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked="").with_evidence("as answered")
+    return replace(
+        own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked=""
+    ).with_evidence("as answered")
 
 
 def _number(text: str, quantity: str) -> float:

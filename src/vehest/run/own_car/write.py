@@ -33,11 +33,24 @@ LEARNT = 0.7  # of the recordings: training and validation
 LEAST_BLOCK = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
 LEAST_SECONDS = 30.0  # of all recordings, to train at all
 ROLES_OF_THREE = ("train", "validation", "test")
-ROLES = ("train", "test", "train", "validation", "train", "test", "train", "train", "validation", "test")  # of whole recordings, in turn
+ROLES = (
+    "train",
+    "test",
+    "train",
+    "validation",
+    "train",
+    "test",
+    "train",
+    "train",
+    "validation",
+    "test",
+)  # of whole recordings, in turn
 SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
 FILTER_CHANNELS = ("vx", "yaw_rate", "ay")  # of the self-calibrating filter, which does without ax
 ASSUMED_WHEELBASE = 2.7  # m, where it is not given
-STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
+STIFFNESS = (
+    10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
+)
 HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
@@ -79,18 +92,28 @@ class Plan:
 
 def registered(word: str) -> str:
     """The name of an estimator that is given by its name or as ``package.module:Class``; raises `ConfigurationError` where it is none."""
-    name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
+    name = next(
+        (point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word
+    )
     if name not in estimator_names():
         declared = f'[project.entry-points."{ENTRY_POINTS}"], NAME = "{word if ":" in word else "package.module:Class"}"'
         what = f"no installed package declares the estimator '{word}'"
-        raise ConfigurationError(f"{what}; its pyproject.toml needs, under {declared}; then install it with pip")
+        raise ConfigurationError(
+            f"{what}; its pyproject.toml needs, under {declared}; then install it with pip"
+        )
     if name not in choices("estimator"):
-        raise ConfigurationError(f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting")
+        raise ConfigurationError(
+            f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting"
+        )
     return name
 
 
 def write(
-    examined: Examined, left: Sequence[Question] = (), further: Sequence[str] = (), *, dry_run: bool = False
+    examined: Examined,
+    left: Sequence[Question] = (),
+    further: Sequence[str] = (),
+    *,
+    dry_run: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
     """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines.
 
@@ -99,15 +122,26 @@ def write(
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    gone = {one.column for one in examined.proposals.channels} - {one.column for one in made.examined.proposals.channels}
+    gone = {one.column for one in examined.proposals.channels} - {
+        one.column for one in made.examined.proposals.channels
+    }
     left = [question for question in left if question.key not in gone]
-    plan = _plan_of(made, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
-    plan.lacking.update({own: "nothing can be compared on these recordings" for own in further if not plan.sweeps})
+    plan = (
+        _plan_of(made, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
+    )
+    plan.lacking.update(
+        {own: "nothing can be compared on these recordings" for own in further if not plan.sweeps}
+    )
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
-        texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0, made.contents)]
+        texts += [
+            _split_text(made),
+            _pipeline_text(name, plan, LEARNT * made.seconds / 60.0, made.contents),
+        ]
     files = dict(zip(paths_of(name), texts, strict=False))
-    stale = [file for file in paths_of(name)[len(files) :] if file.exists()]  # of an earlier one, which these recordings do not allow
+    stale = [
+        file for file in paths_of(name)[len(files) :] if file.exists()
+    ]  # of an earlier one, which these recordings do not allow
     if not dry_run:
         with ExitStack() as stack:
             for file, text in files.items():
@@ -121,11 +155,19 @@ def write(
         "next": following,
         "dry_run": dry_run,
     }
-    purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
+    purposes = (
+        "channels, units and signs of the columns",
+        "ranges for training, validation and test",
+    )
     lines = _words(made, plan, left)
-    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False):
+    for file, purpose in zip(
+        files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False
+    ):
         lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
-    lines += [f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it" for file in stale]
+    lines += [
+        f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it"
+        for file in stale
+    ]
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
 
 
@@ -136,45 +178,88 @@ def _kept(made: Draft) -> list[str]:
 
 def _cut(made: Draft) -> list[str]:
     """Recordings that are long enough to be cut; none where most of the time is in short ones."""
-    long = {own: duration for own, duration in made.durations.items() if 0.2 * duration >= LEAST_BLOCK}
+    long = {
+        own: duration for own, duration in made.durations.items() if 0.2 * duration >= LEAST_BLOCK
+    }
     return list(long) if sum(long.values()) >= 0.5 * made.seconds else []
 
 
 def _is_too_short(made: Draft) -> bool:
-    return made.seconds < LEAST_SECONDS or (not _cut(made) and len(_kept(made)) < len(ROLES_OF_THREE))
+    return made.seconds < LEAST_SECONDS or (
+        not _cut(made) and len(_kept(made)) < len(ROLES_OF_THREE)
+    )
 
 
 def _split_text(made: Draft) -> str:
     """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
     name, ids, cut = made.examined.name, _kept(made), _cut(made)
     if len(cut) == len(made.contents):
-        blocks = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
+        blocks = {
+            "name": name,
+            "dataset": name,
+            "train": "50 %",
+            "validation": "20 %",
+            "tests": {"test": "30 %"},
+        }
         return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
     if cut:
         train, validation, test = (
-            [{"recording": own, "start": f"{start} %", "stop": f"{stop} %"} for own in cut] for start, stop in pairwise((0, 50, 70, 100))
+            [{"recording": own, "start": f"{start} %", "stop": f"{stop} %"} for own in cut]
+            for start, stop in pairwise((0, 50, 70, 100))
         )
         train += [{"recording": own} for own in ids if own not in cut]
     else:
         order = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
         roles = list(zip(ids, cycle(order), strict=False))
-        train, validation, test = ([{"recording": own} for own, role in roles if role == wanted] for wanted in ROLES_OF_THREE)
-    split: dict[str, Any] = {"name": name, "dataset": name, "train": train, "validation": validation, "tests": {"test": test}}
+        train, validation, test = (
+            [{"recording": own} for own, role in roles if role == wanted]
+            for wanted in ROLES_OF_THREE
+        )
+    split: dict[str, Any] = {
+        "name": name,
+        "dataset": name,
+        "train": train,
+        "validation": validation,
+        "tests": {"test": test},
+    }
     return _yaml(split, [f"{name}: {SPLIT_HEAD if cut else WHOLE_HEAD}"])
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
-    name, file, longest = made.examined.name, made.examined.files[0], max(made.contents, key=lambda own: made.durations[own.id])
+    name, file, longest = (
+        made.examined.name,
+        made.examined.files[0],
+        max(made.contents, key=lambda own: made.durations[own.id]),
+    )
     commands = [f"vehest data check {name}", f"vehest data usable {name}"]
     if plan.sweeps:
         return [*commands, f"vehest run {name} --minutes 15"]
     if file.is_dir() or not longest.channels.issuperset(FILTER_CHANNELS):
         return commands
-    file = next((own for own in made.examined.files if longest.id in (own.stem, f"{own.stem}_run_{longest.id.rpartition('_')[2]}")), file)
+    file = next(
+        (
+            own
+            for own in made.examined.files
+            if longest.id in (own.stem, f"{own.stem}_run_{longest.id.rpartition('_')[2]}")
+        ),
+        file,
+    )
     run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
     settings = [f"estimator.wheelbase={made.examined.vehicle['wheelbase'] or ASSUMED_WHEELBASE:g}"]
-    words = ["vehest", "estimate", str(file), f"dataset={name}", *run, *settings, "-o", "estimate.parquet"]
-    return [*commands, list2cmdline(words)]  # double quotes around blanks, which shells of Windows and POSIX read
+    words = [
+        "vehest",
+        "estimate",
+        str(file),
+        f"dataset={name}",
+        *run,
+        *settings,
+        "-o",
+        "estimate.parquet",
+    ]
+    return [
+        *commands,
+        list2cmdline(words),
+    ]  # double quotes around blanks, which shells of Windows and POSIX read
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -199,7 +284,9 @@ def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
         "rate_hz": min(one.rate_hz for one in made.contents),
         "seconds": made.seconds,
         "open": [question.as_plain() for question in left],
-        "steering_ratio_found": None if made.ratio is None else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
+        "steering_ratio_found": None
+        if made.ratio is None
+        else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
         "has_reference": "vy_ref" in made.channels,
         "estimators": plan.estimators,
         "lacking": plan.lacking,
@@ -214,33 +301,69 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     if made.ratio is not None:
         value, spread = made.ratio
         doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
-        lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
+        lines.append(
+            f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}"
+        )
     lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
     lines += [f"note: {note}" for note in made.notes]
     lines += [f"warning: {remark}" for remark in made.remarks]
     lines += ["open, taken as proposed:"] if left else []
-    lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left]
-    return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
+    lines += [
+        f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left
+    ]
+    return [
+        *lines,
+        *_limits(made),
+        *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items()),
+    ]
 
 
 def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     contents, vehicle = made.contents, made.examined.vehicle
-    plan, values, slowest, cut = Plan(), _car(vehicle), min(own.rate_hz for own in contents), _cut(made)
-    shares = [0.2 * made.durations[own] for own in cut] if cut else [made.durations[own] for own in _kept(made)]
-    seconds = min(shares, default=0.0)  # the shortest of the longest range for training and all those for validation
+    plan, values, slowest, cut = (
+        Plan(),
+        _car(vehicle),
+        min(own.rate_hz for own in contents),
+        _cut(made),
+    )
+    shares = (
+        [0.2 * made.durations[own] for own in cut]
+        if cut
+        else [made.durations[own] for own in _kept(made)]
+    )
+    seconds = min(
+        shares, default=0.0
+    )  # the shortest of the longest range for training and all those for validation
     own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
-    trials = sorted([*own, *((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)])
+    trials = sorted(
+        [
+            *own,
+            *(
+                (trial, name)
+                for name in estimator_names()
+                for trial in estimator_class(name).trials
+            ),
+        ]
+    )
     sweeps: dict[tuple[str, str, int], list[str]] = {}
     for trial, name in trials:
         sweeps.setdefault(trial[1:], []).append(name)
     for (about, overrides, samples), names in sweeps.items():
         if PRETRAINED in overrides and slowest < PRETRAINED_HZ * (1 - 1e-9):
             continue  # the next entry trains the same family from scratch
-        unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
+        unknown = [
+            name
+            for name in ("wheelbase", "mass")
+            if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)
+        ]
         car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
         words = overrides.replace("{car}", car).format(**values).split()
-        words = [word for word in words if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)]
+        words = [
+            word
+            for word in words
+            if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
+        ]
         of_car = f"the car's {' and '.join(unknown)}" if unknown else ""
         lacks = {name: of_car or _lack(name, words, contents, samples, seconds) for name in names}
         tried = [name for name in names if not lacks[name]]
@@ -248,9 +371,13 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
         if tried:
             plan.sweeps.append(([f"estimator={','.join(tried)}", *words], about))
             plan.estimators.extend(tried)
-    known = {name for names in sweeps.values() for name in names} | {"learned_ukf_variant"}  # which only a paper's study compares
+    known = {name for names in sweeps.values() for name in names} | {
+        "learned_ukf_variant"
+    }  # which only a paper's study compares
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
-    plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; --with adds it"))
+    plan.lacking.update(
+        dict.fromkeys(others, "none of the families tried by default; --with adds it")
+    )
     return plan if plan.sweeps else Plan()
 
 
@@ -260,33 +387,77 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
     values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
     values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
-    return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
+    return {name: f"{value:.4g}" for name, value in values.items()} | {
+        "wheelbase": f"{wheelbase:g}"
+    }
 
 
-def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary], samples: int, seconds: float) -> str:
-    first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
+def _lack(
+    name: str,
+    words: Sequence[str],
+    contents: Sequence[RecordingSummary],
+    samples: int,
+    seconds: float,
+) -> str:
+    first = [
+        word if "[" in word else word.split(",")[0]
+        for word in words
+        if not word.startswith("seed=")
+    ]
     try:
         found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error)
     needed = samples / (found.rate_hz or math.inf)
-    short = [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"] if needed > seconds else []
+    short = (
+        [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"]
+        if needed > seconds
+        else []
+    )
     return ", ".join([*found.missing.in_words(), *short]) or found.to_give
 
 
-def _pipeline_of(name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]) -> dict[str, Any]:
+def _pipeline_of(
+    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
+) -> dict[str, Any]:
     """A pipeline for study and split of a name: all recordings, then parts with less of the minutes of reference."""
-    parts: dict[str, Any] = {"all": {"title": "all recordings", "split": name, "sweeps": [words for words, _ in plan.sweeps]}}
-    scratch = ["estimator=ksnn", "estimator.n_local=2", "estimator.n_hidden=2", "training.max_epochs=100"]
+    parts: dict[str, Any] = {
+        "all": {
+            "title": "all recordings",
+            "split": name,
+            "sweeps": [words for words, _ in plan.sweeps],
+        }
+    }
+    scratch = [
+        "estimator=ksnn",
+        "estimator.n_local=2",
+        "estimator.n_hidden=2",
+        "training.max_epochs=100",
+    ]
     for own in MINUTES if "ksnn" in plan.estimators else ():
         if own < 0.8 * minutes:
-            part = {"title": f"{own:g} min of reference", "split": name, "overrides": [f"++split.minutes={own:g}"]}
+            part = {
+                "title": f"{own:g} min of reference",
+                "split": name,
+                "overrides": [f"++split.minutes={own:g}"],
+            }
             parts[f"minutes_{own:g}"] = part | {"sweeps": [["estimator=zero,static_map"], scratch]}
             if any(PRETRAINED in words for words, _ in plan.sweeps):
-                tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
+                tuned = {
+                    "title": f"{part['title']}, trained on",
+                    "sweeps": [[*scratch, PRETRAINED]],
+                }
                 parts[f"minutes_{own:g}_tuned"] = part | tuned
-    evaluation = {"rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)]), "least_speed": STANDSTILL_SPEED}
-    study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
+    evaluation = {
+        "rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)]),
+        "least_speed": STANDSTILL_SPEED,
+    }
+    study = {
+        "study": name,
+        "title": f"Which estimator to trust on {name}",
+        "report": "own_car",
+        "publish": False,
+    }
     return study | {"evaluation": evaluation, "parts": parts}
 
 
@@ -300,12 +471,16 @@ def _limits(own: Draft) -> list[str]:
             f"with the reference; until then {_without_reference(own)}"
         ]
     if not missing and not _cut(own):
-        return [f"the recordings are short, so the split takes whole recordings ({len(_kept(own))}, {own.seconds:.0f} s in all)"]
+        return [
+            f"the recordings are short, so the split takes whole recordings ({len(_kept(own))}, {own.seconds:.0f} s in all)"
+        ]
     if not missing:
         text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
         return [text] if own.seconds < SHORT else []
     if "vy_ref" not in missing:
-        return [f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
+        return [
+            f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"
+        ]
     return [
         "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
         + _without_reference(own)
@@ -318,15 +493,24 @@ def _without_reference(own: Draft) -> str:
     if lacking:
         return f"the self-calibrating filter, which needs no reference, lacks {lacking}"
     wheelbase = own.examined.vehicle["wheelbase"]
-    unknown = "" if wheelbase else f", with your car's wheelbase [m] instead of {ASSUMED_WHEELBASE:g}"
-    return f"the self-calibrating filter needs none and estimates by the last command below{unknown}"
+    unknown = (
+        "" if wheelbase else f", with your car's wheelbase [m] instead of {ASSUMED_WHEELBASE:g}"
+    )
+    return (
+        f"the self-calibrating filter needs none and estimates by the last command below{unknown}"
+    )
 
 
 def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
     examined = made.examined
     name = examined.name
-    head = [f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."]
-    head += [f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}." for question in left]
+    head = [
+        f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."
+    ]
+    head += [
+        f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}."
+        for question in left
+    ]
     for channel, late in made.late.items():
         if not CHANNELS[channel].is_reference:
             head += [
@@ -339,23 +523,43 @@ def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
         evidence = one.evidence[0] if one.evidence else CHANNELS[one.channel].meaning
         comments[f"  {one.channel}"] = f"asked: {one.asked}; {evidence}" if one.asked else evidence
     dataset = {key: value for key, value in made.dataset.items() if key != "transforms" or value}
-    return _yaml({**dataset, "reference_point": "unknown", "imu_point": "unknown", "accept": []}, head, comments)
+    return _yaml(
+        {**dataset, "reference_point": "unknown", "imu_point": "unknown", "accept": []},
+        head,
+        comments,
+    )
 
 
-def _pipeline_text(name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]) -> str:
+def _pipeline_text(
+    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
+) -> str:
     head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
-    head += ["Left out, and what each lacks:", *(f"  {own}: {lack}" for own, lack in plan.lacking.items())]
+    head += [
+        "Left out, and what each lacks:",
+        *(f"  {own}: {lack}" for own, lack in plan.lacking.items()),
+    ]
     return _yaml(_pipeline_of(name, plan, minutes, contents), head)
 
 
-def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
+def _yaml(
+    content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None
+) -> str:
     """YAML below a comment, with further comments behind some keys."""
-    lines = yaml.safe_dump(dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False).splitlines()
+    lines = yaml.safe_dump(
+        dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False
+    ).splitlines()
     for line in lines:
         if "${" in line:
-            raise ConfigurationError(f"'{printable(line.strip()[:60])}' holds '${{', which configurations read as a reference; rename it")
+            raise ConfigurationError(
+                f"'{printable(line.strip()[:60])}' holds '${{', which configurations read as a reference; rename it"
+            )
     known = {key: printable(comment) for key, comment in (comments or {}).items()}
-    behind = [f"{line:<44} # {known[key]}" if (key := line.partition(":")[0]) in known else line for line in lines]
-    return "\n".join([*(f"# {printable(line)}" for text in head for line in text.splitlines()), *behind, ""])
+    behind = [
+        f"{line:<44} # {known[key]}" if (key := line.partition(":")[0]) in known else line
+        for line in lines
+    ]
+    return "\n".join(
+        [*(f"# {printable(line)}" for text in head for line in text.splitlines()), *behind, ""]
+    )

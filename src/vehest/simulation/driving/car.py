@@ -47,10 +47,16 @@ class Car:
     steering_rate: float  # largest steering velocity of the road wheels [rad/s]
     largest_steer: float  # of the road wheels [rad]
     lateral_acceleration: tuple[float, ...]  # (M,), from 0 to the grip [m/s²]
-    excess_steer: tuple[float, ...]  # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
-    rear_slip: tuple[float, ...]  # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    excess_steer: tuple[
+        float, ...
+    ]  # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
+    rear_slip: tuple[
+        float, ...
+    ]  # (M,), slip angle of the rear axle there, as a positive angle [rad]
 
-    def steer_for(self, curvature: float, lateral_acceleration: float, friction: float = 1.0) -> float:
+    def steer_for(
+        self, curvature: float, lateral_acceleration: float, friction: float = 1.0
+    ) -> float:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
         Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
@@ -59,14 +65,20 @@ class Car:
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
 
-    def sideslip_for(self, curvature: float, lateral_acceleration: float, friction: float = 1.0) -> float:
+    def sideslip_for(
+        self, curvature: float, lateral_acceleration: float, friction: float = 1.0
+    ) -> float:
         """Sideslip [rad] in the same turn."""
         slip = self._at(self.rear_slip, lateral_acceleration, friction)
-        return (self.wheelbase * self.front_share) * curvature - math.copysign(friction * slip, lateral_acceleration)
+        return (self.wheelbase * self.front_share) * curvature - math.copysign(
+            friction * slip, lateral_acceleration
+        )
 
     def resistance(self, speed: float, yaw_rate: float, steer: float, sideslip: float) -> float:
         """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn."""
-        return self.drag * speed**2 + yaw_rate * speed * (self.front_share * math.sin(steer) - math.sin(sideslip))
+        return self.drag * speed**2 + yaw_rate * speed * (
+            self.front_share * math.sin(steer) - math.sin(sideslip)
+        )
 
     def _at(self, values: tuple[float, ...], lateral_acceleration: float, friction: float) -> float:
         grid = self.lateral_acceleration
@@ -79,7 +91,10 @@ class Car:
 def car_of(plant: MultiBodyPlant) -> Car:
     """The car as its driver knows it; measured once a process for each vehicle and step; raises `ConfigurationError`."""
     own = dict(plant.vehicle.driver)
-    key = json.dumps([plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step], sort_keys=True)
+    key = json.dumps(
+        [plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step],
+        sort_keys=True,
+    )
     if key not in _KNOWN:
         _KNOWN[key] = _as_known(plant, own)
     return _KNOWN[key]
@@ -93,9 +108,13 @@ def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
     vehicle, parameters = plant.vehicle, plant.parameters
     unknown = sorted(set(own) - set(_OWN_VALUES))
     if unknown:
-        raise ConfigurationError(f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_OWN_VALUES)}")
+        raise ConfigurationError(
+            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_OWN_VALUES)}"
+        )
     front_share = parameters.b / (parameters.a + parameters.b)
-    driven_axle = min(_ratio(front_share, parameters.T_se), _ratio(1.0 - front_share, 1.0 - parameters.T_se))
+    driven_axle = min(
+        _ratio(front_share, parameters.T_se), _ratio(1.0 - front_share, 1.0 - parameters.T_se)
+    )
     top_speed = _own(own, "top_speed", parameters.longitudinal.v_max, vehicle.name)
     accelerations, steers, slips = _measure(plant, min(TEST_SPEED, 0.5 * top_speed))
     grip = _own(own, "grip", accelerations[-1], vehicle.name)
@@ -107,10 +126,16 @@ def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
         grip=grip,
         driving_share=min(TRACTION_SHARE * driven_axle, TRACTION_SHARE),
         power_per_mass=_own(
-            own, "power_per_mass", POWER_SHARE * parameters.longitudinal.a_max * parameters.longitudinal.v_switch, vehicle.name
+            own,
+            "power_per_mass",
+            POWER_SHARE * parameters.longitudinal.a_max * parameters.longitudinal.v_switch,
+            vehicle.name,
         ),
         top_speed=top_speed,
-        drag=0.5 * AIR_DENSITY / parameters.m * _own(own, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
+        drag=0.5
+        * AIR_DENSITY
+        / parameters.m
+        * _own(own, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
         steering_rate=parameters.steering.v_max,
         largest_steer=parameters.steering.max,
         lateral_acceleration=accelerations,
@@ -126,22 +151,35 @@ def _ratio(load: float, torque: float) -> float:
 def _own(own: Mapping[str, Any], name: str, default: float, vehicle_name: str) -> float:
     value = float(own.get(name, default))
     if not (math.isfinite(value) and value > 0.0):
-        raise ConfigurationError(f"vehicle '{vehicle_name}': the driver's {name} must be positive, not {value}")
+        raise ConfigurationError(
+            f"vehicle '{vehicle_name}': the driver's {name} must be positive, not {value}"
+        )
     return value
 
 
-def _measure(plant: MultiBodyPlant, speed: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+def _measure(
+    plant: MultiBodyPlant, speed: float
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one; excess steer and rear slip [rad] there."""
     ramp = ramp_steer(plant, speed)
     steady = ramp.vx * ramp.yaw_rate
-    astray = np.flatnonzero((np.abs(ramp.ay - steady) > UNSTEADY) | (ramp.tyre_fz.min(axis=1) <= 0.0))
+    astray = np.flatnonzero(
+        (np.abs(ramp.ay - steady) > UNSTEADY) | (ramp.tyre_fz.min(axis=1) <= 0.0)
+    )
     end = int(astray[0]) if len(astray) else len(steady) - 1
     limit = int(np.argmax(steady >= USEFUL_SHARE * steady[: end + 1].max()))
     grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
-        raise ConfigurationError(f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow")
-    ramp_values = (ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx, (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx)
+        raise ConfigurationError(
+            f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow"
+        )
+    ramp_values = (
+        ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,
+        (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx,
+    )
     grid = np.append(np.arange(0.0, grip - 0.05, 0.25), grip)
     rising = np.maximum.accumulate(steady[: limit + 1])
-    steers, slips = (np.interp(grid, rising, values[: limit + 1]).tolist() for values in ramp_values)
+    steers, slips = (
+        np.interp(grid, rising, values[: limit + 1]).tolist() for values in ramp_values
+    )
     return tuple(grid.tolist()), tuple(steers), tuple(slips)

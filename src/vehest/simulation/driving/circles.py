@@ -36,13 +36,19 @@ class SteadyCircle(Manoeuvre):
     name: ClassVar[str] = "skidpad"
     radius: Range = (35.0, 60.0)  # [m]; the standard wants at least 30 m
     severity: Range = (0.7, 0.95)  # share of the grip at which it ends
-    ay_rate: float = 0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase
+    ay_rate: float = (
+        0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase
+    )
     start_ay: float = 2.0  # at which the circle is entered [m/s²]
     hold_time: float = 2.0  # at the final speed [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
     half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]
 
-    limits: ClassVar = CIRCLE_LIMITS | {"ay_rate": (0.02, 3.0), "start_ay": (0.2, 8.0), "hold_time": (0.0, 120.0)}
+    limits: ClassVar = CIRCLE_LIMITS | {
+        "ay_rate": (0.02, 3.0),
+        "start_ay": (0.2, 8.0),
+        "hold_time": (0.0, 120.0),
+    }
 
     @property
     def longest(self) -> float:
@@ -54,7 +60,10 @@ class SteadyCircle(Manoeuvre):
         draw = Draws(seed)
         radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
         driver = draw_driver(seed)
-        final_ay = min(severity * car.grip * OpenArea(surface, seed).lowest, (FASTEST_SHARE * car.top_speed) ** 2 / radius)
+        final_ay = min(
+            severity * car.grip * OpenArea(surface, seed).lowest,
+            (FASTEST_SHARE * car.top_speed) ** 2 / radius,
+        )
         first_ay = min(self.start_ay, 0.5 * final_ay)
         speed = math.sqrt(first_ay * radius)
         run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
@@ -69,8 +78,15 @@ class SteadyCircle(Manoeuvre):
         around = math.sqrt(final_ay * radius) * (growing + self.hold_time + 5.0)
         line = circle(radius, side, run_in, around, transition)
         plan = plan_along(line, speed, surface, seed)
-        drawn = {"radius": radius, "severity": severity, "side": SIDES[side], "driver": asdict(driver)}
-        return LineDriver(plan, car, driver, drawn, end_time=entered + growing + self.hold_time, speed_at=speed_at)
+        drawn = {
+            "radius": radius,
+            "severity": severity,
+            "side": SIDES[side],
+            "driver": asdict(driver),
+        }
+        return LineDriver(
+            plan, car, driver, drawn, end_time=entered + growing + self.hold_time, speed_at=speed_at
+        )
 
 
 @dataclass(frozen=True)
@@ -79,15 +95,24 @@ class BrakingInTurn(Manoeuvre):
 
     name: ClassVar[str] = "braking_in_turn"
     radius: Range = (60.0, 100.0)  # of the circle [m]; 100 m in the standard
-    severity: Range = (0.4, 0.7)  # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
+    severity: Range = (
+        0.4,
+        0.7,
+    )  # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
     deceleration: Range = (2.0, 5.0)  # [m/s²]
     turn_time: Range = (3.0, 5.0)  # on the circle before the brakes [s]
-    steering: Literal["held", "path"] = "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
+    steering: Literal["held", "path"] = (
+        "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
+    )
     until_speed: float = 0.0  # at which the recording ends [m/s]; 0 is the stand
     side: Side = "either"  # ``left``, ``right`` or ``either``
     half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes
 
-    limits: ClassVar = CIRCLE_LIMITS | {"deceleration": (0.5, 10.0), "turn_time": (1.0, 60.0), "until_speed": (0.0, 60.0)}
+    limits: ClassVar = CIRCLE_LIMITS | {
+        "deceleration": (0.5, 10.0),
+        "turn_time": (1.0, 60.0),
+        "until_speed": (0.0, 60.0),
+    }
 
     @property
     def longest(self) -> float:
@@ -100,7 +125,10 @@ class BrakingInTurn(Manoeuvre):
         radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
         deceleration, turn_time = draw(self.deceleration), draw(self.turn_time)
         driver = draw_driver(seed)
-        speed = min(math.sqrt(severity * car.grip * OpenArea(surface, seed).mean * radius), FASTEST_SHARE * car.top_speed)
+        speed = min(
+            math.sqrt(severity * car.grip * OpenArea(surface, seed).mean * radius),
+            FASTEST_SHARE * car.top_speed,
+        )
         run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
         brakes_at = (run_in + transition) / speed - SETTLING_TIME + turn_time
         line = circle(radius, side, run_in, speed * (turn_time + 30.0), transition)
@@ -115,7 +143,9 @@ class BrakingInTurn(Manoeuvre):
 class TurnBraker(LineDriver):
     """Follows a circle, then brakes until the manoeuvre's speed is reached or the car stands."""
 
-    def __init__(self, manoeuvre: BrakingInTurn, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any]) -> None:
+    def __init__(
+        self, manoeuvre: BrakingInTurn, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any]
+    ) -> None:
         super().__init__(plan, car, driver, drawn)
         self._brakes_at, self._deceleration = drawn["brakes_at"], drawn["deceleration"]
         self._held, self._until_speed = manoeuvre.steering == "held", manoeuvre.until_speed
@@ -127,7 +157,11 @@ class TurnBraker(LineDriver):
             return decision
         braking = -self._deceleration * min((time - self._brakes_at) / BRAKE_BUILD_UP, 1.0)
         decision = decision._replace(acceleration=braking, finished=seen.speed < self._until_speed)
-        return decision._replace(steering_velocity=0.0, lateral_error=math.nan) if self._held else decision
+        return (
+            decision._replace(steering_velocity=0.0, lateral_error=math.nan)
+            if self._held
+            else decision
+        )
 
 
 BRAKE_BUILD_UP = 0.2  # time in which brakes come on [s]; assumed

@@ -37,8 +37,13 @@ class DoubleLaneChange(Manoeuvre):
     """
 
     name: ClassVar[str] = "double_lane_change"
-    layout: Literal["iso_3888_1", "iso_3888_2"] = "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
-    severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
+    layout: Literal["iso_3888_1", "iso_3888_2"] = (
+        "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
+    )
+    severity: Range = (
+        0.5,
+        0.9,
+    )  # share of the grip that the sharpest bend of the line takes; decides the speed
     speed: Range | None = None  # [m/s], instead of the severity
     side: Side = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
     half_width: float = 1.5  # distance from the line beyond which the car has left the road [m]
@@ -55,12 +60,23 @@ class DoubleLaneChange(Manoeuvre):
         first, last = 1.1 * width + 0.25, 1.3 * width + 0.25
         if self.layout == "iso_3888_1":
             second, offset = 1.2 * width + 0.25, 3.5
-            lanes = ((0.0, 15.0, first, 0.0), (45.0, 70.0, second, offset), (95.0, 125.0, last, 0.0))
+            lanes = (
+                (0.0, 15.0, first, 0.0),
+                (45.0, 70.0, second, offset),
+                (95.0, 125.0, last, 0.0),
+            )
         else:
             second, last = width + 1.0, max(last, 3.0)
             offset = 0.5 * first + 1.0 + 0.5 * second  # one metre between the lanes
-            lanes = ((0.0, 12.0, first, 0.0), (25.5, 36.5, second, offset), (49.0, 61.0, last, 0.5 * (last - first)))
-        return tuple(Gate(begin, end, middle - 0.5 * wide, middle + 0.5 * wide) for begin, end, wide, middle in lanes)
+            lanes = (
+                (0.0, 12.0, first, 0.0),
+                (25.5, 36.5, second, offset),
+                (49.0, 61.0, last, 0.5 * (last - first)),
+            )
+        return tuple(
+            Gate(begin, end, middle - 0.5 * wide, middle + 0.5 * wide)
+            for begin, end, wide, middle in lanes
+        )
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the speed, the side and the habits of this seed."""
@@ -74,7 +90,10 @@ class Slalom(Manoeuvre):
     name: ClassVar[str] = "slalom"
     spacing: float = 18.0  # of the cones [m]; 18 m and 30 m are customary
     cones: int = 8  # how many
-    severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
+    severity: Range = (
+        0.5,
+        0.9,
+    )  # share of the grip that the sharpest bend of the line takes; decides the speed
     speed: Range | None = None  # [m/s], instead of the severity
     side: Side = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
     half_width: float = 2.0  # distance from the line beyond which the car has left the road [m]
@@ -97,21 +116,37 @@ class Slalom(Manoeuvre):
         return _between_cones(self, self.gates(car.width), car, surface, seed)
 
 
-def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...], car: Car, surface: Surface, seed: int) -> Controller:
+def _between_cones(
+    manoeuvre: DoubleLaneChange | Slalom,
+    gates: tuple[Gate, ...],
+    car: Car,
+    surface: Surface,
+    seed: int,
+) -> Controller:
     draw = Draws(seed)
     severity, side = draw(manoeuvre.severity), draw.side(manoeuvre.side)
     own_speed = draw(manoeuvre.speed) if manoeuvre.speed is not None else None
     usual = draw_driver(seed)  # who looks less far ahead and steers faster between cones
-    driver = replace(usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag)
+    driver = replace(
+        usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag
+    )
     shape = line_through(gates, car.width, 40.0, 60.0)
     grip = car.grip * OpenArea(surface, seed).mean
-    speed = own_speed or min(math.sqrt(severity * grip / float(np.abs(shape.curvature).max())), FASTEST_SHARE * car.top_speed)
+    speed = own_speed or min(
+        math.sqrt(severity * grip / float(np.abs(shape.curvature).max())),
+        FASTEST_SHARE * car.top_speed,
+    )
     run_in = (SETTLING_TIME + 1.0) * speed
     line = _beginning_at(shape, run_in - 40.0) if run_in > 40.0 else shape
     if side < 0.0:
         line = Line(line.distance, line.x, -line.y, -line.heading, -line.curvature)
     plan = plan_along(line, speed, surface, seed)
-    drawn = {"severity": severity if own_speed is None else None, "speed": speed, "side": SIDES[side], "driver": asdict(driver)}
+    drawn = {
+        "severity": severity if own_speed is None else None,
+        "speed": speed,
+        "side": SIDES[side],
+        "driver": asdict(driver),
+    }
     end = max(run_in, 40.0) + gates[-1].end - gates[0].begin + 40.0
     return LineDriver(plan, car, driver, drawn, end=end)
 
@@ -122,4 +157,8 @@ def _beginning_at(line: Line, earlier: float) -> Line:
     before = np.arange(math.ceil(earlier / step)) * step
     distance = np.concatenate([before, before[-1] + step + line.distance])
     x = np.concatenate([line.x[0] - before[::-1] - step, line.x])
-    return Line(distance, x, *(np.pad(values, (len(before), 0)) for values in (line.y, line.heading, line.curvature)))
+    return Line(
+        distance,
+        x,
+        *(np.pad(values, (len(before), 0)) for values in (line.y, line.heading, line.curvature)),
+    )

@@ -23,9 +23,16 @@ from vehest.simulation.road.lines import Line
 
 DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
-LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0  # frequencies between which a driver corrects [Hz]; assumed
+LOWEST_CORRECTION, HIGHEST_CORRECTION = (
+    0.5,
+    2.0,
+)  # frequencies between which a driver corrects [Hz]; assumed
 
-WAVELENGTHS = (310.0, 470.0, 1130.0)  # of the variations along a drive [m]; assumed, and none divides a lap
+WAVELENGTHS = (
+    310.0,
+    470.0,
+    1130.0,
+)  # of the variations along a drive [m]; assumed, and none divides a lap
 
 
 @dataclass(frozen=True)
@@ -62,9 +69,14 @@ class DrivingStyle:
     line_phases: tuple[float, ...]  # phase of each sine of the line [rad]
 
     def __post_init__(self) -> None:
-        low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
+        low, high = (
+            self.grip_fraction - abs(self.grip_ripple),
+            self.grip_fraction + abs(self.grip_ripple),
+        )
         if not (low > 0.0 and high <= 1.0 + 1e-9):
-            raise ConfigurationError(f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1")
+            raise ConfigurationError(
+                f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +127,9 @@ class Command(NamedTuple):
     steering_velocity: float  # of the road wheels [rad/s]
     acceleration: float  # wanted [m/s²]
     progress: float = 0.0  # distance along the way [m]
-    lateral_error: float = math.nan  # the car's place left of its line [m]; NaN where there is no line
+    lateral_error: float = (
+        math.nan
+    )  # the car's place left of its line [m]; NaN where there is no line
     friction: float = 1.0  # scale of the tyres' friction at the car
     bank: float = 0.0  # of the road, positive with its left side higher [rad]
     grade: float = 0.0  # of the road, positive downhill [rad]
@@ -123,16 +137,27 @@ class Command(NamedTuple):
     finished: bool = False  # the manoeuvre is over
 
 
-def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float) -> DrivingStyle:
+def draw_style(
+    seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float
+) -> DrivingStyle:
     """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the circle."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
-    return DrivingStyle(grip_fraction, ripple, line_offset, WAVELENGTHS, tuple(phases[0]), tuple(phases[1]))
+    return DrivingStyle(
+        grip_fraction, ripple, line_offset, WAVELENGTHS, tuple(phases[0]), tuple(phases[1])
+    )
 
 
 def plan_laps(
-    course: Course, car: Car, driver: Driver, style: DrivingStyle, n_laps: int, *, friction: FloatArray, highest_speed: FloatArray | float
+    course: Course,
+    car: Car,
+    driver: Driver,
+    style: DrivingStyle,
+    n_laps: int,
+    *,
+    friction: FloatArray,
+    highest_speed: FloatArray | float,
 ) -> Plan:
     """Line and speed profile over one whole lap or more, within the car's limits.
 
@@ -141,9 +166,13 @@ def plan_laps(
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
-    bend, bank, grade = (_repeat(values, n_laps) for values in (course.curvature, course.bank, course.grade))
+    bend, bank, grade = (
+        _repeat(values, n_laps) for values in (course.curvature, course.bank, course.grade)
+    )
     scale = _repeat(friction, n_laps)
-    offset, offset_slope, offset_bend = _sines(distance, style.wavelengths, style.line_phases, style.line_offset)
+    offset, offset_slope, offset_bend = _sines(
+        distance, style.wavelengths, style.line_phases, style.line_offset
+    )
     stretch = 1.0 - bend * offset  # length of the line per length of the centre line
     curvature = bend / stretch + offset_bend
     ripple, _, _ = _sines(distance, style.wavelengths, style.grip_phases, style.grip_ripple)
@@ -154,7 +183,9 @@ def plan_laps(
         y=_repeat(course.y, n_laps) + offset * np.cos(heading),
         heading=heading + np.arctan2(offset_slope, stretch),
         curvature=curvature,
-        speed=speed_profile(curvature, used, float(distance[1]), car, driver, highest_speed, bank, grade),
+        speed=speed_profile(
+            curvature, used, float(distance[1]), car, driver, highest_speed, bank, grade
+        ),
         friction=scale,
         bank=bank,
         grade=grade,
@@ -189,11 +220,21 @@ def speed_profile(
         return math.sqrt(max(1.0 - (speed[i] ** 2 * bend[i] / limit[i]) ** 2, 0.0))
 
     for i in range(len(speed) - 2, -1, -1):
-        braking = driver.braking_share * most[i + 1] * spare(i + 1) - downhill[i + 1] + car.drag * speed[i + 1] ** 2
+        braking = (
+            driver.braking_share * most[i + 1] * spare(i + 1)
+            - downhill[i + 1]
+            + car.drag * speed[i + 1] ** 2
+        )
         speed[i] = min(speed[i], math.sqrt(speed[i + 1] ** 2 + 2.0 * max(braking, 0.0) * spacing))
     for i in range(len(speed) - 1):
-        driving = min(car.power_per_mass / speed[i], car.driving_share * most[i] * spare(i)) + downhill[i] - car.drag * speed[i] ** 2
-        speed[i + 1] = min(speed[i + 1], math.sqrt(max(speed[i] ** 2 + 2.0 * driving * spacing, 0.01)))
+        driving = (
+            min(car.power_per_mass / speed[i], car.driving_share * most[i] * spare(i))
+            + downhill[i]
+            - car.drag * speed[i] ** 2
+        )
+        speed[i + 1] = min(
+            speed[i + 1], math.sqrt(max(speed[i] ** 2 + 2.0 * driving * spacing, 0.01))
+        )
     return np.array(speed)
 
 
@@ -206,13 +247,23 @@ class Hands:
     """
 
     def __init__(self, size: float, generator: np.random.Generator) -> None:
-        frequencies = LOWEST_CORRECTION * (HIGHEST_CORRECTION / LOWEST_CORRECTION) ** generator.uniform(size=24)
+        frequencies = LOWEST_CORRECTION * (
+            HIGHEST_CORRECTION / LOWEST_CORRECTION
+        ) ** generator.uniform(size=24)
         self.size = size
-        self._waves = list(zip((2.0 * math.pi * frequencies).tolist(), generator.uniform(0.0, 2.0 * math.pi, 24).tolist(), strict=True))
+        self._waves = list(
+            zip(
+                (2.0 * math.pi * frequencies).tolist(),
+                generator.uniform(0.0, 2.0 * math.pi, 24).tolist(),
+                strict=True,
+            )
+        )
 
     def at(self, time: float, load: float) -> float:
         """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip [m/s²]."""
-        unit = math.sqrt(2.0 / len(self._waves)) * sum(math.sin(rate * time + phase) for rate, phase in self._waves)
+        unit = math.sqrt(2.0 / len(self._waves)) * sum(
+            math.sin(rate * time + phase) for rate, phase in self._waves
+        )
         return self.size * unit * (1.0 + 2.0 * min(load, 1.0)) / 3.0
 
 
@@ -250,7 +301,10 @@ class Follower:
     def start(self) -> tuple[float, float, float, float]:
         """Place [m], heading [rad] and speed [m/s] at which the car starts."""
         cell, share = self._cell(self.progress)
-        x, y, heading, speed = (_between(values, cell, share) for values in (self._x, self._y, self._heading, self._speed))
+        x, y, heading, speed = (
+            _between(values, cell, share)
+            for values in (self._x, self._y, self._heading, self._speed)
+        )
         return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
 
     def command(self, time: float, seen: Observation) -> Command:
@@ -258,7 +312,9 @@ class Follower:
         car, driver = self.car, self.driver
         speed, sideslip = seen.speed, seen.sideslip
         lateral_error, heading_error, here, share = self._locate(seen, sideslip)
-        ahead, share_ahead = self._cell(self.progress + speed * (driver.steering_lag + driver.response * speed))
+        ahead, share_ahead = self._cell(
+            self.progress + speed * (driver.steering_lag + driver.response * speed)
+        )
         friction = max(_between(self._friction, ahead, share_ahead), 0.05)
         bank, grade = _between(self._bank, here, share), _between(self._grade, here, share)
         grip = car.grip * friction
@@ -283,12 +339,19 @@ class Follower:
         target, feedforward = (
             self._speed_at(time)
             if self._speed_at
-            else (_between(self._speed, here, share), _between(self._acceleration, ahead, share_ahead))
+            else (
+                _between(self._speed, here, share),
+                _between(self._acceleration, ahead, share_ahead),
+            )
         )
-        resistance = car.resistance(speed, seen.yaw_rate, seen.steer, sideslip) - GRAVITY * math.sin(grade)
+        resistance = car.resistance(
+            speed, seen.yaw_rate, seen.steer, sideslip
+        ) - GRAVITY * math.sin(grade)
         acceleration = feedforward + driver.speed_gain * (target - speed) + resistance
         spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
-        highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0)) * max(1.0 - beyond / 0.1, 0.0)
+        highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0)) * max(
+            1.0 - beyond / 0.1, 0.0
+        )
         lowest = -max(driver.braking_share * grip * spare, 0.1 * grip)
         return Command(
             steering_velocity=steering_velocity(car, driver, steer, seen.steer),
@@ -311,7 +374,10 @@ class Follower:
         for _ in range(2):
             cell, share = self._cell(self.progress)
             heading = _between(self._heading, cell, share)
-            dx, dy = seen.x - _between(self._x, cell, share), seen.y - _between(self._y, cell, share)
+            dx, dy = (
+                seen.x - _between(self._x, cell, share),
+                seen.y - _between(self._y, cell, share),
+            )
             along, across = math.cos(heading), math.sin(heading)
             self.progress = max(self.progress + dx * along + dy * across, 0.0)
         error = dy * along - dx * across
@@ -343,7 +409,10 @@ def _repeat(values: FloatArray, n_laps: int, per_lap: float = 0.0) -> FloatArray
 
 
 def _sines(
-    distance: FloatArray, wavelengths: tuple[float, ...], phases: tuple[float, ...], amplitude: float
+    distance: FloatArray,
+    wavelengths: tuple[float, ...],
+    phases: tuple[float, ...],
+    amplitude: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean of sines of the given amplitude with its first and second derivative, each (N,)."""
     wave_numbers = 2.0 * math.pi / np.array(wavelengths)

@@ -32,20 +32,30 @@ class Freestyle(Manoeuvre):
     duration: Range = (20.0, 40.0)  # of the recording [s]
     speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest wanted speed [m/s]
     current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
-    sideslip: tuple[float, float] = (0.15, 0.35)  # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
+    sideslip: tuple[float, float] = (
+        0.15,
+        0.35,
+    )  # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
     brakes: float = 0.02  # share of the decisions that are a full braking
     kicks: float = 0.03  # share of the decisions that are a burst with the largest current
     straights: float = 0.15  # share of the steering decisions that are straight ahead
 
     limits: ClassVar = {
-        **{"duration": (1.0, 3600.0), "speed": (0.5, 20.0), "current": (0.0, 1000.0), "sideslip": (0.05, math.pi)},
+        **{
+            "duration": (1.0, 3600.0),
+            "speed": (0.5, 20.0),
+            "current": (0.0, 1000.0),
+            "sideslip": (0.05, math.pi),
+        },
         **dict.fromkeys(("brakes", "kicks", "straights"), (0.0, 1.0)),
     }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.brakes + self.kicks > 1.0:
-            raise ConfigurationError(f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}")
+            raise ConfigurationError(
+                f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}"
+            )
 
     @property
     def longest(self) -> float:
@@ -61,7 +71,13 @@ class FreestyleDriver:
     """Drives one car for the time of one recording."""
 
     def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, draw: Draws) -> None:
-        self._style, self._car, self._area, self._draw, self._generator = style, car, area, draw, draw.generator
+        self._style, self._car, self._area, self._draw, self._generator = (
+            style,
+            car,
+            area,
+            draw,
+            draw.generator,
+        )
         self.duration = draw(style.duration)
         self.drawn = {"duration": self.duration}
         self._progress = self._speed_until = self._steer_until = self._gas_until = 0.0

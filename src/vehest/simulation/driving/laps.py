@@ -11,7 +11,15 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
-from vehest.simulation.driving.driver import Command, Driver, Hands, Observation, Plan, draw_style, plan_laps
+from vehest.simulation.driving.driver import (
+    Command,
+    Driver,
+    Hands,
+    Observation,
+    Plan,
+    draw_style,
+    plan_laps,
+)
 from vehest.simulation.driving.manoeuvre import (
     SETTLING_TIME,
     Controller,
@@ -58,7 +66,9 @@ class Laps(Manoeuvre):
         super().__post_init__()
         course_by_name(self.course)
         if (self.duration is None) == (self.laps is None):
-            raise ConfigurationError("manoeuvre 'laps' needs either a duration [s] or a number of laps")
+            raise ConfigurationError(
+                "manoeuvre 'laps' needs either a duration [s] or a number of laps"
+            )
 
     @property
     def longest(self) -> float:
@@ -87,22 +97,32 @@ class Laps(Manoeuvre):
 
         def plan(n_laps: int) -> Plan:
             speeds = self._held_up(course, n_laps, highest, seed) if self.traffic else highest
-            return plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=speeds)
+            return plan_laps(
+                course, car, driver, style, n_laps, friction=friction, highest_speed=speeds
+            )
 
-        laps = self.laps if self.laps is not None else math.ceil((self.duration or 0.0) / _lap_time(plan(2), course.length)) + 1
+        laps = (
+            self.laps
+            if self.laps is not None
+            else math.ceil((self.duration or 0.0) / _lap_time(plan(2), course.length)) + 1
+        )
         end = (1 + self.laps) * course.length if self.laps is not None else math.inf
         drawn: dict[str, Any] = {"style": asdict(style), "driver": asdict(driver)}
         end_time = self.duration if self.duration is not None else math.inf
         if hands is not None:
             drawn["corrections"] = hands.size
-        return LapDriver(plan(laps + 2), car, driver, drawn, course.length, end, end_time=end_time, hands=hands)
+        return LapDriver(
+            plan(laps + 2), car, driver, drawn, course.length, end, end_time=end_time, hands=hands
+        )
 
     def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
         """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are drawn lap by lap."""
         cells, spacing = len(course.arc_length) - 1, float(course.arc_length[1])
         speeds = np.full(n_laps * cells + 1, highest)
         for lap in range(n_laps):
-            generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_TRAFFIC_STREAM, lap)))
+            generator = np.random.default_rng(
+                np.random.SeedSequence(entropy=seed, spawn_key=(_TRAFFIC_STREAM, lap))
+            )
             for _ in range(int(generator.poisson(self.traffic))):
                 begin = lap * cells + int(generator.uniform(0.0, cells))
                 length = int(generator.uniform(*TRAFFIC_LENGTH) / spacing)
@@ -117,7 +137,11 @@ class SpeedLaps(Manoeuvre):
 
     name: ClassVar[str] = "speed_laps"
     course: str = "vairano_like"  # name of the course
-    speeds: tuple[float, ...] = (30.0 / 3.6, 40.0 / 3.6, 45.0 / 3.6)  # of the laps, in order [m/s]; 30, 40 and 45 km/h in the paper
+    speeds: tuple[float, ...] = (
+        30.0 / 3.6,
+        40.0 / 3.6,
+        45.0 / 3.6,
+    )  # of the laps, in order [m/s]; 30, 40 and 45 km/h in the paper
     stop_time: float = 5.0  # from the last lap's speed to the stand [s]; 5 s in the paper
     severity: Range = 0.7  # share of the grip that corners get at most
     change_rate: float = 0.4  # acceleration by which the speed changes from lap to lap [m/s²]
@@ -125,13 +149,19 @@ class SpeedLaps(Manoeuvre):
     flat: bool = False  # leaves out the course's bank and grade
     half_width: float = 5.0  # of the road, beyond which the car has left it [m]
 
-    limits: ClassVar = {"severity": (0.05, 0.95), "stop_time": (1.0, 60.0), "change_rate": (0.05, 3.0)}
+    limits: ClassVar = {
+        "severity": (0.05, 0.95),
+        "stop_time": (1.0, 60.0),
+        "change_rate": (0.05, 3.0),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         course_by_name(self.course)
         if not self.speeds or not all(2.0 <= speed <= 60.0 for speed in self.speeds):
-            raise ConfigurationError(f"manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not {list(self.speeds)}")
+            raise ConfigurationError(
+                f"manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not {list(self.speeds)}"
+            )
 
     @property
     def longest(self) -> float:
@@ -149,7 +179,15 @@ class SpeedLaps(Manoeuvre):
         cells = len(course.arc_length) - 1
         lap_of = np.clip(np.arange(n_laps * cells + 1) // cells - 1, 0, len(self.speeds) - 1)
         wanted = np.array(self.speeds)[lap_of]
-        plan = plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=_eased(wanted, course, self.change_rate))
+        plan = plan_laps(
+            course,
+            car,
+            driver,
+            style,
+            n_laps,
+            friction=friction,
+            highest_speed=_eased(wanted, course, self.change_rate),
+        )
         end = (1 + len(self.speeds)) * course.length
         drawn = {"severity": severity, "style": asdict(style), "driver": asdict(driver)}
         return LapDriver(plan, car, driver, drawn, course.length, end, stop_time=self.stop_time)
@@ -161,7 +199,9 @@ class FastLap(Manoeuvre):
 
     name: ClassVar[str] = "fast_lap"
     course: str = "vairano_like"  # name of the course
-    mean_speed: float = 76.0 / 3.6  # length of the course over the time of the lap [m/s]; 76 km/h in the paper
+    mean_speed: float = (
+        76.0 / 3.6
+    )  # length of the course over the time of the lap [m/s]; 76 km/h in the paper
     top_speed: float = 115.0 / 3.6  # that the driver does not exceed [m/s]; 115 km/h in the paper
     line_offset: float = 0.3  # by which the line varies about the road's middle [m]
     flat: bool = False  # leaves out the course's bank and grade
@@ -186,7 +226,9 @@ class FastLap(Manoeuvre):
 
         def plan(severity: float) -> Plan:
             style = draw_style(seed, (severity, severity), 0.0, self.line_offset)
-            return plan_laps(course, car, driver, style, 3, friction=friction, highest_speed=self.top_speed)
+            return plan_laps(
+                course, car, driver, style, 3, friction=friction, highest_speed=self.top_speed
+            )
 
         def mean(severity: float) -> float:
             return course.length / _lap_time(plan(severity), course.length)
@@ -200,7 +242,14 @@ class FastLap(Manoeuvre):
         for _ in range(12):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if mean(middle) < self.mean_speed else (low, middle)
-        return LapDriver(plan(high), car, driver, {"severity": high, "driver": asdict(driver)}, course.length, 2.0 * course.length)
+        return LapDriver(
+            plan(high),
+            car,
+            driver,
+            {"severity": high, "driver": asdict(driver)},
+            course.length,
+            2.0 * course.length,
+        )
 
 
 FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
@@ -217,9 +266,15 @@ class LapDriver(LineDriver):
         self, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any], lap: float, end: float, *,
         stop_time: float | None = None, end_time: float = math.inf, hands: Hands | None = None,
     ) -> None:  # fmt: skip
-        times = np.concatenate([[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))])
-        begin = float(np.interp(np.interp(lap, plan.distance, times) - SETTLING_TIME, times, plan.distance))
-        super().__init__(plan, car, driver, drawn, end=end, end_time=end_time - 1e-9, progress=begin, hands=hands)
+        times = np.concatenate(
+            [[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))]
+        )
+        begin = float(
+            np.interp(np.interp(lap, plan.distance, times) - SETTLING_TIME, times, plan.distance)
+        )
+        super().__init__(
+            plan, car, driver, drawn, end=end, end_time=end_time - 1e-9, progress=begin, hands=hands
+        )
         self._stop_time = stop_time
         self._stop: tuple[float, float] | None = None  # when it began, and at which speed
 
@@ -232,7 +287,10 @@ class LapDriver(LineDriver):
             self._stop = (time, seen.speed)
         begin, speed = self._stop
         rate = speed / self._stop_time
-        return decision._replace(finished=False, acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0))
+        return decision._replace(
+            finished=False,
+            acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0),
+        )
 
 
 def _course(name: str, flat: bool) -> Course:
@@ -253,5 +311,7 @@ def _eased(speed: FloatArray, course: Course, rate: float) -> FloatArray:
     for at in np.flatnonzero(np.diff(speed)).tolist():
         before, after = speed[at], speed[at + 1]
         cells = max(round(abs(after**2 - before**2) / (2.0 * rate) / spacing), 1)
-        eased[at + 1 : at + 1 + cells] = np.sqrt(np.linspace(before**2, after**2, cells + 1)[1:])[: len(eased) - at - 1]
+        eased[at + 1 : at + 1 + cells] = np.sqrt(np.linspace(before**2, after**2, cells + 1)[1:])[
+            : len(eased) - at - 1
+        ]
     return eased

@@ -49,7 +49,9 @@ class Manoeuvre(ABC):
     """Base of all manoeuvres; raises `ConfigurationError`: a parameter is outside its limits."""
 
     name: ClassVar[str]
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # parameter -> lowest and highest value, beside `COMMON_LIMITS`
+    limits: ClassVar[
+        Mapping[str, tuple[float, float]]
+    ] = {}  # parameter -> lowest and highest value, beside `COMMON_LIMITS`
 
     def __post_init__(self) -> None:
         require(self, **COMMON_LIMITS, **self.limits)
@@ -86,7 +88,11 @@ class LineDriver(Follower):
         **following: Any,
     ) -> None:
         super().__init__(plan, car, driver, **following)
-        self.drawn, self._end, self._end_time = drawn, plan.length - 1.0 if end is None else end, end_time
+        self.drawn, self._end, self._end_time = (
+            drawn,
+            plan.length - 1.0 if end is None else end,
+            end_time,
+        )
 
     def command(self, time: float, seen: Observation) -> Command:
         """As planned, until the end."""
@@ -115,7 +121,9 @@ def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
         value = getattr(manoeuvre, key, None)
         low, high = as_range(lowest if value is None else value)
         if not (lowest <= low <= high <= highest):
-            raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, not {value}")
+            raise ConfigurationError(
+                f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, not {value}"
+            )
 
 
 def as_range(value: Range) -> tuple[float, float]:
@@ -128,7 +136,9 @@ class Draws:
     """What the seed of a drive draws for its manoeuvre; their order is fixed."""
 
     def __init__(self, seed: int) -> None:
-        self.generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+        self.generator = np.random.default_rng(
+            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0))
+        )
 
     def __call__(self, value: Range) -> float:
         """A value of the range, uniformly; also a plain number takes one draw, so that later ones stay as they are."""
@@ -144,8 +154,17 @@ def draw_driver(seed: int) -> Driver:
     """Habits of the driver; their spread is assumed."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
     usual = Driver()
-    spread = {"preview_time": 0.1, "response": 0.1, "steering_lag": 0.15, "yaw_damping": 0.15, "countersteer": 0.2}
-    habits = {name: getattr(usual, name) * float(generator.uniform(1.0 - by, 1.0 + by)) for name, by in spread.items()}
+    spread = {
+        "preview_time": 0.1,
+        "response": 0.1,
+        "steering_lag": 0.15,
+        "yaw_damping": 0.15,
+        "countersteer": 0.2,
+    }
+    habits = {
+        name: getattr(usual, name) * float(generator.uniform(1.0 - by, 1.0 + by))
+        for name, by in spread.items()
+    }
     return replace(usual, **habits)
 
 

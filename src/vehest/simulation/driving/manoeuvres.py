@@ -22,17 +22,34 @@ from vehest.simulation.driving.open_loop import RandomSteer, Spiral, StepSteer
 
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
     made.name: made
-    for made in (Laps, SpeedLaps, FastLap, DoubleLaneChange, Slalom, SteadyCircle, BrakingInTurn, StepSteer, Spiral, RandomSteer)
+    for made in (
+        Laps,
+        SpeedLaps,
+        FastLap,
+        DoubleLaneChange,
+        Slalom,
+        SteadyCircle,
+        BrakingInTurn,
+        StepSteer,
+        Spiral,
+        RandomSteer,
+    )
 }
 """Manoeuvres by name."""
 
 
-def manoeuvre_from_config(configuration: Mapping[str, Any], among: Mapping[str, type[Any]] = MANOEUVRES) -> Any:
+def manoeuvre_from_config(
+    configuration: Mapping[str, Any], among: Mapping[str, type[Any]] = MANOEUVRES
+) -> Any:
     """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has; else `ConfigurationError`."""
     values = dict(configuration)
     name = values.pop("name", None)
     if not isinstance(name, str) or name not in among:
-        raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(among))}")
+        raise ConfigurationError(
+            f"there is no manoeuvre '{name}'; there are {', '.join(sorted(among))}"
+        )
     validated(among[name], values, f"manoeuvre '{name}'", error=ConfigurationError)
     # Made of the values as they are written, whole numbers too, which provenance keeps.
-    return among[name](**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    return among[name](
+        **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    )

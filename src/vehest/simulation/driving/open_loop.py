@@ -33,12 +33,23 @@ class StepSteer(Manoeuvre):
 
     name: ClassVar[str] = "j_turn"
     speed: Range = (15.0, 28.0)  # [m/s]; the driver holds it as far as grip and power allow
-    severity: Range = (0.4, 1.0)  # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square
-    steer_time: Range = (0.15, 0.6)  # in which the angle is reached, unless the steering is slower [s]
+    severity: Range = (
+        0.4,
+        1.0,
+    )  # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square
+    steer_time: Range = (
+        0.15,
+        0.6,
+    )  # in which the angle is reached, unless the steering is slower [s]
     turn_time: Range = (5.0, 8.0)  # after the step [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
 
-    limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "steer_time": (0.02, 10.0), "turn_time": (0.5, 600.0)}
+    limits: ClassVar = {
+        "speed": (3.0, 70.0),
+        "severity": (0.05, 2.0),
+        "steer_time": (0.02, 10.0),
+        "turn_time": (0.5, 600.0),
+    }
 
     @property
     def longest(self) -> float:
@@ -49,7 +60,9 @@ class StepSteer(Manoeuvre):
         """A driver with the speed, the angle and the side of this seed."""
         draw = Draws(seed)
         speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
-        severity, steer_time, turn_time = (draw(values) for values in (self.severity, self.steer_time, self.turn_time))
+        severity, steer_time, turn_time = (
+            draw(values) for values in (self.severity, self.steer_time, self.turn_time)
+        )
         side, begin = draw.side(self.side), draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
@@ -57,7 +70,14 @@ class StepSteer(Manoeuvre):
         def steer_at(time: float) -> float:
             return angle * min(max((time - begin) / steer_time, 0.0), 1.0)
 
-        drawn = {"speed": speed, "severity": severity, "steer": angle, "begin": begin, "steer_time": steer_time, "side": SIDES[side]}
+        drawn = {
+            "speed": speed,
+            "severity": severity,
+            "steer": angle,
+            "begin": begin,
+            "steer_time": steer_time,
+            "side": SIDES[side],
+        }
         return OpenLoop(car, area, speed, steer_at, begin + steer_time + turn_time, drawn)
 
 
@@ -67,13 +87,21 @@ class Spiral(Manoeuvre):
 
     name: ClassVar[str] = "spiral"
     speed: Range = (14.0, 25.0)  # [m/s]; the driver holds it as far as grip and power allow
-    severity: Range = (0.7, 1.0)  # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square
+    severity: Range = (
+        0.7,
+        1.0,
+    )  # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square
     ramp_time: Range = (6.0, 12.0)  # in which the angle is reached [s]
     hold_time: Range = (1.0, 2.0)  # at the angle [s]
     turns: Literal[1, 2] = 2  # 1, or 2 for a second turn to the other side
     side: Side = "either"  # of the first turn: ``left``, ``right`` or ``either``
 
-    limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "ramp_time": (0.5, 300.0), "hold_time": (0.0, 300.0)}
+    limits: ClassVar = {
+        "speed": (3.0, 70.0),
+        "severity": (0.05, 2.0),
+        "ramp_time": (0.5, 300.0),
+        "hold_time": (0.0, 300.0),
+    }
 
     @property
     def longest(self) -> float:
@@ -84,20 +112,35 @@ class Spiral(Manoeuvre):
         """A driver with the speed, the angle and the side of this seed."""
         draw = Draws(seed)
         speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
-        severity, ramp, hold = (draw(values) for values in (self.severity, self.ramp_time, self.hold_time))
+        severity, ramp, hold = (
+            draw(values) for values in (self.severity, self.ramp_time, self.hold_time)
+        )
         side, begin = draw.side(self.side), draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
         back = min(0.4 * ramp, 3.0)
-        times, angles = [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back], [0.0, angle, angle, 0.0]
+        times, angles = (
+            [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back],
+            [0.0, angle, angle, 0.0],
+        )
         if self.turns == 2:
             again = times[-1]
-            times, angles = [*times, again + ramp, again + ramp + hold, again + ramp + hold + back], [*angles, -angle, -angle, 0.0]
+            times, angles = (
+                [*times, again + ramp, again + ramp + hold, again + ramp + hold + back],
+                [*angles, -angle, -angle, 0.0],
+            )
 
         def steer_at(time: float) -> float:
             return float(np.interp(time, times, angles))
 
-        drawn = {"speed": speed, "severity": severity, "steer": angle, "begin": begin, "ramp_time": ramp, "side": SIDES[side]}
+        drawn = {
+            "speed": speed,
+            "severity": severity,
+            "steer": angle,
+            "begin": begin,
+            "ramp_time": ramp,
+            "side": SIDES[side],
+        }
         return OpenLoop(car, area, speed, steer_at, times[-1] + 1.0, drawn)
 
 
@@ -107,7 +150,10 @@ class RandomSteer(Manoeuvre):
 
     name: ClassVar[str] = "random_steer"
     speed: Range = (14.0, 30.0)  # [m/s]; the driver holds it as far as grip and power allow
-    severity: Range = (0.5, 1.0)  # share of the grip that three standard deviations of the steering angle would take in a steady turn
+    severity: Range = (
+        0.5,
+        1.0,
+    )  # share of the grip that three standard deviations of the steering angle would take in a steady turn
     band: tuple[float, float] = (0.1, 1.2)  # lowest and highest frequency [Hz]
     duration: float = 30.0  # of the recording [s]
 
@@ -116,7 +162,9 @@ class RandomSteer(Manoeuvre):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.01 <= self.band[0] < self.band[1] <= 5.0:
-            raise ConfigurationError(f"manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not {self.band}")
+            raise ConfigurationError(
+                f"manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not {self.band}"
+            )
 
     @property
     def longest(self) -> float:
@@ -137,7 +185,13 @@ class RandomSteer(Manoeuvre):
 
         def steer_at(time: float) -> float:
             fade = min(max((time + 0.5) / 1.0, 0.0), 1.0)
-            return fade * amplitude * sum(math.sin(rate * time + phase) for rate, phase in zip(rates, phases, strict=True))
+            return (
+                fade
+                * amplitude
+                * sum(
+                    math.sin(rate * time + phase) for rate, phase in zip(rates, phases, strict=True)
+                )
+            )
 
         drawn = {"speed": speed, "severity": severity, "steer_deviation": deviation}
         return OpenLoop(car, area, speed, steer_at, self.duration, drawn)
@@ -150,10 +204,22 @@ class OpenLoop:
     """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the speed [m/s], until ``end_time`` [s]."""
 
     def __init__(
-        self, car: Car, area: OpenArea, speed: float, steer_at: Callable[[float], float], end_time: float, drawn: dict[str, Any]
+        self,
+        car: Car,
+        area: OpenArea,
+        speed: float,
+        steer_at: Callable[[float], float],
+        end_time: float,
+        drawn: dict[str, Any],
     ) -> None:
         self.drawn, self.start = drawn, (0.0, 0.0, 0.0, speed)
-        self._car, self._area, self._speed, self._steer_at, self._end_time = car, area, speed, steer_at, end_time
+        self._car, self._area, self._speed, self._steer_at, self._end_time = (
+            car,
+            area,
+            speed,
+            steer_at,
+            end_time,
+        )
         self._progress, self._before = 0.0, -SETTLING_TIME
 
     def command(self, time: float, seen: Observation) -> Command:
@@ -165,7 +231,9 @@ class OpenLoop:
         rate = (self._steer_at(time + 1.0 / DRIVER_RATE_HZ) - seen.steer) * DRIVER_RATE_HZ
         grip = car.grip * friction
         spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
-        wanted = 1.5 * (self._speed - speed) + car.resistance(speed, seen.yaw_rate, seen.steer, seen.sideslip)
+        wanted = 1.5 * (self._speed - speed) + car.resistance(
+            speed, seen.yaw_rate, seen.steer, seen.sideslip
+        )
         highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0))
         return Command(
             steering_velocity=max(-car.steering_rate, min(car.steering_rate, rate)),
@@ -179,4 +247,7 @@ class OpenLoop:
 def _steer_at(car: Car, severity: float, speed: float, friction: float) -> float:
     """Road-wheel angle [rad] of a steady turn that takes a share of the grip."""
     lateral = min(severity, 1.0) * car.grip * friction
-    return min(car.steer_for(lateral / speed**2, lateral, friction) * max(severity, 1.0) ** 2, car.largest_steer)
+    return min(
+        car.steer_for(lateral / speed**2, lateral, friction) * max(severity, 1.0) ** 2,
+        car.largest_steer,
+    )

@@ -19,8 +19,18 @@ import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from vehest.simulation.plant import equations, regimes
-from vehest.simulation.plant.equations import SMALLEST_WHEEL_VELOCITY, acceleration_limit, lateral_force, multi_body
-from vehest.simulation.plant.parameters import LongitudinalValues, MultiBodyValues, SteeringValues, TyreValues
+from vehest.simulation.plant.equations import (
+    SMALLEST_WHEEL_VELOCITY,
+    acceleration_limit,
+    lateral_force,
+    multi_body,
+)
+from vehest.simulation.plant.parameters import (
+    LongitudinalValues,
+    MultiBodyValues,
+    SteeringValues,
+    TyreValues,
+)
 from vehest.simulation.plant.regimes import (
     FIRST_WHEEL,
     PITCH_RATE,
@@ -58,7 +68,9 @@ N_STATES = 29
 N_INPUTS = 5
 N_FORCES = 12
 
-ROLLED_OVER = 0.6  # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
+ROLLED_OVER = (
+    0.6  # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
+)
 STABLE_RATE = 2.785  # the Runge-Kutta method is stable for eigenvalues down to -STABLE_RATE/step
 AT_REST = 1e-9  # lateral velocity [m/s] and yaw rate [rad/s] of a standing car that count as none
 OVERSPEED = 1.1  # speed of the driven wheels over the car's top speed at which the engine gives no more torque; assumed
@@ -67,7 +79,9 @@ LARGEST_LOAD_FACTOR = 1.5
 
 # As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for Python, which unpack tuples of a hundred
 # numbers, and references of arrays, counted in every function, would take almost half of the time to compile.
-_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+_kernel = numba.njit(
+    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
+)
 
 
 # Places of the groups in a parameter vector.
@@ -75,11 +89,17 @@ _STEERING = len(MultiBodyValues._fields) - 4
 _LONGITUDINAL = _STEERING + len(SteeringValues._fields)
 _FRONT = _LONGITUDINAL + len(LongitudinalValues._fields)
 _REAR = _FRONT + len(TyreValues._fields)
-_FRICTIONS = tuple(tyre + TyreValues._fields.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1"))
-_LENGTHS = tuple(len(values_class._fields) for values_class in (SteeringValues, LongitudinalValues, TyreValues))
+_FRICTIONS = tuple(
+    tyre + TyreValues._fields.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1")
+)
+_LENGTHS = tuple(
+    len(values_class._fields) for values_class in (SteeringValues, LongitudinalValues, TyreValues)
+)
 
 
-@numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # it makes an array
+@numba.njit(
+    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+)  # it makes an array
 def _unpack(vector, friction):  # type: ignore[no-untyped-def]
     """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost as much as ten evaluations."""
     values = vector.copy()
@@ -87,7 +107,10 @@ def _unpack(vector, friction):  # type: ignore[no-untyped-def]
         values[place] *= friction
     steering = SteeringValues(*to_fixed_tuple(values[_STEERING:], _LENGTHS[0]))
     longitudinal = LongitudinalValues(*to_fixed_tuple(values[_LONGITUDINAL:], _LENGTHS[1]))
-    front, rear = TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2])), TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2]))
+    front, rear = (
+        TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2])),
+        TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2])),
+    )
     return MultiBodyValues(*to_fixed_tuple(values, _STEERING), steering, longitudinal, front, rear)  # type: ignore[call-arg]
 
 
@@ -117,7 +140,9 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
     derivatives[0], derivatives[1] = x[VX] * cosine - x[VY] * sine, x[VX] * sine + x[VY] * cosine
     if regime == SLOW:
         acceleration = acceleration_limit(x[VX], inputs[1], p.longitudinal)
-        derivatives[VX], derivatives[VY], derivatives[YAW_RATE] = slow_motion(x, derivatives[STEER], acceleration, inputs, p)
+        derivatives[VX], derivatives[VY], derivatives[YAW_RATE] = slow_motion(
+            x, derivatives[STEER], acceleration, inputs, p
+        )
         velocities = wheel_velocities(x, p)
         for i in range(4):
             # With the slip that the force will need, so that ROLLING takes over where SLOW left.
@@ -140,7 +165,10 @@ def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
     velocity = 0.5 * p.R_w * (p.T_se * front + (1.0 - p.T_se) * rear)
     if velocity > OVERSPEED * p.longitudinal.v_max:
         return min(acceleration, 0.0)
-    return min(acceleration, p.longitudinal.a_max * p.longitudinal.v_switch / max(velocity, p.longitudinal.v_switch))
+    return min(
+        acceleration,
+        p.longitudinal.a_max * p.longitudinal.v_switch / max(velocity, p.longitudinal.v_switch),
+    )
 
 
 @_kernel
@@ -181,7 +209,9 @@ def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-de
     for i in range(4):
         if regime == ROLLING:
             length = vector[len(vector) - (2 if i < 2 else 1)]
-            held[i] += (held[4 + i] - held[i]) * (1.0 - math.exp(-abs(x[VX]) * part / length) if length > 0.0 else 1.0)
+            held[i] += (held[4 + i] - held[i]) * (
+                1.0 - math.exp(-abs(x[VX]) * part / length) if length > 0.0 else 1.0
+            )
         else:
             held[i] = forces[4 + i] / forces[8 + i]
 
@@ -243,7 +273,14 @@ def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignor
         p = _unpack(vector, frictions[k])
         for i in range(4):
             held[i] = helds[k, i]
-        contact = (regimes[k], inputs[k], _sliding_friction(p.tire), _sliding_friction(p.tire_rear), lags, held)
+        contact = (
+            regimes[k],
+            inputs[k],
+            _sliding_friction(p.tire),
+            _sliding_friction(p.tire_rear),
+            lags,
+            held,
+        )
         wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
         sine, cosine = math.sin(states[k, STEER]), math.cos(states[k, STEER])
         for i in range(N_FORCES):
@@ -294,12 +331,18 @@ def _held(lock: Path | None) -> Iterator[None]:
     with ExitStack() as stack:
         if lock is not None and fcntl is not None:
             with suppress(OSError):
-                fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)  # goes with the file, also when the process is killed
+                fcntl.flock(
+                    stack.enter_context(lock.open("w")), fcntl.LOCK_EX
+                )  # goes with the file, also when the process is killed
         yield
 
 
 def _digest() -> str:
-    sources = (inspect.getsource(equations), inspect.getsource(regimes), repr(MultiBodyValues._fields))
+    sources = (
+        inspect.getsource(equations),
+        inspect.getsource(regimes),
+        repr(MultiBodyValues._fields),
+    )
     return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
 
 

@@ -53,12 +53,19 @@ JOINT_FRONT, JOINT_REAR = 27, 28
 
 # Places of an axle's lateral velocity and of the lateral play of its joint among the states, and its parameters. Roll, roll rate, lateral
 # velocity, heave and heave rate of an axle follow one another.
-_Axle = namedtuple("_Axle", "vy joint lever track mass inertia static spring damper torsion joint_height camber camber_squared")
+_Axle = namedtuple(
+    "_Axle",
+    "vy joint lever track mass inertia static spring damper torsion joint_height camber camber_squared",
+)
 # Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the wheels.
 _Suspension = namedtuple("_Suspension", "left right joint joint_rate camber_left camber_right")
-_Wheels = namedtuple("_Wheels", "along_left along_right across_left across_right load_left load_right")
+_Wheels = namedtuple(
+    "_Wheels", "along_left along_right across_left across_right load_left load_right"
+)
 
-_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+_kernel = numba.njit(
+    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
+)
 
 
 @_kernel
@@ -72,7 +79,9 @@ def steering_limit(steer, velocity, limits):  # type: ignore[no-untyped-def]
 @_kernel
 def acceleration_limit(velocity, acceleration, limits):  # type: ignore[no-untyped-def]
     """Longitudinal acceleration [m/s²] within brakes, engine power and top speed."""
-    if (velocity <= limits.v_min and acceleration <= 0.0) or (velocity >= limits.v_max and acceleration >= 0.0):
+    if (velocity <= limits.v_min and acceleration <= 0.0) or (
+        velocity >= limits.v_max and acceleration >= 0.0
+    ):
         return 0.0
     most = limits.a_max * limits.v_switch / velocity if velocity > limits.v_switch else limits.a_max
     return min(max(acceleration, -limits.a_max), most)
@@ -90,7 +99,9 @@ def longitudinal_force(slip, camber, load, tyre):  # type: ignore[no-untyped-def
     """Longitudinal force of pure slip [N]. The published model has the vertical shift inside of the sine."""
     peak = tyre.p_dx1 * (1.0 - tyre.p_dx3 * camber**2) * load
     stiffness = load * tyre.p_kx1 / (tyre.p_cx1 * peak)
-    return peak * math.sin(tyre.p_cx1 * _bent(stiffness, tyre.p_ex1, -slip + tyre.p_hx1) + load * tyre.p_vx1)
+    return peak * math.sin(
+        tyre.p_cx1 * _bent(stiffness, tyre.p_ex1, -slip + tyre.p_hx1) + load * tyre.p_vx1
+    )
 
 
 @_kernel
@@ -121,7 +132,12 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
     stiffness_across = tyre.r_by1 * math.cos(math.atan(tyre.r_by2 * (angle - tyre.r_by3)))
     across = _weighted(across, tyre.r_cy1, stiffness_across, tyre.r_ey1, tyre.r_hy1, slip)
     if tyre.r_vy1 != 0.0 or tyre.r_vy3 != 0.0:
-        induced = friction * load * (tyre.r_vy1 + tyre.r_vy3 * camber) * math.cos(math.atan(tyre.r_vy4 * angle))
+        induced = (
+            friction
+            * load
+            * (tyre.r_vy1 + tyre.r_vy3 * camber)
+            * math.cos(math.atan(tyre.r_vy4 * angle))
+        )
         across += induced * math.sin(tyre.r_vy5 * math.atan(tyre.r_vy6 * slip))
     return _weighted(along, tyre.r_cx1, stiffness_along, tyre.r_ex1, tyre.r_hx1, angle), across
 
@@ -131,10 +147,34 @@ def _axles(p):  # type: ignore[no-untyped-def]
     both = 2.0 * (p.a + p.b)
     return (
         _Axle(
-            VY_FRONT, JOINT_FRONT, p.a, p.T_f, p.m_uf, p.I_uf, p.m_s * GRAVITY * p.b / both, p.K_sf, p.K_sdf, p.K_tsf, p.h_raf, p.D_f, p.E_f
+            VY_FRONT,
+            JOINT_FRONT,
+            p.a,
+            p.T_f,
+            p.m_uf,
+            p.I_uf,
+            p.m_s * GRAVITY * p.b / both,
+            p.K_sf,
+            p.K_sdf,
+            p.K_tsf,
+            p.h_raf,
+            p.D_f,
+            p.E_f,
         ),
         _Axle(
-            VY_REAR, JOINT_REAR, -p.b, p.T_r, p.m_ur, p.I_ur, p.m_s * GRAVITY * p.a / both, p.K_sr, p.K_sdr, p.K_tsr, p.h_rar, p.D_r, p.E_r
+            VY_REAR,
+            JOINT_REAR,
+            -p.b,
+            p.T_r,
+            p.m_ur,
+            p.I_ur,
+            p.m_s * GRAVITY * p.a / both,
+            p.K_sr,
+            p.K_sdr,
+            p.K_tsr,
+            p.h_rar,
+            p.D_r,
+            p.E_r,
         ),
     )
 
@@ -142,12 +182,20 @@ def _axles(p):  # type: ignore[no-untyped-def]
 @_kernel
 def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: ignore[no-untyped-def]
     """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump stops are left out."""
-    roll, roll_rate, heave, heave_rate = x[axle.vy - 2], x[axle.vy - 1], x[axle.vy + 1], x[axle.vy + 2]
+    roll, roll_rate, heave, heave_rate = (
+        x[axle.vy - 2],
+        x[axle.vy - 1],
+        x[axle.vy + 1],
+        x[axle.vy + 2],
+    )
     sine, cosine = math.sin(x[ROLL]), math.cos(x[ROLL])
     relative_roll, relative_roll_rate = x[ROLL] - roll, x[ROLL_RATE] - roll_rate
     above, above_rate = height - radius + heave - x[HEAVE], heave_rate - x[HEAVE_RATE]
 
-    middle, middle_rate = above / cosine - height + radius + axle.lever * x[PITCH], above_rate + axle.lever * x[PITCH_RATE]
+    middle, middle_rate = (
+        above / cosine - height + radius + axle.lever * x[PITCH],
+        above_rate + axle.lever * x[PITCH_RATE],
+    )
     lean, lean_rate = 0.5 * relative_roll * axle.track, 0.5 * relative_roll_rate * axle.track
     left, right = middle + lean, middle - lean
     left_rate, right_rate = middle_rate + lean_rate, middle_rate - lean_rate
@@ -183,12 +231,23 @@ def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical,
     roll, roll_rate, heave = x[axle.vy - 2], x[axle.vy - 1], x[axle.vy + 1]
     half = 0.5 * axle.track
     middle, lean = heave + radius * (math.cos(roll) - 1.0), half * math.sin(roll)
-    load_left, load_right = max((middle - lean) * vertical, SMALLEST_LOAD), max((middle + lean) * vertical, SMALLEST_LOAD)
+    load_left, load_right = (
+        max((middle - lean) * vertical, SMALLEST_LOAD),
+        max((middle + lean) * vertical, SMALLEST_LOAD),
+    )
     sideways = x[VY] + axle.lever * x[YAW_RATE] - roll_rate * (radius - heave)
-    angle_left = math.atan(sideways / max(x[VX] + half * x[YAW_RATE], SMALLEST_WHEEL_VELOCITY)) - steer
-    angle_right = math.atan(sideways / max(x[VX] - half * x[YAW_RATE], SMALLEST_WHEEL_VELOCITY)) - steer
-    along_left, across_left = _tyre_forces(left_slip, angle_left, suspension.camber_left, load_left, tyre)
-    along_right, across_right = _tyre_forces(right_slip, angle_right, suspension.camber_right, load_right, tyre)
+    angle_left = (
+        math.atan(sideways / max(x[VX] + half * x[YAW_RATE], SMALLEST_WHEEL_VELOCITY)) - steer
+    )
+    angle_right = (
+        math.atan(sideways / max(x[VX] - half * x[YAW_RATE], SMALLEST_WHEEL_VELOCITY)) - steer
+    )
+    along_left, across_left = _tyre_forces(
+        left_slip, angle_left, suspension.camber_left, load_left, tyre
+    )
+    along_right, across_right = _tyre_forces(
+        right_slip, angle_right, suspension.camber_right, load_right, tyre
+    )
     return _Wheels(along_left, along_right, across_left, across_right, load_left, load_right)
 
 
@@ -213,9 +272,13 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
     )
     derivatives[axle.vy - 2] = x[axle.vy - 1]
     derivatives[axle.vy - 1] = 1.0 / axle.inertia * moment
-    derivatives[axle.vy] = 1.0 / axle.mass * (across - suspension.joint * cosine - both * sine) - x[YAW_RATE] * x[VX]
+    derivatives[axle.vy] = (
+        1.0 / axle.mass * (across - suspension.joint * cosine - both * sine) - x[YAW_RATE] * x[VX]
+    )
     derivatives[axle.vy + 1] = x[axle.vy + 2]
-    derivatives[axle.vy + 2] = GRAVITY - 1.0 / axle.mass * (left[1] + right[1] + suspension.joint * sine - both * cosine)
+    derivatives[axle.vy + 2] = GRAVITY - 1.0 / axle.mass * (
+        left[1] + right[1] + suspension.joint * sine - both * cosine
+    )
     derivatives[axle.joint] = suspension.joint_rate
 
 
@@ -226,10 +289,16 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     A negative wheel speed becomes zero in x itself. Axes and places are those of regimes.py; steering velocity [rad/s] and acceleration
     [m/s²] are the wanted ones, ``contact`` is as forces_of_contact takes it, p are MultiBodyValues.
     """
-    u = steering_limit(x[STEER], steering_velocity, p.steering), acceleration_limit(x[VX], acceleration, p.longitudinal)
+    u = (
+        steering_limit(x[STEER], steering_velocity, p.steering),
+        acceleration_limit(x[VX], acceleration, p.longitudinal),
+    )
     front, rear = _axles(p)
     radius = p.R_w
-    at_front, at_rear = _suspension(x, front, p.h_s, radius, p.K_ras, p.K_rad), _suspension(x, rear, p.h_s, radius, p.K_ras, p.K_rad)
+    at_front, at_rear = (
+        _suspension(x, front, p.h_s, radius, p.K_ras, p.K_rad),
+        _suspension(x, rear, p.h_s, radius, p.K_ras, p.K_rad),
+    )
     v0, v1, v2, v3 = wheel_velocities(x, p)
     slip0, slip1 = _slip(v0, radius * x[FIRST_WHEEL]), _slip(v1, radius * x[FIRST_WHEEL + 1])
     slip2, slip3 = _slip(v2, radius * x[FIRST_WHEEL + 2]), _slip(v3, radius * x[FIRST_WHEEL + 3])
@@ -241,9 +310,24 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     x0, x1, x2, x3, y0, y1, y2, y3 = forces_of_contact(contact, x, u, p, along, across, loads)
 
     sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
-    front_along, front_across = (x0 + x1) * cosine - (y0 + y1) * sine, (y0 + y1) * cosine + (x0 + x1) * sine
-    _axle_rates(x, front, at_front, front_across, (y0, loads[0]), (y1, loads[1]), radius, p.K_lt, derivatives)
-    _axle_rates(x, rear, at_rear, y2 + y3, (y2, loads[2]), (y3, loads[3]), radius, p.K_lt, derivatives)
+    front_along, front_across = (
+        (x0 + x1) * cosine - (y0 + y1) * sine,
+        (y0 + y1) * cosine + (x0 + x1) * sine,
+    )
+    _axle_rates(
+        x,
+        front,
+        at_front,
+        front_across,
+        (y0, loads[0]),
+        (y1, loads[1]),
+        radius,
+        p.K_lt,
+        derivatives,
+    )
+    _axle_rates(
+        x, rear, at_rear, y2 + y3, (y2, loads[2]), (y3, loads[3]), radius, p.K_lt, derivatives
+    )
 
     half_front, half_rear = 0.5 * p.T_f, 0.5 * p.T_r
     yaw_moment = (
@@ -255,8 +339,12 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
         - (y2 + y3) * p.b
     )
     sine, cosine = math.sin(x[ROLL]), math.cos(x[ROLL])
-    front_arm = p.h_s - x[HEAVE] - radius + x[VY_FRONT + 1] - (p.h_raf - radius) * math.cos(x[VY_FRONT - 2])
-    rear_arm = p.h_s - x[HEAVE] - radius + x[VY_REAR + 1] - (p.h_rar - radius) * math.cos(x[VY_REAR - 2])
+    front_arm = (
+        p.h_s - x[HEAVE] - radius + x[VY_FRONT + 1] - (p.h_raf - radius) * math.cos(x[VY_FRONT - 2])
+    )
+    rear_arm = (
+        p.h_s - x[HEAVE] - radius + x[VY_REAR + 1] - (p.h_rar - radius) * math.cos(x[VY_REAR - 2])
+    )
     roll_moment = (
         half_front * at_front.left
         + half_rear * at_rear.left
@@ -266,18 +354,30 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
         - at_rear.joint / cosine * rear_arm
     )
     pitch_moment = (
-        p.a * (at_front.left + at_front.right) - p.b * (at_rear.left + at_rear.right) + (front_along + x2 + x3) * (p.h_s - x[HEAVE])
+        p.a * (at_front.left + at_front.right)
+        - p.b * (at_rear.left + at_rear.right)
+        + (front_along + x2 + x3) * (p.h_s - x[HEAVE])
     )
-    springs, joints = at_front.left + at_rear.left + at_front.right + at_rear.right, at_front.joint + at_rear.joint
+    springs, joints = (
+        at_front.left + at_rear.left + at_front.right + at_rear.right,
+        at_front.joint + at_rear.joint,
+    )
 
     course, speed = math.atan(x[VY] / x[VX]) + x[YAW], math.sqrt(x[VX] ** 2 + x[VY] ** 2)
     derivatives[0], derivatives[1] = math.cos(course) * speed, math.sin(course) * speed
     derivatives[STEER] = u[0]
-    derivatives[VX] = 1.0 / p.m * (x2 + x3 + (x0 + x1) * math.cos(x[STEER]) - (y0 + y1) * math.sin(x[STEER])) + x[YAW_RATE] * x[VY]
+    derivatives[VX] = (
+        1.0 / p.m * (x2 + x3 + (x0 + x1) * math.cos(x[STEER]) - (y0 + y1) * math.sin(x[STEER]))
+        + x[YAW_RATE] * x[VY]
+    )
     derivatives[YAW] = x[YAW_RATE]
-    derivatives[YAW_RATE] = 1.0 / (p.I_z - p.I_xz_s**2 / p.I_Phi_s) * (yaw_moment + p.I_xz_s / p.I_Phi_s * roll_moment)
+    derivatives[YAW_RATE] = (
+        1.0 / (p.I_z - p.I_xz_s**2 / p.I_Phi_s) * (yaw_moment + p.I_xz_s / p.I_Phi_s * roll_moment)
+    )
     derivatives[ROLL] = x[ROLL_RATE]
-    derivatives[ROLL_RATE] = 1.0 / (p.I_Phi_s - p.I_xz_s**2 / p.I_z) * (p.I_xz_s / p.I_z * yaw_moment + roll_moment)
+    derivatives[ROLL_RATE] = (
+        1.0 / (p.I_Phi_s - p.I_xz_s**2 / p.I_z) * (p.I_xz_s / p.I_z * yaw_moment + roll_moment)
+    )
     derivatives[PITCH] = x[PITCH_RATE]
     derivatives[PITCH_RATE] = 1.0 / p.I_y_s * pitch_moment
     derivatives[VY] = 1.0 / p.m_s * (joints * cosine + springs * sine) - x[YAW_RATE] * x[VX]

@@ -14,14 +14,19 @@ AY_RATE = 0.5  # by which the lateral acceleration of a neutral car would grow [
 LONGEST = 60.0  # s
 
 
-def ramp_steer(plant: MultiBodyPlant, speed: float, *, friction: float = 1.0, direction: float = 1.0) -> Motion:
+def ramp_steer(
+    plant: MultiBodyPlant, speed: float, *, friction: float = 1.0, direction: float = 1.0
+) -> Motion:
     """Constant speed [m/s], slowly growing steering angle, until the lateral acceleration falls by 3 % again; 50 Hz.
 
     Towards the limit, where the lateral acceleration hardly grows any more, the steering angle grows up to ten times faster. ``friction``
     scales that of the tyres; the direction is 1 to the left, -1 to the right.
     """
     steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
-    state, per_sample = plant.initial_state(0.0, 0.0, 0.0, speed), round(1.0 / (RATE_HZ * plant.step))
+    state, per_sample = (
+        plant.initial_state(0.0, 0.0, 0.0, speed),
+        round(1.0 / (RATE_HZ * plant.step)),
+    )
     states: list[PlantState] = []
     inputs: list[FloatArray] = []
     integral = largest = 0.0

@@ -8,7 +8,12 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
-WHEELS = ("fl", "fr", "rl", "rr")  # order of the columns of (T, 4) arrays: front left, front right, rear left, rear right
+WHEELS = (
+    "fl",
+    "fr",
+    "rl",
+    "rr",
+)  # order of the columns of (T, 4) arrays: front left, front right, rear left, rear right
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,12 @@ STEADY_SHARE = 0.93
 The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
 
 HEAVE_FRONT, HEAVE_REAR = 16, 21
-MIRRORED = (1, 0, 3, 2)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
+MIRRORED = (
+    1,
+    0,
+    3,
+    2,
+)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
 
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
@@ -76,7 +81,10 @@ class PlantState:
 
     x, y = _state(X, "Position on the ground [m]."), _state(Y, "Position on the ground [m].")
     yaw = _state(YAW, "Heading, not wrapped [rad].")
-    vx, vy = _state(VX, "Forward velocity [m/s]."), _state(VY, "Lateral velocity, positive to the left [m/s].")
+    vx, vy = (
+        _state(VX, "Forward velocity [m/s]."),
+        _state(VY, "Lateral velocity, positive to the left [m/s]."),
+    )
     yaw_rate = _state(YAW_RATE, "Positive to the left [rad/s].")
     steer = _state(STEER, "Road-wheel angle of the front axle, positive to the left [rad].")
 
@@ -118,14 +126,22 @@ class MultiBodyPlant:
     @property
     def grip(self) -> float:
         """About the largest steady lateral acceleration [m/s²], from the lateral friction of the weaker axle."""
-        return float(STEADY_SHARE * GRAVITY * min(self.parameters.tire.p_dy1, self.parameters.tire_rear.p_dy1))
+        return float(
+            STEADY_SHARE
+            * GRAVITY
+            * min(self.parameters.tire.p_dy1, self.parameters.tire_rear.p_dy1)
+        )
 
     @cached_property
     def _at_rest(self) -> FloatArray:
         """The state in which the springs carry the car, at the origin; (29,)."""
         p, values = self.parameters, np.zeros(compiled.N_STATES)
-        values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (2.0 * p.K_zt)
-        values[HEAVE_REAR] = (p.m_s * GRAVITY * p.a / (p.a + p.b) + p.m_ur * GRAVITY) / (2.0 * p.K_zt)
+        values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (
+            2.0 * p.K_zt
+        )
+        values[HEAVE_REAR] = (p.m_s * GRAVITY * p.a / (p.a + p.b) + p.m_ur * GRAVITY) / (
+            2.0 * p.K_zt
+        )
         values[PITCH] = (values[HEAVE_REAR] - values[HEAVE_FRONT]) / self.wheelbase
         values[HEAVE] = values[HEAVE_FRONT] + p.a * values[PITCH]
         return values
@@ -137,11 +153,20 @@ class MultiBodyPlant:
         values[FIRST_WHEEL : FIRST_WHEEL + 4] = vx / self.parameters.R_w
         return PlantState(values, Regime.SLOW if vx < SLOW_BELOW else Regime.ROLLING)
 
-    def advance(self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0) -> PlantState:
+    def advance(
+        self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0
+    ) -> PlantState:
         """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the car rolls over or diverges."""
         inputs = _writable(inputs)
         values, regime, slid, held = compiled.advance(
-            state.values, int(state.regime), inputs, self._vector, float(friction), self.step, int(n_steps), state.held
+            state.values,
+            int(state.regime),
+            inputs,
+            self._vector,
+            float(friction),
+            self.step,
+            int(n_steps),
+            state.held,
         )
         if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
             raise SimulationError(
@@ -150,7 +175,9 @@ class MultiBodyPlant:
             )
         return PlantState(values, Regime(regime), state.spun or slid, held)
 
-    def evaluate(self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
+    def evaluate(
+        self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
 
         ``inputs`` are (T, 5); ``friction`` scales friction, (T,) or one for all.
@@ -160,7 +187,9 @@ class MultiBodyPlant:
         inputs = _writable(inputs).reshape(-1, N_INPUTS)
         held = np.array([state.held for state in states]).reshape(-1, 4)
         frictions = _writable(np.broadcast_to(friction, len(states)))
-        derivatives, forces = compiled.evaluate(values, regimes, inputs, self._vector, frictions, held)
+        derivatives, forces = compiled.evaluate(
+            values, regimes, inputs, self._vector, frictions, held
+        )
         return derivatives, forces.reshape(-1, 3, 4)[:, :, MIRRORED]
 
     def motion(

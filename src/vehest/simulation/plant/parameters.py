@@ -30,7 +30,9 @@ _published = cache(setup_vehicle_parameters)  # reads the library's files, which
 LIBRARY = "commonroad-vehicle-models"
 LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
 
-PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
+PUBLISHED_SETS: Mapping[int, str] = MappingProxyType(
+    {1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"}
+)
 """Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
 
 
@@ -45,15 +47,42 @@ SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters)) 
 LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
 TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
 GROUPS: Mapping[str, type] = MappingProxyType(
-    {"steering": SteeringValues, "longitudinal": LongitudinalValues, "tire": TyreValues, REAR_TYRE: TyreValues}
+    {
+        "steering": SteeringValues,
+        "longitudinal": LongitudinalValues,
+        "tire": TyreValues,
+        REAR_TYRE: TyreValues,
+    }
 )
 """Fields of MultiBodyValues that are named tuples themselves."""
 
 MultiBodyValues = namedtuple(  # type: ignore[misc]
-    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")), *GROUPS]
+    "MultiBodyValues",
+    [
+        *(name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")),
+        *GROUPS,
+    ],
 )
 
-POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_y_w", "T_f", "T_r", "R_w", "K_zt", "K_sf", "K_sr", "w")
+POSITIVE = (
+    "m",
+    "m_s",
+    "m_uf",
+    "m_ur",
+    "a",
+    "b",
+    "I_z",
+    "I_Phi_s",
+    "I_y_s",
+    "I_y_w",
+    "T_f",
+    "T_r",
+    "R_w",
+    "K_zt",
+    "K_sf",
+    "K_sr",
+    "w",
+)
 """Parameters without which a car does not exist."""
 
 
@@ -68,18 +97,27 @@ class Vehicle:
     name: str  # in recordings
     parameter_set: int  # number of the published set it starts from
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    driver: Mapping[str, float] = field(default_factory=dict)  # values of this car for its driver (car.py); the plant does not read them
-    relaxation: tuple[float, float] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
+    driver: Mapping[str, float] = field(
+        default_factory=dict
+    )  # values of this car for its driver (car.py); the plant does not read them
+    relaxation: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
 
     def __post_init__(self) -> None:
         parameters = library_parameters(self)
         for name in POSITIVE:
             if not getattr(parameters, name) > 0.0:
-                raise ConfigurationError(f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}")
+                raise ConfigurationError(
+                    f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}"
+                )
         rear_tyre(self)
         for place, length in zip(("front", "rear"), self.relaxation, strict=True):
             if not 0.0 <= length < math.inf:
-                raise ConfigurationError(f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m")
+                raise ConfigurationError(
+                    f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m"
+                )
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
@@ -87,10 +125,15 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
 
     Raises `ConfigurationError` where a key is missing or unknown, or a value of the wrong type, and as `Vehicle` does.
     """
-    given, where = {key: value for key, value in configuration.items() if value is not None}, f"vehicle '{configuration.get('name')}'"
+    given, where = (
+        {key: value for key, value in configuration.items() if value is not None},
+        f"vehicle '{configuration.get('name')}'",
+    )
     lengths = given.pop("relaxation", {})
     if not isinstance(lengths, Mapping) or set(lengths) - {"front", "rear"}:
-        raise ConfigurationError(f"{where}: relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}")
+        raise ConfigurationError(
+            f"{where}: relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}"
+        )
     given["relaxation"] = [lengths.get("front", 0.0), lengths.get("rear", 0.0)]
     return validated(Vehicle, given, where, error=ConfigurationError)
 
@@ -135,7 +178,9 @@ def library_parameters(vehicle: Vehicle) -> VehicleParameters:
             f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
         )
     parameters = deepcopy(_published(vehicle.parameter_set))
-    known_to_library = {name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE}
+    known_to_library = {
+        name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE
+    }
     _override(parameters, known_to_library, vehicle.name, prefix="")
     return parameters
 
@@ -145,7 +190,9 @@ def rear_tyre(vehicle: Vehicle) -> TireParameters:
     tyre = library_parameters(vehicle).tire
     overrides = vehicle.overrides.get(REAR_TYRE, {})
     if not isinstance(overrides, Mapping):
-        raise ConfigurationError(f"vehicle '{vehicle.name}': override '{REAR_TYRE}' must be a mapping, not {overrides!r}")
+        raise ConfigurationError(
+            f"vehicle '{vehicle.name}': override '{REAR_TYRE}' must be a mapping, not {overrides!r}"
+        )
     _override(tyre, overrides, vehicle.name, prefix=f"{REAR_TYRE}.")
     return tyre
 
@@ -165,15 +212,21 @@ def parameter_vector(parameters: Any) -> FloatArray:
     return np.array(values)
 
 
-def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str) -> None:
+def _override(
+    parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str
+) -> None:
     for name, value in overrides.items():
         where = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
         if name not in _field_names(type(parameters)):
             known = ", ".join(_field_names(type(parameters)))
-            raise ConfigurationError(f"{where} names no parameter of the plant; known ones: {known}")
+            raise ConfigurationError(
+                f"{where} names no parameter of the plant; known ones: {known}"
+            )
         is_group = is_dataclass(getattr(parameters, name))
         if is_group != isinstance(value, Mapping):
-            raise ConfigurationError(f"{where} must be {'a mapping' if is_group else 'a number'}, not {value!r}")
+            raise ConfigurationError(
+                f"{where} must be {'a mapping' if is_group else 'a number'}, not {value!r}"
+            )
         if is_group:
             _override(getattr(parameters, name), value, vehicle_name, prefix=f"{prefix}{name}.")
             continue

@@ -29,7 +29,9 @@ from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
 
 SLOWEST = 0.3  # speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper, not a spring
-STICTION_SPEED = 1.0  # speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
+STICTION_SPEED = (
+    1.0  # speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
+)
 
 SHORTEST = 0.2  # share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step
 
@@ -46,27 +48,51 @@ PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
 @numba.njit(cache=True, error_model="numpy")
 def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
     """sin(C atan(B s))/s."""
-    return math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
+    return (
+        math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type: ignore[no-untyped-def]
     """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its load."""
     rate = np.empty(N_STATES)
-    vx, vy, yaw_rate, steer, current = state[VX], state[VY], state[YAW_RATE], state[STEER], state[CURRENT]
+    vx, vy, yaw_rate, steer, current = (
+        state[VX],
+        state[VY],
+        state[YAW_RATE],
+        state[STEER],
+        state[CURRENT],
+    )
     wheelbase = p.cg_to_front_axle + p.cg_to_rear_axle
     along = 0.5 * p.mass * state[LOAD_AX] * p.cg_height / wheelbase
     across = p.mass * state[LOAD_AY] * p.cg_height / p.track
-    mean_speed = 0.25 * (state[FIRST_WHEEL] + state[FIRST_WHEEL + 1] + state[FIRST_WHEEL + 2] + state[FIRST_WHEEL + 3])
+    mean_speed = 0.25 * (
+        state[FIRST_WHEEL]
+        + state[FIRST_WHEEL + 1]
+        + state[FIRST_WHEEL + 2]
+        + state[FIRST_WHEEL + 3]
+    )
     sum_x = sum_y = moment = traction = 0.0
     rolling = np.empty(4)
     for wheel in range(4):
         front, left = wheel < 2, wheel % 2 == 0
-        x, y = (p.cg_to_front_axle if front else -p.cg_to_rear_axle), (0.5 if left else -0.5) * p.track
+        x, y = (
+            (p.cg_to_front_axle if front else -p.cg_to_rear_axle),
+            (0.5 if left else -0.5) * p.track,
+        )
         angle = steer if front else 0.0
-        static = 0.5 * p.mass * GRAVITY * (p.cg_to_rear_axle if front else p.cg_to_front_axle) / wheelbase
+        static = (
+            0.5
+            * p.mass
+            * GRAVITY
+            * (p.cg_to_rear_axle if front else p.cg_to_front_axle)
+            / wheelbase
+        )
         share = p.roll_share_front if front else 1.0 - p.roll_share_front
-        load = max(static + (-along if front else along) + (-across if left else across) * share, 0.0)
+        load = max(
+            static + (-along if front else along) + (-across if left else across) * share, 0.0
+        )
         cosine, sine = math.cos(angle), math.sin(angle)
         point_x, point_y = vx - yaw_rate * y, vy + yaw_rate * x
         wheel_x, wheel_y = point_x * cosine + point_y * sine, point_y * cosine - point_x * sine
@@ -76,7 +102,9 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
         missing_y = -wheel_y / reference - state[FIRST_SLIP_Y + wheel]
         stiffness = p.stiffness_factor_front if front else p.stiffness_factor_rear
         stored = math.hypot(state[FIRST_SLIP_X + wheel], state[FIRST_SLIP_Y + wheel])
-        length = p.relaxation_length * max(_per_slip(stored, stiffness, p.shape_factor) / (p.shape_factor * stiffness), SHORTEST)
+        length = p.relaxation_length * max(
+            _per_slip(stored, stiffness, p.shape_factor) / (p.shape_factor * stiffness), SHORTEST
+        )
         rate[FIRST_SLIP_X + wheel] = missing_x * reference / length
         rate[FIRST_SLIP_Y + wheel] = missing_y * reference / length
         slip_x = state[FIRST_SLIP_X + wheel] + p.carcass_damping * missing_x
@@ -87,12 +115,17 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
         force_x, force_y = grip * per_slip * slip_x, grip * per_slip * slip_y
         rolling[wheel] = p.wheel_radius * force_x
         traction += rolling[wheel]
-        forces[wheel, 0], forces[wheel, 1] = force_x * cosine - force_y * sine, force_x * sine + force_y * cosine
+        forces[wheel, 0], forces[wheel, 1] = (
+            force_x * cosine - force_y * sine,
+            force_x * sine + force_y * cosine,
+        )
         forces[wheel, 2] = load
         sum_x += forces[wheel, 0]
         sum_y += forces[wheel, 1]
         moment += x * forces[wheel, 1] - y * forces[wheel, 0]
-    losses = p.coulomb_torque * math.tanh(mean_speed / STICTION_SPEED) + p.viscous_torque * mean_speed
+    losses = (
+        p.coulomb_torque * math.tanh(mean_speed / STICTION_SPEED) + p.viscous_torque * mean_speed
+    )
     motor = p.torque_constant * current - losses
     drive = motor - p.motor_inertia * (motor - traction) / (p.motor_inertia + 4.0 * p.wheel_inertia)
     for axle in range(2):
@@ -100,17 +133,27 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
         axle_speed = 0.5 * (state[first] + state[first + 1])
         for side in range(2):
             wheel = 2 * axle + side
-            lock = p.axle_lock * (axle_speed - state[first + side]) + p.centre_lock * (mean_speed - axle_speed)
+            lock = p.axle_lock * (axle_speed - state[first + side]) + p.centre_lock * (
+                mean_speed - axle_speed
+            )
             rate[first + side] = (0.25 * drive + lock - rolling[wheel]) / p.wheel_inertia
     drag = p.air_drag * math.hypot(vx, vy)
     ax, ay = (sum_x - drag * vx) / p.mass, (sum_y - drag * vy) / p.mass
-    rate[X], rate[Y] = vx * math.cos(state[YAW]) - vy * math.sin(state[YAW]), vx * math.sin(state[YAW]) + vy * math.cos(state[YAW])
+    rate[X], rate[Y] = (
+        vx * math.cos(state[YAW]) - vy * math.sin(state[YAW]),
+        vx * math.sin(state[YAW]) + vy * math.cos(state[YAW]),
+    )
     rate[YAW], rate[YAW_RATE] = yaw_rate, moment / p.yaw_inertia
     rate[VX], rate[VY] = ax + vy * yaw_rate, ay - vx * yaw_rate
-    rate[LOAD_AX], rate[LOAD_AY] = (ax - state[LOAD_AX]) / p.load_time, (ay - state[LOAD_AY]) / p.load_time
+    rate[LOAD_AX], rate[LOAD_AY] = (
+        (ax - state[LOAD_AX]) / p.load_time,
+        (ay - state[LOAD_AY]) / p.load_time,
+    )
     turning = (min(max(wanted_steer, -p.largest_steer), p.largest_steer) - steer) / p.steering_time
     rate[STEER] = min(max(turning, -p.steering_rate), p.steering_rate)
-    rate[CURRENT] = (min(max(wanted_current, -p.largest_current), p.largest_current) - current) / p.current_time
+    rate[CURRENT] = (
+        min(max(wanted_current, -p.largest_current), p.largest_current) - current
+    ) / p.current_time
     return rate
 
 
@@ -120,8 +163,12 @@ def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # t
     forces = np.empty((4, 3))
     for _ in range(n_steps):
         first = _derivative(state, wanted_steer, wanted_current, scale, p, forces)
-        second = _derivative(state + 0.5 * step * first, wanted_steer, wanted_current, scale, p, forces)
-        third = _derivative(state + 0.5 * step * second, wanted_steer, wanted_current, scale, p, forces)
+        second = _derivative(
+            state + 0.5 * step * first, wanted_steer, wanted_current, scale, p, forces
+        )
+        third = _derivative(
+            state + 0.5 * step * second, wanted_steer, wanted_current, scale, p, forces
+        )
         fourth = _derivative(state + step * third, wanted_steer, wanted_current, scale, p, forces)
         state = state + step / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
     return state
@@ -164,11 +211,18 @@ class PlanarPlant:
             )
         return after
 
-    def motion(self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float) -> Motion:
+    def motion(
+        self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float
+    ) -> Motion:
         """Motion from the states (22,) and the inputs at each sample."""
         values, car = np.array(states), self.car
-        found = [self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)]
-        rates, forces = np.array([rate for rate, _ in found]), np.array([force for _, force in found])
+        found = [
+            self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)
+        ]
+        rates, forces = (
+            np.array([rate for rate, _ in found]),
+            np.array([force for _, force in found]),
+        )
         level = np.zeros(len(values))
         wheel_speed = values[:, FIRST_WHEEL : FIRST_WHEEL + len(WHEELS)]
         return Motion(

@@ -42,9 +42,15 @@ class PlanarCar:
     centre_lock: ZeroOrPositive
     air_drag: ZeroOrPositive  # force per square of the speed [N s²/m²]
     friction: Positive  # peak friction of the tyres at a quarter of the weight [1]
-    load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]  # relative loss of friction per relative gain of load [1]
-    stiffness_factor_front: Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
-    stiffness_factor_rear: Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    load_sensitivity: Annotated[
+        float, Field(ge=0.0, le=0.5)
+    ]  # relative loss of friction per relative gain of load [1]
+    stiffness_factor_front: (
+        Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    )
+    stiffness_factor_rear: (
+        Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    )
     shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]  # its C [1]
     relaxation_length: Positive  # of the tyres [m]
     carcass_damping: Share  # share of the slip that acts at once, without relaxation [1]
@@ -69,7 +75,9 @@ class PlanarCar:
         return {name: float(getattr(self, name)) for name in PARAMETERS}
 
 
-PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")  # names of the plant's parameters, in order
+PARAMETERS = tuple(
+    entry.name for entry in fields(PlanarCar) if entry.name != "name"
+)  # names of the plant's parameters, in order
 
 
 @dataclass(frozen=True)
@@ -83,7 +91,9 @@ class PlanarVehicle:
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:
     """A car from the keys ``name``, ``plant`` and ``parameters``; raises `ConfigurationError` where one is missing, unknown or wrong."""
-    whole = validated(PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError)
+    whole = validated(
+        PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError
+    )
     return _checked(whole.name, whole.parameters)
 
 
@@ -91,9 +101,15 @@ def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
     """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no parameter or a value makes no sense."""
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
-        raise ConfigurationError(f"vary: '{unknown[0]}' is no parameter of vehicle '{car.name}' that can be scaled")
-    return _checked(car.name, {name: value * factors.get(name, 1.0) for name, value in car.parameters.items()})
+        raise ConfigurationError(
+            f"vary: '{unknown[0]}' is no parameter of vehicle '{car.name}' that can be scaled"
+        )
+    return _checked(
+        car.name, {name: value * factors.get(name, 1.0) for name, value in car.parameters.items()}
+    )
 
 
 def _checked(name: str, parameters: dict[str, Any]) -> PlanarCar:
-    return validated(PlanarCar, {"name": name, **parameters}, f"vehicle '{name}'", error=ConfigurationError)
+    return validated(
+        PlanarCar, {"name": name, **parameters}, f"vehicle '{name}'", error=ConfigurationError
+    )

@@ -49,7 +49,9 @@ X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = 
 VY_FRONT, VY_REAR = 15, 20
 FIRST_WHEEL = 23  # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names
 
-_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+_kernel = numba.njit(
+    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
+)
 
 
 @_kernel
@@ -82,7 +84,9 @@ def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[
         change = 0.0
     tangent = math.tan(x[STEER])
     yaw_rate = x[VX] * tangent / wheelbase
-    yaw_acceleration = (change * tangent + x[VX] * steering_velocity * (1.0 + tangent**2)) / wheelbase
+    yaw_acceleration = (
+        change * tangent + x[VX] * steering_velocity * (1.0 + tangent**2)
+    ) / wheelbase
     return (
         change,
         p.b * yaw_acceleration + (p.b * yaw_rate - x[VY]) / RELAXATION,
@@ -96,7 +100,12 @@ def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
     sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
     sideways = (x[VY] + p.a * x[YAW_RATE]) * sine
     front, rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
-    return (x[VX] + front) * cosine + sideways, (x[VX] - front) * cosine + sideways, x[VX] + rear, x[VX] - rear
+    return (
+        (x[VX] + front) * cosine + sideways,
+        (x[VX] - front) * cosine + sideways,
+        x[VX] + rear,
+        x[VX] - rear,
+    )
 
 
 @_kernel
@@ -115,13 +124,22 @@ def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[n
     if regime == ROLLING and lags:
         for i in range(4):
             held[4 + i] = across[i] / loads[i]
-        return *along, held[0] * loads[0], held[1] * loads[1], held[2] * loads[2], held[3] * loads[3]
+        return (
+            *along,
+            held[0] * loads[0],
+            held[1] * loads[1],
+            held[2] * loads[2],
+            held[3] * loads[3],
+        )
     if regime == ROLLING:
         return *along, *across
     sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
     if regime == SLOW:
         front_x, rear_x, front_y, rear_y = _forces_needed(x, u, inputs, p)
-        front_x, front_y = 0.5 * (front_x * cosine + front_y * sine), 0.5 * (front_y * cosine - front_x * sine)
+        front_x, front_y = (
+            0.5 * (front_x * cosine + front_y * sine),
+            0.5 * (front_y * cosine - front_x * sine),
+        )
         rear_x, rear_y = 0.5 * rear_x, 0.5 * rear_y
         return front_x, front_x, rear_x, rear_x, front_y, front_y, rear_y, rear_y
     half_front, half_rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
@@ -130,7 +148,16 @@ def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[n
     x1, y1 = _coulomb(friction_front * loads[1], x[VX] - half_front, front_vy)
     x2, y2 = _coulomb(friction_rear * loads[2], x[VX] + half_rear, rear_vy)
     x3, y3 = _coulomb(friction_rear * loads[3], x[VX] - half_rear, rear_vy)
-    return x0 * cosine + y0 * sine, x1 * cosine + y1 * sine, x2, x3, y0 * cosine - x0 * sine, y1 * cosine - x1 * sine, y2, y3
+    return (
+        x0 * cosine + y0 * sine,
+        x1 * cosine + y1 * sine,
+        x2,
+        x3,
+        y0 * cosine - x0 * sine,
+        y1 * cosine - x1 * sine,
+        y2,
+        y3,
+    )
 
 
 @_kernel
@@ -150,7 +177,12 @@ def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
     across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
     moment, wheelbase = p.I_z * yaw_acceleration, p.a + p.b
     front_share = p.T_sb if along < 0.0 else p.T_se
-    return (front_share * along, (1.0 - front_share) * along, (across * p.b + moment) / wheelbase, (across * p.a - moment) / wheelbase)
+    return (
+        front_share * along,
+        (1.0 - front_share) * along,
+        (across * p.b + moment) / wheelbase,
+        (across * p.a - moment) / wheelbase,
+    )
 
 
 @_kernel

@@ -20,7 +20,9 @@ class StabilityState:
 
     reference: float = 0.0  # yaw rate that it follows [rad/s]
     active: bool = False  # whether it intervenes
-    moment: float = 0.0  # yaw moment that it asks for, positive to the left [N m]; the plant's third input
+    moment: float = (
+        0.0  # yaw moment that it asks for, positive to the left [N m]; the plant's third input
+    )
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,14 @@ class StabilityControl:
     slowest: float = 5.0  # speed below which it does nothing [m/s]; assumed
 
     def step(
-        self, before: StabilityState, interval: float, *, steer: float, vx: float, yaw_rate: float, friction: float = 1.0
+        self,
+        before: StabilityState,
+        interval: float,
+        *,
+        steer: float,
+        vx: float,
+        yaw_rate: float,
+        friction: float = 1.0,
     ) -> StabilityState:
         """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as far as the control knows it."""
         if vx < self.slowest:

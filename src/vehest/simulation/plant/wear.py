@@ -26,4 +26,6 @@ class Stint:
     def friction_at(self, time: float) -> float:
         """The factor at a time after the first sample [s]; before it, that of the first."""
         since = max(time, 0.0)
-        return (1.0 - self.cold * math.exp(-since / self.warm_time)) * (1.0 - self.wear * min(since / self.wear_time, 1.0))
+        return (1.0 - self.cold * math.exp(-since / self.warm_time)) * (
+            1.0 - self.wear * min(since / self.wear_time, 1.0)
+        )

@@ -57,7 +57,9 @@ def build_course(name: str, layout: Layout) -> Course:
             raise ConfigurationError(f"course '{name}': {segment} is too short for its transitions")
     turning = sum(segment.angle for segment in layout.segments)
     if abs(abs(turning) - 2.0 * math.pi) > 1e-9:
-        raise ConfigurationError(f"course '{name}': its corners turn by {math.degrees(turning):.6g}°, not by ±360°")
+        raise ConfigurationError(
+            f"course '{name}': its corners turn by {math.degrees(turning):.6g}°, not by ±360°"
+        )
     return _trace(name, replace(layout, segments=tuple(_close(name, layout.segments))))
 
 
@@ -65,7 +67,9 @@ def build_course(name: str, layout: Layout) -> Course:
 def course_by_name(name: str) -> Course:
     """One of the courses of the proving ground; raises `ConfigurationError` where there is no such course."""
     if name not in LAYOUTS:
-        raise ConfigurationError(f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}")
+        raise ConfigurationError(
+            f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}"
+        )
     return build_course(name, LAYOUTS[name])
 
 
@@ -81,7 +85,9 @@ def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
         if isinstance(segment, Straight):
             segment = Straight(segment.length + next(changes))
             if segment.length < 0:
-                raise ConfigurationError(f"course '{name}': it closes only with a straight of {segment.length:.3g} m")
+                raise ConfigurationError(
+                    f"course '{name}': it closes only with a straight of {segment.length:.3g} m"
+                )
         closed.append(segment)
     return closed
 
@@ -116,7 +122,9 @@ def _trace(name: str, layout: Layout) -> Course:
 
 def _nodes(segments: Sequence[Segment]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Arc lengths (M,), with the curvatures (M,) and banks (M,) between which both are linear."""
-    pieces = np.array([(0.0, 0.0, 0.0), *(piece for segment in segments for piece in segment.pieces())])
+    pieces = np.array(
+        [(0.0, 0.0, 0.0), *(piece for segment in segments for piece in segment.pieces())]
+    )
     return np.cumsum(pieces[:, 0]), pieces[:, 1], pieces[:, 2]
 
 
@@ -125,7 +133,9 @@ def _grade(heights: Sequence[tuple[float, float]], arc_length: FloatArray) -> Fl
     if not heights:
         return np.zeros_like(arc_length)
     places = np.array([*(place for place, _ in heights), heights[0][0] + 1.0]) * arc_length[-1]
-    spline = CubicSpline(places, [*(height for _, height in heights), heights[0][1]], bc_type="periodic")
+    spline = CubicSpline(
+        places, [*(height for _, height in heights), heights[0][1]], bc_type="periodic"
+    )
     return np.asarray(-np.arctan(spline(arc_length, 1)))
 
 
@@ -146,13 +156,17 @@ class _HeadingProfile:
         self._headings = np.concatenate([[0.0], np.cumsum(areas)])
 
     def __call__(self, arc_length: FloatArray) -> FloatArray:
-        before = np.clip(np.searchsorted(self._nodes, arc_length, side="right") - 1, 0, len(self._nodes) - 2)
+        before = np.clip(
+            np.searchsorted(self._nodes, arc_length, side="right") - 1, 0, len(self._nodes) - 2
+        )
         curvature = np.interp(arc_length, self._nodes, self._curvatures)
         mean = 0.5 * (self._curvatures[before] + curvature)
         return self._headings[before] + mean * (arc_length - self._nodes[before])
 
 
-def _integrate_position(cells: FloatArray, heading_at: _HeadingProfile, arc_length: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _integrate_position(
+    cells: FloatArray, heading_at: _HeadingProfile, arc_length: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Position at ``arc_length`` by four-point Gauss-Legendre quadrature in each of the cells."""
     points, weights = np.polynomial.legendre.leggauss(4)
     half = 0.5 * np.diff(cells)

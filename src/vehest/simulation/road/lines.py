@@ -48,8 +48,13 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     swing out a little where the line turns, is covered by the clearance.
     """
     begin, end = gates[0].begin - run_in, gates[-1].end + run_out
-    straight_until, straight_from = gates[0].begin - min(run_in, 40.0), gates[-1].end + run_out / 3.0
-    places = np.linspace(straight_until, straight_from, max(round((straight_from - straight_until) / _KNOTS), 8) + 1)
+    straight_until, straight_from = (
+        gates[0].begin - min(run_in, 40.0),
+        gates[-1].end + run_out / 3.0,
+    )
+    places = np.linspace(
+        straight_until, straight_from, max(round((straight_from - straight_until) / _KNOTS), 8) + 1
+    )
     room = 0.5 * width + CLEARANCE
     lower, upper = np.full(len(places), -np.inf), np.full(len(places), np.inf)
     for gate in gates:
@@ -65,7 +70,9 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     bends = np.diff(padded, 2, axis=0) / step**2
     changes = _SMOOTH * np.diff(padded, 3, axis=0) / step**3
     lateral = least_within(bends.T @ bends + changes.T @ changes, lower, upper)
-    around = np.concatenate([places[0] + step * np.arange(-3, 0), places, places[-1] + step * np.arange(1, 4)])
+    around = np.concatenate(
+        [places[0] + step * np.arange(-3, 0), places, places[-1] + step * np.arange(1, 4)]
+    )
     return _sampled(around, np.pad(lateral, 3), begin, end)
 
 
@@ -84,10 +91,15 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
     multiplier = np.zeros(len(lower))
     for _ in range(_MOST_ITERATIONS):
         before = allowed
-        y = cho_solve_banded((factor, False), _PENALTY * bounded * (allowed - multiplier), check_finite=False)
+        y = cho_solve_banded(
+            (factor, False), _PENALTY * bounded * (allowed - multiplier), check_finite=False
+        )
         allowed = np.clip(y + multiplier, lower, upper)
         multiplier = bounded * (multiplier + y - allowed)
-        if max(np.abs(bounded * (y - allowed)).max(), np.abs(bounded * (allowed - before)).max()) < _TOLERANCE:
+        if (
+            max(np.abs(bounded * (y - allowed)).max(), np.abs(bounded * (allowed - before)).max())
+            < _TOLERANCE
+        ):
             break
     return np.asarray(y)
 
@@ -103,7 +115,9 @@ def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) 
     x = np.arange(begin, end, 0.1)
     inside = np.clip(x, places[0], places[-1])
     slope = np.where(inside == x, offset(inside, 1), 0.0)
-    along = np.concatenate([[0.0], np.cumsum(0.1 * np.sqrt(1.0 + (0.5 * (slope[1:] + slope[:-1])) ** 2))])
+    along = np.concatenate(
+        [[0.0], np.cumsum(0.1 * np.sqrt(1.0 + (0.5 * (slope[1:] + slope[:-1])) ** 2))]
+    )
     distance = np.arange(0.0, along[-1], SPACING)
     x = np.interp(distance, along, x)
     inside = np.clip(x, places[0], places[-1])
@@ -117,10 +131,17 @@ def circle(radius: float, side: float, run_in: float, length: float, transition:
     distance = np.arange(0.0, run_in + transition + length, SPACING)
     curvature = side / radius * np.clip((distance - run_in) / transition, 0.0, 1.0)
     beyond = np.clip(distance - run_in, 0.0, transition)
-    heading = side / radius * (0.5 * beyond**2 / transition + np.maximum(distance - run_in - transition, 0.0))
+    heading = (
+        side
+        / radius
+        * (0.5 * beyond**2 / transition + np.maximum(distance - run_in - transition, 0.0))
+    )
     # Simpson's rule over each sample; the heading between two samples is taken as linear, as good as exact at this spacing.
     half = 0.5 * (heading[1:] + heading[:-1])
     x, y = (
-        np.concatenate([[0.0], np.cumsum(SPACING / 6.0 * (f(heading[:-1]) + 4.0 * f(half) + f(heading[1:])))]) for f in (np.cos, np.sin)
+        np.concatenate(
+            [[0.0], np.cumsum(SPACING / 6.0 * (f(heading[:-1]) + 4.0 * f(half) + f(heading[1:])))]
+        )
+        for f in (np.cos, np.sin)
     )
     return Line(distance, x, y, heading, curvature)

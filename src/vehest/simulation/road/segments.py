@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-Piece = tuple[float, float, float]  # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are linear
+Piece = tuple[
+    float, float, float
+]  # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are linear
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,9 @@ class Corner:
     radius: float  # of the arc [m]
     angle: float  # change of heading, positive to the left [rad]
     transition: float  # length of each clothoid [m]
-    banking: float = 0.0  # of the arc, growing along the clothoids; positive with the inner side lower [rad]
+    banking: float = (
+        0.0  # of the arc, growing along the clothoids; positive with the inner side lower [rad]
+    )
 
     @property
     def bank(self) -> float:
@@ -67,7 +71,9 @@ class Compound:
 
     def __post_init__(self) -> None:
         if len({(part.transition, part.angle > 0.0) for part in self.parts}) != 1:
-            raise ValueError(f"the parts of a compound corner need one side and one transition: {self.parts}")
+            raise ValueError(
+                f"the parts of a compound corner need one side and one transition: {self.parts}"
+            )
 
     @property
     def angle(self) -> float:
@@ -81,7 +87,9 @@ class Compound:
 
     def pieces(self) -> list[Piece]:
         """The parts' arcs with a clothoid before, between and after them."""
-        return [piece for part in self.parts for piece in part.pieces()[:2]] + self.parts[-1].pieces()[2:]
+        return [piece for part in self.parts for piece in part.pieces()[:2]] + self.parts[
+            -1
+        ].pieces()[2:]
 
 
 Segment = Straight | Corner | Compound

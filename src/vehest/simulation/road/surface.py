@@ -28,10 +28,14 @@ class Surface:
     """
 
     name: str = "dry"  # in recordings
-    friction: float = 1.0  # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
+    friction: float = (
+        1.0  # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
+    )
     patches: float | None = None  # lowest scale of a patch
     patch_length: tuple[float, float] = (20.0, 80.0)  # shortest and longest patch [m]
-    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None  # of the patches; by default the drive's
+    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = (
+        None  # of the patches; by default the drive's
+    )
 
     def __post_init__(self) -> None:
         lowest = self.friction if self.patches is None else self.patches
@@ -40,9 +44,13 @@ class Surface:
                 f"surface '{self.name}': friction must lie between 0.05 and 1.5 and its patches below it, not {self.friction} and {lowest}"
             )
         if not 5.0 <= self.patch_length[0] <= self.patch_length[1] < math.inf:
-            raise ConfigurationError(f"surface '{self.name}': patches are at least 5 m long, not {self.patch_length}")
+            raise ConfigurationError(
+                f"surface '{self.name}': patches are at least 5 m long, not {self.patch_length}"
+            )
 
-    def along(self, distance: FloatArray, drive_seed: int, length: float | None = None) -> FloatArray:
+    def along(
+        self, distance: FloatArray, drive_seed: int, length: float | None = None
+    ) -> FloatArray:
         """Scale at each distance along the way, (N,) [m], zero or positive, uniform.
 
         The drive's seed draws the patches if the surface has none of its own; after a lap's ``length`` [m] the same come again, by default
@@ -52,20 +60,30 @@ class Surface:
             return np.full(distance.shape, self.friction)
         around = length if length is not None else float(distance[-1]) + 1.0
         ends, scales = self._draw(around, self.seed if self.seed is not None else drive_seed)
-        nodes = np.concatenate([[0.0], np.repeat(ends[:-1], 2) + np.tile([-1.0, 1.0], len(ends) - 1), [around]])
+        nodes = np.concatenate(
+            [[0.0], np.repeat(ends[:-1], 2) + np.tile([-1.0, 1.0], len(ends) - 1), [around]]
+        )
         return np.interp(np.mod(distance, around), nodes, np.repeat(scales, 2))
 
     def _draw(self, around: float, seed: int) -> tuple[FloatArray, FloatArray]:
         """Ends [m] and scales of the patches of one lap; the last one is as long as it must be."""
-        generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM,)))
+        generator = np.random.default_rng(
+            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM,))
+        )
         low = self.friction if self.patches is None else self.patches
-        ends = np.cumsum(generator.uniform(*self.patch_length, math.ceil(around / self.patch_length[0]) + 1))
+        ends = np.cumsum(
+            generator.uniform(*self.patch_length, math.ceil(around / self.patch_length[0]) + 1)
+        )
         scales = generator.uniform(low, self.friction, len(ends))
         inside = ends < around - self.patch_length[0]
         return np.append(ends[inside], around), scales[: int(inside.sum()) + 1]
 
 
-SURFACES: dict[str, Surface] = {"dry": Surface(), "wet": Surface("wet", 0.7), "patchy": Surface("patchy", 1.0, patches=0.5)}
+SURFACES: dict[str, Surface] = {
+    "dry": Surface(),
+    "wet": Surface("wet", 0.7),
+    "patchy": Surface("patchy", 1.0, patches=0.5),
+}
 """Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's friction, puddles or gravel half."""
 
 
@@ -75,6 +93,8 @@ def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surfac
         return SURFACES["dry"]
     if isinstance(configuration, str):
         if configuration not in SURFACES:
-            raise ConfigurationError(f"there is no surface '{configuration}'; there are {', '.join(SURFACES)}")
+            raise ConfigurationError(
+                f"there is no surface '{configuration}'; there are {', '.join(SURFACES)}"
+            )
         return SURFACES[configuration]
     return validated(Surface, {"name": "own", **configuration}, "surface", error=ConfigurationError)

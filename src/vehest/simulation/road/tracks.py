@@ -14,7 +14,9 @@ class Layout:
 
     segments: tuple[Segment, ...]  # in the order they are driven
     crossfall: float = 0.0  # bank of the road all along, positive with the left side higher [rad]; corners add their own
-    heights: tuple[tuple[float, float], ...] = ()  # (share of the lap, height [m]), in ascending order; none is a level course
+    heights: tuple[
+        tuple[float, float], ...
+    ] = ()  # (share of the lap, height [m]), in ascending order; none is a level course
     # (share of the lap where it begins, where it ends, scale of the tyres' friction); 1 elsewhere
     friction: tuple[tuple[float, float, float], ...] = ()
 

@@ -7,7 +7,15 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.sensors.levels import NO_ERRORS, PRESETS, REFERENCES, Reference, SensorLevel, SensorLevels, without_errors
+from vehest.simulation.sensors.levels import (
+    NO_ERRORS,
+    PRESETS,
+    REFERENCES,
+    Reference,
+    SensorLevel,
+    SensorLevels,
+    without_errors,
+)
 
 OFF = "off"  # switches errors off; YAML reads False, a command line the text
 
@@ -22,7 +30,11 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
 
     Raises `ConfigurationError`: there is no such sensor or error.
     """
-    every = [entry.name for entry in fields(levels) if isinstance(getattr(levels, entry.name), SensorLevel)]
+    every = [
+        entry.name
+        for entry in fields(levels)
+        if isinstance(getattr(levels, entry.name), SensorLevel)
+    ]
     for name in names:
         first, *rest = str(name).split(".")
         for sensor in every if first == "*" else [first]:
@@ -49,25 +61,37 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
     if isinstance(off, str):
         off = [off]
     if not isinstance(off, Iterable) or isinstance(off, Mapping):
-        raise ConfigurationError(f"sensors: switched_off is a list of names such as ay.noise, not {off!r}")
+        raise ConfigurationError(
+            f"sensors: switched_off is a list of names such as ay.noise, not {off!r}"
+        )
     levels = _changed(PRESETS[preset], changes, "sensors", also=("preset", "switched_off"))
     return switched_off(levels, *off)
 
 
 def _reference(kind: Any) -> Reference:
     if str(kind) not in REFERENCES:
-        raise ConfigurationError(f"sensors: reference '{kind}' is not one of: {', '.join(REFERENCES)}")
+        raise ConfigurationError(
+            f"sensors: reference '{kind}' is not one of: {', '.join(REFERENCES)}"
+        )
     return REFERENCES[str(kind)]
 
 
-def _changed(current: Any, changes: Mapping[str, Any], where: str, also: tuple[str, ...] = ()) -> Any:
+def _changed(
+    current: Any, changes: Mapping[str, Any], where: str, also: tuple[str, ...] = ()
+) -> Any:
     """A dataclass of levels with some of its fields changed, or all of them off."""
     known = [entry.name for entry in fields(current)]
     new = {}
     for key, change in changes.items():
         if key not in known:
-            raise ConfigurationError(f"{where}: '{key}' is not one of: {', '.join([*known, *also])}")
-        new[key] = _changed_value(getattr(current, key), change, f"{where}: {key}" if where == "sensors" else f"{where}.{key}")
+            raise ConfigurationError(
+                f"{where}: '{key}' is not one of: {', '.join([*known, *also])}"
+            )
+        new[key] = _changed_value(
+            getattr(current, key),
+            change,
+            f"{where}: {key}" if where == "sensors" else f"{where}.{key}",
+        )
     try:
         return replace(current, **new)
     except ConfigurationError as error:
@@ -81,7 +105,9 @@ def _changed_value(old: Any, change: Any, where: str) -> Any:
         if isinstance(old, Reference) and isinstance(change, str):
             return _reference(change)
         if not isinstance(change, Mapping):
-            raise ConfigurationError(f"{where} is a mapping of what changes, or off, not {change!r}")
+            raise ConfigurationError(
+                f"{where} is a mapping of what changes, or off, not {change!r}"
+            )
         rest = {str(key): value for key, value in change.items()}
         if isinstance(old, Reference) and "kind" in rest:
             old = _reference(rest.pop("kind"))
@@ -101,7 +127,9 @@ def _off_at(levels: Any, path: list[str], name: str) -> Any:
     key, rest = path[0], path[1:]
     choices = [entry.name for entry in fields(levels) if entry.name not in NO_ERRORS]
     if key not in choices:
-        raise ConfigurationError(f"sensors: cannot switch off '{name}': '{key}' is not one of: {', '.join(choices)}")
+        raise ConfigurationError(
+            f"sensors: cannot switch off '{name}': '{key}' is not one of: {', '.join(choices)}"
+        )
     old = getattr(levels, key)
     if not rest:
         return replace(levels, **{key: without_errors(old)})

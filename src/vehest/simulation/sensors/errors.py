@@ -26,15 +26,23 @@ def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name:
     if level.offset:
         value = value + level.offset * stream(seed, f"{name}.offset").standard_normal()
     if level.drift:
-        value = value + level.drift * _gauss_markov(stream(seed, f"{name}.drift"), len(true), level.drift_time * rate_hz)
+        value = value + level.drift * _gauss_markov(
+            stream(seed, f"{name}.drift"), len(true), level.drift_time * rate_hz
+        )
     if level.noise:
-        value = value + level.noise * math.sqrt(rate_hz / 2.0) * stream(seed, f"{name}.noise").standard_normal(len(true))
-    return np.round(value / level.quantisation) * level.quantisation if level.quantisation else value
+        value = value + level.noise * math.sqrt(rate_hz / 2.0) * stream(
+            seed, f"{name}.noise"
+        ).standard_normal(len(true))
+    return (
+        np.round(value / level.quantisation) * level.quantisation if level.quantisation else value
+    )
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
     """The random stream of one error of one sensor in one drive, independent of other errors."""
-    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(STREAM, zlib.crc32(name.encode()))))
+    return np.random.default_rng(
+        np.random.SeedSequence(entropy=seed, spawn_key=(STREAM, zlib.crc32(name.encode())))
+    )
 
 
 def delayed(samples: FloatArray, delay: float) -> FloatArray:

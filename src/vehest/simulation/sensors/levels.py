@@ -101,7 +101,9 @@ class Reference(Errors):
     """
 
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
-    kind: str = "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
+    kind: str = (
+        "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
+    )
     vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
     vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
     yaw_rate: SensorLevel = SensorLevel()  # errors of its gyro [rad/s]
@@ -110,7 +112,9 @@ class Reference(Errors):
     lever_x: float = 0.0  # its place forward of the centre of gravity [m]
     lever_y: float = 0.0  # its place left of the centre of gravity [m]
     lever_z: float = 0.0  # its place above the centre of gravity [m]
-    lever_error: float = 0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
+    lever_error: float = (
+        0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -155,12 +159,20 @@ MOTION_CAPTURE = Reference(
 )
 """Cameras around a small test area: markers' poses, differentiated."""
 
-REFERENCES: dict[str, Reference] = {reference.kind: reference for reference in (OPTICAL, GNSS, MOTION_CAPTURE, Reference())}
+REFERENCES: dict[str, Reference] = {
+    reference.kind: reference for reference in (OPTICAL, GNSS, MOTION_CAPTURE, Reference())
+}
 
 
-_GYRO = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
-_ACCELEROMETER = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
-_WHEEL_FORCE = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+_GYRO = SensorLevel(
+    noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01
+)
+_ACCELEROMETER = SensorLevel(
+    noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01
+)
+_WHEEL_FORCE = SensorLevel(
+    noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005
+)
 
 
 @dataclass(frozen=True)
@@ -216,7 +228,10 @@ class SensorLevels:
     speed_of_wheels: bool = False
 
 
-NO_ERRORS = ("kind", "drift_time")  # fields that are no errors and stay when the others are switched off
+NO_ERRORS = (
+    "kind",
+    "drift_time",
+)  # fields that are no errors and stay when the others are switched off
 
 
 def without_errors(level: Any) -> Any:
@@ -224,7 +239,11 @@ def without_errors(level: Any) -> Any:
     if isinstance(level, Reference):
         return Reference()
     if is_dataclass(level):
-        values = {entry.name: getattr(level, entry.name) for entry in fields(level) if entry.name not in NO_ERRORS}
+        values = {
+            entry.name: getattr(level, entry.name)
+            for entry in fields(level)
+            if entry.name not in NO_ERRORS
+        }
         return replace(level, **{name: without_errors(value) for name, value in values.items()})  # type: ignore[type-var]
     return False if isinstance(level, bool) else 0.0
 
@@ -238,13 +257,21 @@ def _gyros(level: SensorLevel) -> dict[str, Any]:
 # be separated from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
 RACE = SensorLevels(
     vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
-    **_gyros(SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)),  # noise and delay read off; offset and scale assumed
+    **_gyros(
+        SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)
+    ),  # noise and delay read off; offset and scale assumed
     # Read off but for the scale (assumed). Offset: the mean of what the accelerations lack against the reference's velocities; drift:
     # what is left of that below 0.5 Hz when delays, white noise and the gravity of roll and pitch are taken out, a banked road included;
     # its time is known to a factor of two. Delays are known to some 3 ms, by what other bands than 0.2 to 2 Hz give.
-    ax=SensorLevel(noise=0.088, offset=0.025, drift=0.0153, drift_time=1.8, delay=0.0151, scale=0.003),
-    ay=SensorLevel(noise=0.13, offset=0.028, drift=0.17, drift_time=11.5, delay=0.0183, scale=0.003),
-    steer=SensorLevel(noise=1.7e-5, offset=0.0017, quantisation=1.23e-4),  # noise and step read off; offset assumed
+    ax=SensorLevel(
+        noise=0.088, offset=0.025, drift=0.0153, drift_time=1.8, delay=0.0151, scale=0.003
+    ),
+    ay=SensorLevel(
+        noise=0.13, offset=0.028, drift=0.17, drift_time=11.5, delay=0.0183, scale=0.003
+    ),
+    steer=SensorLevel(
+        noise=1.7e-5, offset=0.0017, quantisation=1.23e-4
+    ),  # noise and step read off; offset assumed
     imu=Mounting(),  # what it is turned by is in the offsets that were read off
 )
 """A race car of the sixties with good instruments."""
@@ -255,15 +282,25 @@ RACE = SensorLevels(
 # (docs/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
     # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which are not measured there.
-    **_gyros(SensorLevel(noise=0.006, offset=0.0065, delay=0.005)),  # noise, offset read off; delay assumed
+    **_gyros(
+        SensorLevel(noise=0.006, offset=0.0065, delay=0.005)
+    ),  # noise, offset read off; delay assumed
     ax=SensorLevel(noise=0.17, offset=0.1, delay=0.005),  # noise read off; offset and delay assumed
-    ay=SensorLevel(noise=0.17, offset=0.15, delay=0.005),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed
-    steer=SensorLevel(noise=2e-4, offset=0.005),  # assumed: the servo's command, and how well its neutral is trimmed
+    ay=SensorLevel(
+        noise=0.17, offset=0.15, delay=0.005
+    ),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed
+    steer=SensorLevel(
+        noise=2e-4, offset=0.005
+    ),  # assumed: the servo's command, and how well its neutral is trimmed
     wheel_speed=SensorLevel(),  # none is there
     imu=Mounting(misalignment=0.01),  # assumed
     reference=MOTION_CAPTURE,
-    motor_speed=SensorLevel(noise=0.03, delay=0.01, scale=0.005),  # noise read off; delay one message; scale, the tyre's radius, assumed
-    motor_current=SensorLevel(noise=0.24, delay=0.01, scale=0.02),  # noise read off; delay one message; scale assumed
+    motor_speed=SensorLevel(
+        noise=0.03, delay=0.01, scale=0.005
+    ),  # noise read off; delay one message; scale, the tyre's radius, assumed
+    motor_current=SensorLevel(
+        noise=0.24, delay=0.01, scale=0.02
+    ),  # noise read off; delay one message; scale assumed
     vibration=Vibration(yaw_rate=0.009, ax=0.063, ay=0.115),  # read off
 )
 """A model race car of 5 kg: little noise at rest, an inertial unit that shakes with the wheels."""
@@ -272,6 +309,8 @@ SMALL_CAR = SensorLevels(
 PRESETS: dict[str, SensorLevels] = {
     "default": SensorLevels(),
     "race": RACE,
-    "ideal": without_errors(SensorLevels()),  # shows the true motion of the centre of gravity in the road's axes
+    "ideal": without_errors(
+        SensorLevels()
+    ),  # shows the true motion of the centre of gravity in the road's axes
     "small_car": SMALL_CAR,
 }

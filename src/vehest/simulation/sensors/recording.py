@@ -26,11 +26,25 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     """
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
-    wheels = {"wheel_speed": motion.wheel_speed, "fx": motion.tyre_fx, "fy": motion.tyre_fy, "fz": motion.tyre_fz}
+    wheels = {
+        "wheel_speed": motion.wheel_speed,
+        "fx": motion.tyre_fx,
+        "fy": motion.tyre_fy,
+        "fz": motion.tyre_fz,
+    }
     felt = [(name, name, values) for name, values in true.items()]
-    felt += [(f"{sensor}_{wheel}", sensor, own) for sensor, values in wheels.items() for wheel, own in zip(WHEELS, values.T, strict=True)]
-    felt += [(name, name, values) for name in OF_MOTOR if (values := getattr(motion, name)) is not None]
-    channels = {name: shown(values, getattr(levels, sensor), motion.rate_hz, seed, name) for name, sensor, values in felt}
+    felt += [
+        (f"{sensor}_{wheel}", sensor, own)
+        for sensor, values in wheels.items()
+        for wheel, own in zip(WHEELS, values.T, strict=True)
+    ]
+    felt += [
+        (name, name, values) for name in OF_MOTOR if (values := getattr(motion, name)) is not None
+    ]
+    channels = {
+        name: shown(values, getattr(levels, sensor), motion.rate_hz, seed, name)
+        for name, sensor, values in felt
+    }
     return channels | _reference(motion, levels.reference, seed)
 
 
@@ -41,7 +55,9 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
         absent.add("vibration")
     if not levels.speed_of_wheels:
         absent.add("speed_of_wheels")
-    return {name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent}
+    return {
+        name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent
+    }
 
 
 _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, left out
@@ -50,7 +66,11 @@ _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, 
 def _without_idle(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
-    return {name: _without_idle(inner) for name, inner in value.items() if name not in _IDLE or inner != _IDLE[name]}
+    return {
+        name: _without_idle(inner)
+        for name, inner in value.items()
+        if name not in _IDLE or inner != _IDLE[name]
+    }
 
 
 def _speed_of_wheels(motion: Motion) -> FloatArray:
@@ -58,7 +78,9 @@ def _speed_of_wheels(motion: Motion) -> FloatArray:
     turning = motion.wheel_speed[:, :2].mean(axis=1)
     straight = np.abs(motion.steer) <= np.quantile(np.abs(motion.steer), 0.3)
     rolling = float(np.dot(turning[straight], turning[straight]))
-    radius = float(np.dot(motion.vx[straight], turning[straight])) / rolling if rolling > 0.0 else 0.0
+    radius = (
+        float(np.dot(motion.vx[straight], turning[straight])) / rolling if rolling > 0.0 else 0.0
+    )
     return turning * radius
 
 
@@ -70,7 +92,11 @@ def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
     """
     grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
     road = np.stack(
-        [motion.ax - GRAVITY * np.sin(grade), motion.ay + GRAVITY * np.cos(grade) * np.sin(bank), GRAVITY * np.cos(grade) * np.cos(bank)]
+        [
+            motion.ax - GRAVITY * np.sin(grade),
+            motion.ay + GRAVITY * np.cos(grade) * np.sin(bank),
+            GRAVITY * np.cos(grade) * np.cos(bank),
+        ]
     )
     return _turned(road, motion.roll * (tilt.roll * tilt.roll_share), motion.pitch * tilt.pitch)
 
@@ -81,7 +107,12 @@ def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
     """
     roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch
-    sin_roll, cos_roll, sin_pitch, cos_pitch = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    sin_roll, cos_roll, sin_pitch, cos_pitch = (
+        np.sin(roll),
+        np.cos(roll),
+        np.sin(pitch),
+        np.cos(pitch),
+    )
     return np.stack(
         [
             motion.roll_rate - motion.yaw_rate * sin_pitch,
@@ -97,14 +128,29 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
     rates, force = body_rates(motion, levels.tilt), specific_force(motion, levels.tilt)
     lever = np.array([[mounting.lever_x], [mounting.lever_y], [mounting.lever_z]])
     if lever.any():  # dω/dt × l + ω × (ω × l), as of a rigid body
-        angular = np.gradient(rates, axis=1) * motion.rate_hz if rates.shape[1] > 1 else np.zeros_like(rates)
-        force = force + (np.cross(angular, lever, axis=0) + np.cross(rates, np.cross(rates, lever, axis=0), axis=0))
+        angular = (
+            np.gradient(rates, axis=1) * motion.rate_hz
+            if rates.shape[1] > 1
+            else np.zeros_like(rates)
+        )
+        force = force + (
+            np.cross(angular, lever, axis=0)
+            + np.cross(rates, np.cross(rates, lever, axis=0), axis=0)
+        )
     angles = np.array([mounting.roll, mounting.pitch, mounting.yaw])
     if mounting.misalignment:
-        angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(3)
+        angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(
+            3
+        )
     roll_rate, pitch_rate, yaw_rate = _turned(rates, *angles)
     ax, ay, _ = _turned(force, *angles)
-    felt = {"yaw_rate": yaw_rate, "roll_rate": roll_rate, "pitch_rate": pitch_rate, "ax": ax, "ay": ay}
+    felt = {
+        "yaw_rate": yaw_rate,
+        "roll_rate": roll_rate,
+        "pitch_rate": pitch_rate,
+        "ax": ax,
+        "ay": ay,
+    }
     for name in ("yaw_rate", "ax", "ay"):
         by_speed = getattr(levels.vibration, name)
         if by_speed:
@@ -113,7 +159,12 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
     return felt
 
 
-def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | float, yaw: FloatArray | float = 0.0) -> FloatArray:
+def _turned(
+    vector: FloatArray,
+    roll: FloatArray | float,
+    pitch: FloatArray | float,
+    yaw: FloatArray | float = 0.0,
+) -> FloatArray:
     """A vector (3, T) along axes that are turned by yaw, then pitch, then roll; the angles are numbers or (T,)."""
     x, y, z = vector
     x, y = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
@@ -125,7 +176,9 @@ def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | fl
 def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, FloatArray]:
     """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity."""
     rate_hz = motion.rate_hz
-    forward = motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
+    forward = (
+        motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
+    )
     left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
     heading = shown(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
     cosine, sine = np.cos(heading), np.sin(heading)
@@ -134,7 +187,14 @@ def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, Flo
     seen_left = shown(left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref")
     lever_x, lever_y = reference.lever_x, reference.lever_y
     if reference.lever_error:
-        error_x, error_y = reference.lever_error * stream(seed, "reference.lever_error").standard_normal(2)
+        error_x, error_y = reference.lever_error * stream(
+            seed, "reference.lever_error"
+        ).standard_normal(2)
         lever_x, lever_y = lever_x + error_x, lever_y + error_y
     vx, vy = seen_forward + yaw_rate * lever_y, seen_left - yaw_rate * lever_x
-    return {"vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate, "sideslip_ref": np.arctan2(vy, vx)}
+    return {
+        "vx_ref": vx,
+        "vy_ref": vy,
+        "yaw_rate_ref": yaw_rate,
+        "sideslip_ref": np.arctan2(vy, vx),
+    }

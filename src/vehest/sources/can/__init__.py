@@ -44,7 +44,9 @@ class Wanted:
 
     message: Message  # that carries it
     signal: str
-    invalid: frozenset[float] = frozenset()  # values that mean that nothing was measured, in the unit of the DBC
+    invalid: frozenset[float] = (
+        frozenset()
+    )  # values that mean that nothing was measured, in the unit of the DBC
 
 
 class CanSource(SignalSource):
@@ -57,7 +59,9 @@ class CanSource(SignalSource):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         if not self.options.dbc:
-            raise ConfigurationError(f"{self.where}: dbc must name the DBC file that describes the bus, for example dbc: ${{root}}/car.dbc")
+            raise ConfigurationError(
+                f"{self.where}: dbc must name the DBC file that describes the bus, for example dbc: ${{root}}/car.dbc"
+            )
         self.dbc = Path(self.options.dbc).expanduser()
 
     def inputs(self) -> dict[str, str | Path]:
@@ -73,7 +77,9 @@ class CanSource(SignalSource):
         for name, declared in self.channels.items():
             message, signal = database.places[declared.column]
             invalid = (declared.invalid,) if isinstance(declared.invalid, int) else declared.invalid
-            found[name] = Wanted(message, signal, frozenset(message.physical(signal, raw) for raw in invalid))
+            found[name] = Wanted(
+                message, signal, frozenset(message.physical(signal, raw) for raw in invalid)
+            )
         return database, found
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
@@ -92,7 +98,9 @@ class CanSource(SignalSource):
             where = f"'{file}': message '{one.message.name}', which carries '{one.signal}',"
             require_clock(times, where, "where two buses carry it, say which by bus: …")
             origin = f"message '{one.message.name}'"
-            signals[name] = Signal(origin, times, np.array(values[name]), one.message.units[one.signal])
+            signals[name] = Signal(
+                origin, times, np.array(values[name]), one.message.units[one.signal]
+            )
             rates[one.message.name] = round(signals[name].rate_hz, 3)
         return signals, {"dbc": self.dbc.name, "messages": rates}
 
@@ -123,18 +131,28 @@ def channels_by_message(wanted: Mapping[str, Wanted]) -> dict[str, list[str]]:
     return found
 
 
-def channel_values(values: Mapping[str, float], channels: list[str], wanted: Mapping[str, Wanted]) -> dict[str, float]:
+def channel_values(
+    values: Mapping[str, float], channels: list[str], wanted: Mapping[str, Wanted]
+) -> dict[str, float]:
     """Values of the channels that a frame carries; NaN where it says that nothing was measured."""
-    found = {name: values[wanted[name].signal] for name in channels if wanted[name].signal in values}
-    return {name: math.nan if value in wanted[name].invalid else value for name, value in found.items()}
+    found = {
+        name: values[wanted[name].signal] for name in channels if wanted[name].signal in values
+    }
+    return {
+        name: math.nan if value in wanted[name].invalid else value for name, value in found.items()
+    }
 
 
 def is_on(frame: Any, bus: int | str | None) -> bool:
     """Whether a frame was on a bus, by its name or its number, which logs count from 1 and python-can from 0."""
-    return bus is None or frame.channel == (bus - 1 if isinstance(bus, int) and not isinstance(bus, bool) else bus)
+    return bus is None or frame.channel == (
+        bus - 1 if isinstance(bus, int) and not isinstance(bus, bool) else bus
+    )
 
 
-def never_occurs(file: Path, channel: str, wanted: Wanted, count: int, bus: int | str | None) -> str:
+def never_occurs(
+    file: Path, channel: str, wanted: Wanted, count: int, bus: int | str | None
+) -> str:
     """Error text for a signal that a log does not hold."""
     message = wanted.message
     often = "occurs once only" if count else "never occurs"

@@ -20,7 +20,9 @@ from vehest.sources.limited import require_package
 
 COMPARED = 10_000  # names that a misspelt one is compared with
 UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
-_TOO_LONG = re.compile(r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})")
+_TOO_LONG = re.compile(
+    r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})"
+)
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class Message:
 
     described: Any  # by cantools
     units: Mapping[str, str]  # wanted signal -> its unit as the DBC writes it
-    coders: Sequence[Any]  # of cantools: one for all signals that every frame carries, one for each that is multiplexed
+    coders: Sequence[
+        Any
+    ]  # of cantools: one for all signals that every frame carries, one for each that is multiplexed
 
     @property
     def name(self) -> str:
@@ -40,20 +44,26 @@ class Message:
         """Wanted signals that a frame carries, in the DBC's unit, without those that its multiplexer leaves out; raises `DataError`."""
         length = self.described.length
         if len(data) < length:
-            raise DataError(f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says")
+            raise DataError(
+                f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says"
+            )
         found: dict[str, float] = {}
         frame = bytes(data[:length])
         for coder in self.coders:
             try:
                 values = coder.decode(frame, decode_choices=False)
-            except Exception:  # of cantools, for a multiplexer's value that the signal does not go with
+            except (
+                Exception
+            ):  # of cantools, for a multiplexer's value that the signal does not go with
                 continue
             found |= {name: float(value) for name, value in values.items() if name in self.units}
         return found
 
     def physical(self, signal: str, raw: int) -> float:
         """A raw value of a signal in the unit of the DBC."""
-        return float(self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False))
+        return float(
+            self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False)
+        )
 
 
 @dataclass(frozen=True)
@@ -75,11 +85,19 @@ def read_dbc(file: Path) -> list[Any]:
 
     text = file.read_bytes().decode("cp1252", errors="replace")
     if found := _TOO_LONG.search(text):
-        raise DataError(f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}")
+        raise DataError(
+            f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}"
+        )
     try:
-        messages = [message for message in load_string(text, "dbc", strict=False).messages if message.name != UNASSIGNED]
+        messages = [
+            message
+            for message in load_string(text, "dbc", strict=False).messages
+            if message.name != UNASSIGNED
+        ]
     except Exception as error:  # of cantools and its parser, of any kind
-        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error))})") from None
+        raise DataError(
+            f"'{file}' cannot be read as a DBC ({printable(first_line(error))})"
+        ) from None
     if not messages:
         raise DataError(f"'{file}' declares no message; is it a DBC file?")
     return messages
@@ -98,11 +116,17 @@ def read_database(file: Path, wanted: Sequence[str]) -> Database:
     for message, _ in found.values():
         key = _identifier(message)
         if key not in messages:
-            names = list(dict.fromkeys(signal for other, signal in found.values() if other is message))
+            names = list(
+                dict.fromkeys(signal for other, signal in found.values() if other is message)
+            )
             messages[key] = _message(message, names, file)
         elif messages[key].described is not message:
-            raise DataError(f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one")
-    places = {name: (messages[_identifier(message)], signal) for name, (message, signal) in found.items()}
+            raise DataError(
+                f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one"
+            )
+    places = {
+        name: (messages[_identifier(message)], signal) for name, (message, signal) in found.items()
+    }
     return Database(file, messages, places, frozenset(map(_identifier, described)))
 
 
@@ -110,14 +134,20 @@ def _identifier(message: Any) -> tuple[int, bool]:
     return message.frame_id, message.is_extended_frame
 
 
-def _only_one(known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path) -> tuple[Any, str]:
+def _only_one(
+    known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path
+) -> tuple[Any, str]:
     found = known.get(wanted, ())
     if len(found) > 1:
         names = ", ".join(f"{message.name}.{signal}" for message, signal in found[:8])
-        raise DataError(f"'{file}': signal '{wanted}' stands in several messages; write one of {names}")
+        raise DataError(
+            f"'{file}': signal '{wanted}' stands in several messages; write one of {names}"
+        )
     if not found:
         lower = {name.lower(): name for name in list(known)[:COMPARED]}
-        near = ", ".join(lower[close] for close in difflib.get_close_matches(wanted.lower(), lower, n=3))
+        near = ", ".join(
+            lower[close] for close in difflib.get_close_matches(wanted.lower(), lower, n=3)
+        )
         raise DataError(f"'{file}' has no signal '{wanted}'{f' (near it: {near})' if near else ''}")
     return found[0]
 
@@ -135,9 +165,19 @@ def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
         parts = [signals[name] for name in names]
         for one in parts:
             if not 0.0 < abs(one.scale) < 1e30 or not abs(one.offset) < 1e30:
-                raise DataError(f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; correct the DBC")
+                raise DataError(
+                    f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; correct the DBC"
+                )
         try:
-            coders.append(Coder(message.frame_id, message.name, message.length, parts, is_extended_frame=message.is_extended_frame))
+            coders.append(
+                Coder(
+                    message.frame_id,
+                    message.name,
+                    message.length,
+                    parts,
+                    is_extended_frame=message.is_extended_frame,
+                )
+            )
         except Exception as error:  # of cantools
             raise DataError(f"{where} cannot be decoded ({printable(first_line(error))})") from None
     return Message(message, {name: signals[name].unit or "" for name in wanted}, coders)
@@ -149,6 +189,8 @@ def _chain(signals: Mapping[str, Any], wanted: str, where: str) -> list[str]:
     while signals[chain[0]].multiplexer_ids is not None:
         above = signals[chain[0]].multiplexer_signal
         if above not in signals or above in chain:
-            raise DataError(f"{where}: nothing says when frames carry the multiplexed signal '{chain[0]}'")
+            raise DataError(
+                f"{where}: nothing says when frames carry the multiplexed signal '{chain[0]}'"
+            )
         chain.insert(0, above)
     return chain

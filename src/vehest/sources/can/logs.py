@@ -27,16 +27,27 @@ class Frames:
 
         data, at = self.arrays["data"].tobytes(), 0
         names = ("time", "identifier", "extended", "fd", "fast", "length", "bus")
-        for time, identifier, extended, fd, fast, length, bus in zip(*(self.arrays[name].tolist() for name in names), strict=True):
+        for time, identifier, extended, fd, fast, length, bus in zip(
+            *(self.arrays[name].tolist() for name in names), strict=True
+        ):
             kinds = {"is_fd": bool(fd), "bitrate_switch": bool(fast)}
-            yield Message(time, identifier, bool(extended), channel=self.buses[bus], data=data[at : at + length], **kinds)
+            yield Message(
+                time,
+                identifier,
+                bool(extended),
+                channel=self.buses[bus],
+                data=data[at : at + length],
+                **kinds,
+            )
             at += length
 
 
 def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) -> Frames:
     """Read the frames of a log whose (identifier, extended) is wanted; None for all; raises `MissingError` or `DataError`."""
     if regular_file(file).suffix.lower() not in SUFFIXES:
-        raise DataError(f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}")
+        raise DataError(
+            f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}"
+        )
     require_package("can", "bus", "reading CAN")
     request = None if wanted is None else [list(one) for one in wanted]
     reading = read_limited("vehest.sources.readers.can_logs:read_frames", file, wanted=request)

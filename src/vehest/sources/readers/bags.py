@@ -18,13 +18,21 @@ import apsw
 import numpy as np
 from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
 
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
-apsw.connection_hooks.append(lambda connection: connection.pragma("temp_store", "memory"))  # SQLite may write no file
+apsw.connection_hooks.append(
+    lambda connection: connection.pragma("temp_store", "memory")
+)  # SQLite may write no file
 
 TEXTS = frozenset({"string", "wstring", "byte", "char"})
 ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
@@ -33,7 +41,9 @@ LATEST = 2**62  # ns of unix time: 146 years
 Topic = Sequence[Any]  # name, message type, paths of fields
 
 
-def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) -> tuple[Arrays, dict[str, Any]]:
+def read_topics(
+    bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]
+) -> tuple[Arrays, dict[str, Any]]:
     """All messages of topics, in the order in which the bag received them; raises `ConfigurationError` or `DataError`.
 
     Of each topic are given name, message type and paths of numeric fields; ``layouts`` are definitions of types that ROS 2 Humble does not
@@ -45,23 +55,39 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
         try:
             arrays = _read(bag, reader, types, topics)
         except KeyError as error:  # of rosbags' types
-            raise ConfigurationError(f"message type {error} is neither a standard one nor declared; give its layout in messages") from None
+            raise ConfigurationError(
+                f"message type {error} is neither a standard one nor declared; give its layout in messages"
+            ) from None
         if not 0 <= reader.start_time < LATEST:
-            raise DataError(f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again")
+            raise DataError(
+                f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again"
+            )
         return arrays, {"start": reader.start_time}
 
 
-def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[Arrays, dict[str, Any]]:
+def survey_topics(
+    bag: Path, ignored: Sequence[str], most_fields: int
+) -> tuple[Arrays, dict[str, Any]]:
     """All topics whose messages are of ROS's own types, with their plain numbers."""
     types, arrays, found, skipped = _types({}), Arrays(), [], []
     with _opened(bag) as reader:
-        topics = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
+        topics = {
+            connection.topic: connection.msgtype
+            for connection in reader.connections
+            if connection.msgcount
+        }
         for name, kind in topics.items():
             if name.strip("/").split("/")[-1] in ignored:
                 continue
-            fields = [field for field in _numbers(types, kind) if not field.startswith("header.") and "covariance" not in field]
+            fields = [
+                field
+                for field in _numbers(types, kind)
+                if not field.startswith("header.") and "covariance" not in field
+            ]
             if not 0 < len(fields) <= most_fields:
-                skipped.append(f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own of plain numbers")
+                skipped.append(
+                    f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own of plain numbers"
+                )
                 continue
             try:
                 arrays |= _read(bag, reader, types, [(name, kind, fields)])
@@ -88,7 +114,9 @@ def _opened(bag: Path) -> Reader:
             with open(file, "rb") as stream:
                 head = stream.read(18)
             page = int.from_bytes(head[16:], "big")
-            if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page):
+            if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (
+                65536 if page == 1 else page
+            ):
                 raise DataError(f"'{bag}': '{file.name}' is truncated; fetch it again")
     return Reader(_UriPath(bag))
 
@@ -100,7 +128,9 @@ def _types(layouts: Mapping[str, str]) -> Any:
         try:
             declared.update(get_types_from_msg(text, name))
         except Exception as error:  # of rosbags' parser, of any kind
-            raise ConfigurationError(f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}") from None
+            raise ConfigurationError(
+                f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}"
+            ) from None
     try:
         types.register(declared)
     except TypesysError as error:
@@ -132,10 +162,14 @@ def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any
         elif node in ARRAYS and part.isdigit():
             inner = {part: detail[0]}
         if part not in inner:
-            raise ConfigurationError(f"topic '{topic}': '{kind}' has no field '{path}': '{part}' is none of: {', '.join(inner)}")
+            raise ConfigurationError(
+                f"topic '{topic}': '{kind}' has no field '{path}': '{part}' is none of: {', '.join(inner)}"
+            )
         node, detail = inner[part]
     if node != Nodetype.BASE or detail[0] in TEXTS:
-        raise ConfigurationError(f"topic '{topic}': field '{path}' of '{kind}' is not a number; name one inside it")
+        raise ConfigurationError(
+            f"topic '{topic}': field '{path}' of '{kind}' is not a number; name one inside it"
+        )
     return partial(reduce, _part, parts) if any(map(str.isdigit, parts)) else attrgetter(path)
 
 
@@ -146,13 +180,20 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
     for name, kind, paths in topics:
         getters = {f"{name}.{path}": _getter(types, name, kind, path) for path in paths}
         if dict(types.fielddefs[kind][1]).get("header") == (Nodetype.NAME, "std_msgs/msg/Header"):
-            getters[f"{name}@stamped"] = lambda message: message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            getters[f"{name}@stamped"] = lambda message: (
+                message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            )
         keys[name] = [f"{name}@received", *getters]
-        columns |= {key: array("q" if key.endswith(("@received", "@stamped")) else "d") for key in keys[name]}
+        columns |= {
+            key: array("q" if key.endswith(("@received", "@stamped")) else "d")
+            for key in keys[name]
+        }
         takers[name] = [(columns[key].append, getter) for key, getter in getters.items()]
         held = _connections(bag, reader, types, name, kind)
         counts[name] = sum(connection.msgcount for connection in held)
-        check_limit("samples", counts[name], f"'{bag}': topic '{name}' holds {counts[name]} messages")
+        check_limit(
+            "samples", counts[name], f"'{bag}': topic '{name}' holds {counts[name]} messages"
+        )
         wanted += held
     for connection, time, raw in reader.messages(wanted):
         message: Any = types.deserialize_cdr(raw, connection.msgtype)
@@ -163,9 +204,13 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
     for name, count in counts.items():
         received = arrays[f"{name}@received"]
         if len(received) != count:
-            raise DataError(f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {count}; it is truncated")
+            raise DataError(
+                f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {count}; it is truncated"
+            )
         if received.min() < 0 or received.max() >= LATEST:
-            raise DataError(f"'{bag}': topic '{name}': a message was received at no time there is; the bag is damaged")
+            raise DataError(
+                f"'{bag}': topic '{name}': a message was received at no time there is; the bag is damaged"
+            )
         order = np.argsort(received, kind="stable")
         arrays |= {key: arrays[key][order] for key in keys[name]}
     return arrays
@@ -175,15 +220,29 @@ def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) ->
     """What the bag holds of a topic; its type and layout are those that are declared."""
     held = [connection for connection in reader.connections if connection.topic == name]
     if not any(connection.msgcount for connection in held):
-        topics = printable(", ".join(sorted({connection.topic for connection in reader.connections if connection.msgcount})[:30]))
-        raise DataError(f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics in the configuration")
+        topics = printable(
+            ", ".join(
+                sorted(
+                    {connection.topic for connection in reader.connections if connection.msgcount}
+                )[:30]
+            )
+        )
+        raise DataError(
+            f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics in the configuration"
+        )
     for connection in held:
         if connection.msgtype != kind:
-            raise DataError(f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared")
+            raise DataError(
+                f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared"
+            )
         for found, (_, fields) in _definitions(connection).items():
             declared = types.fielddefs.get(found, ((), fields))[1]
-            if [(field.lower(), node) for field, node in fields] != [(field.lower(), node) for field, node in declared]:
-                raise DataError(f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages")
+            if [(field.lower(), node) for field, node in fields] != [
+                (field.lower(), node) for field, node in declared
+            ]:
+                raise DataError(
+                    f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages"
+                )
     return held
 
 
@@ -195,5 +254,11 @@ def _definitions(connection: Connection) -> Mapping[str, Any]:
     if form == MessageDefinitionFormat.MSG:
         return get_types_from_msg(text, connection.msgtype)
     rule = "=" * 80 + "\n"
-    sections = [part.split("\n", 1)[1] for part in text.split(rule)[1:]] if text.startswith(f"{rule}IDL: ") else [text]
-    return {name: kind for section in sections for name, kind in get_types_from_idl(section).items()}
+    sections = (
+        [part.split("\n", 1)[1] for part in text.split(rule)[1:]]
+        if text.startswith(f"{rule}IDL: ")
+        else [text]
+    )
+    return {
+        name: kind for section in sections for name, kind in get_types_from_idl(section).items()
+    }

@@ -19,28 +19,38 @@ from vehest.sources.limited import Arrays
 LATEST = 1e11  # s
 
 
-def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[Arrays, dict[str, Any]]:
+def read_frames(
+    file: Path, wanted: Collection[Sequence[Any]] | None
+) -> tuple[Arrays, dict[str, Any]]:
     """Frames of a log in their order, without error frames and remote frames; raises `DataError` where there is none, or too many.
 
     Returns:
         ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length`` [bytes] and ``bus`` (number in
         ``buses`` of the summary) of each frame, and ``data``, the bytes of all.
     """
-    kept = None if wanted is None else {(int(identifier), bool(extended)) for identifier, extended in wanted}
+    kept = (
+        None
+        if wanted is None
+        else {(int(identifier), bool(extended)) for identifier, extended in wanted}
+    )
     times, identifiers, buses, data = array("d"), array("L"), array("L"), bytearray()
     flags = {name: bytearray() for name in ("extended", "fd", "fast", "length")}
     numbers: dict[Any, int] = {}
     count = 0
     with _opened(file) as reader:
         if isinstance(reader, BLFReader) and reader.file_size > file.stat().st_size:
-            raise DataError(f"'{file}' is truncated: it says that it is {reader.file_size} bytes long; fetch it again")
+            raise DataError(
+                f"'{file}' is truncated: it says that it is {reader.file_size} bytes long; fetch it again"
+            )
         for frame in reader:
             count += 1
             check_limit("samples", count, f"'{file}' holds {count} frames or more")
             if frame.is_error_frame or frame.is_remote_frame:
                 continue
             if not abs(frame.timestamp) < LATEST:
-                raise DataError(f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is damaged")
+                raise DataError(
+                    f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is damaged"
+                )
             if kept is not None and (frame.arbitration_id, frame.is_extended_id) not in kept:
                 continue
             times.append(frame.timestamp)
@@ -53,8 +63,15 @@ def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[A
             data += frame.data
     if not count:
         raise DataError(f"'{file}' holds no frame; is it a log of a bus?")
-    arrays = {name: np.frombuffer(values, np.uint8) for name, values in {**flags, "data": data}.items()}
-    return {"time": np.array(times), "identifier": np.array(identifiers), "bus": np.array(buses), **arrays}, {"buses": list(numbers)}
+    arrays = {
+        name: np.frombuffer(values, np.uint8) for name, values in {**flags, "data": data}.items()
+    }
+    return {
+        "time": np.array(times),
+        "identifier": np.array(identifiers),
+        "bus": np.array(buses),
+        **arrays,
+    }, {"buses": list(numbers)}
 
 
 def _opened(file: Path) -> Any:

@@ -26,13 +26,21 @@ from vehest.sources.limited import Arrays
 
 FINISHED, UNFINISHED = b"MDF     ", b"UnFinMF "
 EVALUATED = {
-    v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_FORMULA, v3.CONVERSION_TYPE_EXPO, v3.CONVERSION_TYPE_LOGH},
+    v2_v3_blocks.ChannelConversion: {
+        v3.CONVERSION_TYPE_FORMULA,
+        v3.CONVERSION_TYPE_EXPO,
+        v3.CONVERSION_TYPE_LOGH,
+    },
     v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_ALG},
 }
 """Conversions that refuse a file: formulas, and those of version 3 that readers compute in contradicting ways."""
 RANGES = {
     v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_TABX, v3.CONVERSION_TYPE_RTABX},
-    v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_RTAB, v4.CONVERSION_TYPE_TABX, v4.CONVERSION_TYPE_RTABX},
+    v4_blocks.ChannelConversion: {
+        v4.CONVERSION_TYPE_RTAB,
+        v4.CONVERSION_TYPE_TABX,
+        v4.CONVERSION_TYPE_RTABX,
+    },
 }
 """Conversions for which whole numbers differ from real ones: they belong to both ends of a range."""
 OPTIONS: Any = {"process_bus_logging": False}  # which would read databases that are attached
@@ -40,7 +48,9 @@ COMPARED = 10_000  # names that a misspelt one is compared with
 BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 
 
-def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) -> tuple[Arrays, dict[str, Any]]:
+def read(
+    file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None
+) -> tuple[Arrays, dict[str, Any]]:
     """Signals with the times of their groups; raises `DataError` for a formula, too much, or a wanted signal that cannot be read.
 
     ``wanted``: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal of numbers
@@ -51,33 +61,61 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
     with open(file, "rb") as stream:
         head = stream.read(64)
         if not head.startswith((FINISHED, UNFINISHED)):
-            raise DataError(f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?")
+            raise DataError(
+                f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?"
+            )
         stream.seek(0)
-        content = io.BytesIO(stream.read()) if head.startswith(UNFINISHED) else stream  # which asammdf completes in place
+        content = (
+            io.BytesIO(stream.read()) if head.startswith(UNFINISHED) else stream
+        )  # which asammdf completes in place
         try:
             measurement = asammdf.MDF(content, **OPTIONS)
         except Exception as error:
             reason = printable(" ".join(str(error).split())[:160]) or type(error).__name__
-            raise DataError(f"'{file}' cannot be read as MDF ({reason}); is it truncated or damaged?") from None
+            raise DataError(
+                f"'{file}' cannot be read as MDF ({reason}); is it truncated or damaged?"
+            ) from None
         _refuse_formulas(measurement, file)
-        places = _located(measurement, wanted, file) if wanted is not None else _numbered(measurement, file)
+        places = (
+            _located(measurement, wanted, file)
+            if wanted is not None
+            else _numbered(measurement, file)
+        )
         arrays: Arrays = {}
         skipped: list[str] | None = [] if wanted is None else None
         for group in dict.fromkeys(group for group, _ in places.values()):
             with _or_skip(skipped, file):
-                arrays |= _group_of(measurement, group, {key: index for key, (at, index) in places.items() if at == group}, file, skipped)
+                arrays |= _group_of(
+                    measurement,
+                    group,
+                    {key: index for key, (at, index) in places.items() if at == group},
+                    file,
+                    skipped,
+                )
         signals = {}
         for key, (group, index) in places.items():
             if key in arrays:
                 channel = measurement.groups[group].channels[index]
                 unit = str((channel.conversion and channel.conversion.unit) or channel.unit or "")
-                signals[key] = {"name": channel.name, "group": group, "title": _title(measurement, group), "unit": unit}
+                signals[key] = {
+                    "name": channel.name,
+                    "group": group,
+                    "title": _title(measurement, group),
+                    "unit": unit,
+                }
         start = measurement.header.start_time.isoformat()
-        return arrays, {"version": measurement.version, "start": start, "signals": signals, "skipped": skipped or []}
+        return arrays, {
+            "version": measurement.version,
+            "start": start,
+            "signals": signals,
+            "skipped": skipped or [],
+        }
 
 
 def with_signals(
-    file: Path, seconds: list[float], signals: list[tuple[str, list[float], str, str, dict[str, str]]]
+    file: Path,
+    seconds: list[float],
+    signals: list[tuple[str, list[float], str, str, dict[str, str]]],
 ) -> tuple[Arrays, dict[str, Any]]:
     """``content``: bytes of a measurement of version 4 with a group of signals more; raises `DataError` where it is of another version.
 
@@ -93,10 +131,14 @@ def with_signals(
         group = []
         for name, values, unit, comment, texts in signals:
             table: dict[str, object] = {
-                key: own for k, (code, text) in enumerate(texts.items()) for key, own in ((f"val_{k}", int(code)), (f"text_{k}", text))
+                key: own
+                for k, (code, text) in enumerate(texts.items())
+                for key, own in ((f"val_{k}", int(code)), (f"text_{k}", text))
             }
             samples = np.array(values, dtype=np.int32 if texts else np.float64)
-            group.append(asammdf.Signal(samples, np.array(seconds), unit, name, table or None, comment))
+            group.append(
+                asammdf.Signal(samples, np.array(seconds), unit, name, table or None, comment)
+            )
         measurement.append(group, acq_name="vehest", common_timebase=True)
         measurement.save(new)
         return {"content": np.frombuffer(new.getvalue(), dtype=np.uint8)}, {}
@@ -152,7 +194,10 @@ def _numbered(measurement: Any, file: Path) -> dict[str, tuple[int, int]]:
     places = [(channel.name, g, index) for g, index, channel in _channels(measurement)]
     check_limit("columns", len(places), f"'{file}' has {len(places)} signals")
     often = Counter(name for name, *_ in places)
-    return {(f"{name} (group {g})" if often[name] > 1 else name): (g, index) for name, g, index in places}
+    return {
+        (f"{name} (group {g})" if often[name] > 1 else name): (g, index)
+        for name, g, index in places
+    }
 
 
 def _channels(measurement: Any) -> Iterator[tuple[int, int, Any]]:
@@ -163,28 +208,51 @@ def _channels(measurement: Any) -> Iterator[tuple[int, int, Any]]:
                 yield g, index, channel
 
 
-def _located(measurement: Any, wanted: Mapping[str, tuple[str, int | str | None]], file: Path) -> dict[str, tuple[int, int]]:
+def _located(
+    measurement: Any, wanted: Mapping[str, tuple[str, int | str | None]], file: Path
+) -> dict[str, tuple[int, int]]:
     places: dict[str, list[tuple[int, int]]] = {}
     for g, index, channel in _channels(measurement):
-        for name in dict.fromkeys((channel.name, *(channel.display_names if measurement.version < "4" else ()))):
+        for name in dict.fromkeys(
+            (channel.name, *(channel.display_names if measurement.version < "4" else ()))
+        ):
             places.setdefault(name, []).append((g, index))
-    return {key: _located_one(measurement, places, name, group, file) for key, (name, group) in wanted.items()}
+    return {
+        key: _located_one(measurement, places, name, group, file)
+        for key, (name, group) in wanted.items()
+    }
 
 
 def _located_one(
-    measurement: Any, places: Mapping[str, list[tuple[int, int]]], name: str, group: int | str | None, file: Path
+    measurement: Any,
+    places: Mapping[str, list[tuple[int, int]]],
+    name: str,
+    group: int | str | None,
+    file: Path,
 ) -> tuple[int, int]:
     found = places.get(name, [])
     if not found:
-        raise DataError(f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in conf/dataset")
-    kept = [place for place in found if group is None or group in (place[0], _group_name(measurement, place[0]))]
+        raise DataError(
+            f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in conf/dataset"
+        )
+    kept = [
+        place
+        for place in found
+        if group is None or group in (place[0], _group_name(measurement, place[0]))
+    ]
     titles = list(dict.fromkeys(_title(measurement, g) for g, _ in kept or found))
     groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
     if not kept:
-        raise DataError(f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group")
+        raise DataError(
+            f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group"
+        )
     if len(kept) > 1:
-        advice = "say which by number or name with group: …" if len(titles) > 1 else "rename all but one"
-        raise DataError(f"'{file}': signal '{name}' stands {len(kept)} times, in group {groups}; {advice}")
+        advice = (
+            "say which by number or name with group: …" if len(titles) > 1 else "rename all but one"
+        )
+        raise DataError(
+            f"'{file}': signal '{name}' stands {len(kept)} times, in group {groups}; {advice}"
+        )
     return kept[0]
 
 
@@ -192,41 +260,62 @@ def _near(places: Mapping[str, object], name: str) -> str:
     names = {known: known.lower() for known in list(places)[:COMPARED] if len(known) < 200}
     close = difflib.get_close_matches(name.lower(), list(names.values()), n=3, cutoff=0.6)
     if close:
-        return "near it: " + ", ".join(_shown(known) for known, lower in names.items() if lower in close)
+        return "near it: " + ", ".join(
+            _shown(known) for known, lower in names.items() if lower in close
+        )
     if any(known.startswith(BUS_FRAMES) for known in names):
         return "it holds undecoded frames of a bus: decode them with their description, for example by asammdf's extract_bus_logging"
     return f"it has {len(places)} signals"
 
 
-def _group_of(measurement: Any, group: int, own: Mapping[str, int], file: Path, skipped: list[str] | None) -> Arrays:
+def _group_of(
+    measurement: Any, group: int, own: Mapping[str, int], file: Path, skipped: list[str] | None
+) -> Arrays:
     """Times of a group and its signals; a signal that cannot be read is an error, or a line in ``skipped``."""
     title = _title(measurement, group)
     described = measurement.groups[group]
     first = _shown(described.channels[next(iter(own.values()))].name)
     clock = measurement.masters_db.get(group)
-    if clock is None or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME:
-        raise DataError(f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no master channel of time")
+    if (
+        clock is None
+        or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME
+    ):
+        raise DataError(
+            f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no master channel of time"
+        )
     count = described.channel_group.cycles_nr
     check_limit("samples", count, f"'{file}': group {title} says that it holds {count} samples")
-    record = described.channel_group.samples_byte_nr + (0 if described.uses_ld else _invalidation_bytes(described))
-    present = sum(min(block.original_size, block.block_limit or block.original_size) for block in described.get_data_blocks())
+    record = described.channel_group.samples_byte_nr + (
+        0 if described.uses_ld else _invalidation_bytes(described)
+    )
+    present = sum(
+        min(block.original_size, block.block_limit or block.original_size)
+        for block in described.get_data_blocks()
+    )
     if present < count * record:
         held = f"holds {present // record} samples, its header says {count}"
-        raise DataError(f"'{file}': signal '{first}' of group {title} {held}; the file is truncated or damaged")
+        raise DataError(
+            f"'{file}': signal '{first}' of group {title} {held}; the file is truncated or damaged"
+        )
     read: dict[str, int] = {}
     where = {
-        key: f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}" for key, index in {"": clock, **own}.items()
+        key: f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}"
+        for key, index in {"": clock, **own}.items()
     }
     for key, index in {"": clock, **own}.items():
         with _or_skip(skipped if key else None, file):
             _require_number(measurement, group, index, where[key])
             read[key] = index
     arrays = {}
-    found = measurement.select([(None, group, index) for index in read.values()], raw=True, copy_master=False)
+    found = measurement.select(
+        [(None, group, index) for index in read.values()], raw=True, copy_master=False
+    )
     for (key, index), raw in zip(read.items(), found, strict=True):
         with _or_skip(skipped if key else None, file):
             conversion = described.channels[index].conversion
-            arrays[key or f"stamps {group}"] = _physical(raw.samples, raw.invalidation_bits, conversion, where[key])
+            arrays[key or f"stamps {group}"] = _physical(
+                raw.samples, raw.invalidation_bits, conversion, where[key]
+            )
     return arrays
 
 
@@ -234,14 +323,20 @@ def _require_number(measurement: Any, group: int, index: int, where: str) -> Non
     described = measurement.groups[group]
     channel, dependencies = described.channels[index], described.channel_dependencies[index]
     if dependencies:
-        raise DataError(f"{where} holds an array or structure; numbers are needed: name another signal")
+        raise DataError(
+            f"{where} holds an array or structure; numbers are needed: name another signal"
+        )
     if channel.conversion_addr and channel.conversion is None:  # asammdf would give the raw numbers
         raise DataError(f"{where} has a conversion that cannot be read; the file is damaged")
     if measurement.version >= "4":
         virtual = channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER)
         end = 0 if virtual else 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
     else:
-        end = 8 * getattr(channel, "additional_byte_offset", 0) + channel.start_offset + channel.bit_count
+        end = (
+            8 * getattr(channel, "additional_byte_offset", 0)
+            + channel.start_offset
+            + channel.bit_count
+        )
     marked = getattr(channel, "flags", 0) & v4.FLAG_CN_INVALIDATION_PRESENT
     outside = marked and channel.pos_invalidation_bit >= 8 * _invalidation_bytes(described)
     if outside or end > 8 * described.channel_group.samples_byte_nr:
@@ -263,10 +358,21 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> Flo
         found = found.astype(np.float64)
     if conversion is not None and len(found):
         with np.errstate(all="ignore"):
-            ranges = type(conversion) is v4_blocks.ChannelConversion and conversion.conversion_type == v4.CONVERSION_TYPE_RTAB
-            found = _of_ranges(found, conversion) if ranges else conversion.convert(found, as_object=True)
-    if found.dtype.kind in "SU" or (found.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in found)):
-        raise DataError(f"{where} holds text; numbers are needed: name another signal, or one without a conversion to text")
+            ranges = (
+                type(conversion) is v4_blocks.ChannelConversion
+                and conversion.conversion_type == v4.CONVERSION_TYPE_RTAB
+            )
+            found = (
+                _of_ranges(found, conversion)
+                if ranges
+                else conversion.convert(found, as_object=True)
+            )
+    if found.dtype.kind in "SU" or (
+        found.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in found)
+    ):
+        raise DataError(
+            f"{where} holds text; numbers are needed: name another signal, or one without a conversion to text"
+        )
     values = np.full(len(raw), np.nan)
     values[valid] = found
     return values
@@ -275,10 +381,17 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> Flo
 def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
     """Values of ranges: whole numbers belong to both ends of one, which asammdf gets wrong, real numbers not to the upper."""
     count = (conversion.val_param_nr - 1) // 3
-    rows = np.array(sorted((conversion[f"lower_{k}"], conversion[f"upper_{k}"], conversion[f"phys_{k}"]) for k in range(count)))
+    rows = np.array(
+        sorted(
+            (conversion[f"lower_{k}"], conversion[f"upper_{k}"], conversion[f"phys_{k}"])
+            for k in range(count)
+        )
+    )
     lower, upper, physical = rows.reshape(-1, 3).T
     at = np.maximum(np.searchsorted(lower, raw, side="right") - 1, 0)
-    inside = (lower[at] <= raw) & ((raw < upper[at]) if raw.dtype.kind == "f" else (raw <= upper[at]))
+    inside = (lower[at] <= raw) & (
+        (raw < upper[at]) if raw.dtype.kind == "f" else (raw <= upper[at])
+    )
     return np.where(inside, physical[at], conversion.default)
 
 

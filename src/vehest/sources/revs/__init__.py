@@ -65,8 +65,14 @@ class RevsSource(FileSource):
         if self.options.recordings is not None:
             return [name.removesuffix(suffix) for name in self.options.recordings]
         pattern = f"{self.options.files or '*'}{suffix}"
-        found = [path for path in sorted(self._folder().glob(pattern)) if path.is_dir() == (not suffix)]
-        names = [path.name.removesuffix(suffix) for path in found if path.name != self.options.vehicle_parameters]
+        found = [
+            path for path in sorted(self._folder().glob(pattern)) if path.is_dir() == (not suffix)
+        ]
+        names = [
+            path.name.removesuffix(suffix)
+            for path in found
+            if path.name != self.options.vehicle_parameters
+        ]
         if not names:
             raise MissingError(f"{self.where}: nothing in '{self._folder()}' matches '{pattern}'")
         return names
@@ -74,7 +80,11 @@ class RevsSource(FileSource):
     def inputs(self) -> dict[str, str | Path]:
         """Every file that is read."""
         folder = self._folder()
-        files = {file.relative_to(folder).as_posix(): file for name in self.ids() for file in self._files_of(name).values()}
+        files = {
+            file.relative_to(folder).as_posix(): file
+            for name in self.ids()
+            for file in self._files_of(name).values()
+        }
         parameters = self._parameters_file()
         return dict(files) if parameters is None else {**files, parameters.name: parameters}
 
@@ -84,15 +94,26 @@ class RevsSource(FileSource):
         if not suffix or self.options.recordings is None:
             return []
         parameters = self.options.vehicle_parameters
-        return [f"{name}{suffix}" for name in self.ids()] + ([str(parameters)] if parameters else [])
+        return [f"{name}{suffix}" for name in self.ids()] + (
+            [str(parameters)] if parameters else []
+        )
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
         files, path, options = self._files_of(recording_id), self._path(recording_id), self.options
-        own, origin = self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
-        clock = uniform_clock(self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock)
-        values = {name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names}
-        channels = {name: column.to_si(values[column.column], channel(name).unit) for name, column in self.columns.items()}
+        own, origin = (
+            self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
+        )
+        clock = uniform_clock(
+            self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock
+        )
+        values = {
+            name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names
+        }
+        channels = {
+            name: column.to_si(values[column.column], channel(name).unit)
+            for name, column in self.columns.items()
+        }
         provenance = {"layout": options.layout, **origin}
         parameters = self._parameters_file()
         if parameters is not None:
@@ -101,20 +122,29 @@ class RevsSource(FileSource):
 
     def _read_csv(self, file: Path) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         columns = list(dict.fromkeys([self.time.column, *self.column_names]))
-        values, units, about = read_csv(file, columns, self.gappy_columns, self.options.preamble_lines)
+        values, units, about = read_csv(
+            file, columns, self.gappy_columns, self.options.preamble_lines
+        )
         if self.options.units_row == "check":
             for name, column in self.columns.items():
                 where = f"'{file}': column '{column.column}'"
-                require_unit(units[column.column], column, channel(name).unit, where, "set units_row: ignore")
+                require_unit(
+                    units[column.column], column, channel(name).unit, where, "set units_row: ignore"
+                )
         return values, about
 
     def _read_text(self, files: Mapping[str, Path]) -> dict[str, FloatArray]:
         """Columns of text files with a number a line."""
-        values = {name: read_columns(file, ["number"], TextLayout(names=("number",)))["number"] for name, file in files.items()}
+        values = {
+            name: read_columns(file, ["number"], TextLayout(names=("number",)))["number"]
+            for name, file in files.items()
+        }
         n_stamps = len(values[self.time.column])
         for name, samples in values.items():
             if len(samples) != n_stamps:
-                raise DataError(f"'{files[name]}' holds {len(samples)} samples, the time file {n_stamps}; the copy is incomplete")
+                raise DataError(
+                    f"'{files[name]}' holds {len(samples)} samples, the time file {n_stamps}; the copy is incomplete"
+                )
         return values
 
     def _folder(self) -> Path:
@@ -129,7 +159,10 @@ class RevsSource(FileSource):
         files = {path.name: path}
         if self.options.layout == "text":
             existing_folder(path, self.name)
-            files = {column: path / f"{column}.txt" for column in sorted({self.time.column, *self.column_names})}
+            files = {
+                column: path / f"{column}.txt"
+                for column in sorted({self.time.column, *self.column_names})
+            }
         require_files(list(files.values()), self.name)
         return files
 

@@ -34,24 +34,39 @@ def read_csv(
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
     lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
     names, units = (
-        [cell.strip() for cell in next(csv.reader(line.splitlines()), [])] for line in lines[preamble_lines : preamble_lines + 2]
+        [cell.strip() for cell in next(csv.reader(line.splitlines()), [])]
+        for line in lines[preamble_lines : preamble_lines + 2]
     )
     if time not in names:
         problem = f"line {preamble_lines + 1} should name the columns and has no '{time}' (it has {listed(names)})"
-        raise DataError(f"'{file}': {problem}; correct preamble_lines, or is it no official Revs file?")
+        raise DataError(
+            f"'{file}': {problem}; correct preamble_lines, or is it no official Revs file?"
+        )
     require_columns(file, names, columns)
     if len(units) != len(names) or any(_number(unit) is not None for unit in units):
-        raise DataError(f"'{file}': line {preamble_lines + 2} should hold units of the {len(names)} columns; was it removed?")
-    values = read_columns(file, columns, TextLayout(skip_rows=preamble_lines + 2, names=tuple(names)))
-    starts = {name: int(np.argmin(np.isnan(values[name]))) for name in columns[1:] if name not in gappy}
+        raise DataError(
+            f"'{file}': line {preamble_lines + 2} should hold units of the {len(names)} columns; was it removed?"
+        )
+    values = read_columns(
+        file, columns, TextLayout(skip_rows=preamble_lines + 2, names=tuple(names))
+    )
+    starts = {
+        name: int(np.argmin(np.isnan(values[name]))) for name in columns[1:] if name not in gappy
+    }
     slowest = max(starts, key=lambda name: starts[name], default=time)
     first = starts.get(slowest, 0)
     if first > LONGEST_HEAD * len(values[time]):
         what = f"column '{slowest}' is blank until {values[time][first]:.12g} s, more than {100 * LONGEST_HEAD:g} % of the rows"
-        raise DataError(f"'{file}': {what}; leave its channel out of the map in conf/dataset, or declare it in 'gappy'")
+        raise DataError(
+            f"'{file}': {what}; leave its channel out of the map in conf/dataset, or declare it in 'gappy'"
+        )
     preamble = [text for line in lines[:preamble_lines] if (text := line.rstrip(",").strip())]
     about = {"file": file.name, "preamble": preamble, "rows_dropped_at_the_head": first}
-    return {name: samples[first:] for name, samples in values.items()}, dict(zip(names, units, strict=True)), about
+    return (
+        {name: samples[first:] for name, samples in values.items()},
+        dict(zip(names, units, strict=True)),
+        about,
+    )
 
 
 def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
@@ -62,18 +77,33 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
     """
     text = _decoded(read_head(file))
     try:
-        rows = [row for line in csv.reader(text.splitlines(), strict=True) if any(row := [cell.strip() for cell in line])]
+        rows = [
+            row
+            for line in csv.reader(text.splitlines(), strict=True)
+            if any(row := [cell.strip() for cell in line])
+        ]
     except csv.Error as error:
-        raise DataError(f"'{file}' cannot be read as a table ({error}); the copy is damaged") from None
+        raise DataError(
+            f"'{file}' cannot be read as a table ({error}); the copy is damaged"
+        ) from None
     if len(rows) < 3 or "\0" in text:
-        raise DataError(f"'{file}' is no table of vehicle parameters: a line of names, one of units, and values below")
+        raise DataError(
+            f"'{file}' is no table of vehicle parameters: a line of names, one of units, and values below"
+        )
     found: dict[str, dict[str, Any]] = {}
     for name, unit, *values in filter(any, zip_longest(*rows, fillvalue="")):
         if not name or name in found:
-            raise DataError(f"'{file}': line 1 should name every column once, column {len(found) + 1} is called '{printable(name[:40])}'")
+            raise DataError(
+                f"'{file}': line 1 should name every column once, column {len(found) + 1} is called '{printable(name[:40])}'"
+            )
         if _number(unit) is not None:
-            raise DataError(f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?")
-        found[name] = {"value": _value(values, f"'{file}': parameter '{printable(name[:40])}'"), "unit": unit}
+            raise DataError(
+                f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?"
+            )
+        found[name] = {
+            "value": _value(values, f"'{file}': parameter '{printable(name[:40])}'"),
+            "unit": unit,
+        }
     return found
 
 
@@ -85,7 +115,9 @@ def _value(cells: list[str], where: str) -> Any:
     numbers = [_number(cell) for cell in cells]
     for line, (cell, found) in enumerate(zip(cells, numbers, strict=True), start=3):
         if found is None:
-            raise DataError(f"{where} holds '{printable(cell[:40])}' in line {line}; numbers are needed")
+            raise DataError(
+                f"{where} holds '{printable(cell[:40])}' in line {line}; numbers are needed"
+            )
     return numbers or None
 
 

@@ -17,7 +17,15 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.clocks import Clock, at_ticks, common_span, require_clock, require_samples, ticks_within, uniform_times
+from vehest.sources.clocks import (
+    Clock,
+    at_ticks,
+    common_span,
+    require_clock,
+    require_samples,
+    ticks_within,
+    uniform_times,
+)
 from vehest.sources.columns import columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.limited import Reading
@@ -25,7 +33,9 @@ from vehest.sources.pose import ground_plane
 from vehest.sources.rosbag.declarations import Pose, RosbagOptions, Topic
 from vehest.sources.rosbag.topics import STORAGES, bag_files, read_bag
 
-POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
+POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(
+    f"orientation.{axis}" for axis in "xyzw"
+)
 MOST_WANDERING = 0.4  # of the grid's interval
 
 
@@ -52,35 +62,59 @@ class RosbagSource(FileSource):
             self._require_pattern()
         self.channels = self.options.channels or {}
         entries = {
-            name: {"column": one.field, "unit": one.unit, "sign": one.sign, "factor": one.factor} for name, one in self.channels.items()
+            name: {"column": one.field, "unit": one.unit, "sign": one.sign, "factor": one.factor}
+            for name, one in self.channels.items()
         }
         self.columns = columns_from_config(entries, self.name)
         wanted = [(one.topic, one.field) for one in self.channels.values()]
         if pose := self.options.pose:
             wanted += [(pose.topic, f"{pose.field}.{part}") for part in POSE_FIELDS]
         declared = self.options.topics or {}
-        self.topics = {name: declared[name] for name in declared if any(topic == name for topic, _ in wanted)}
-        self.fields = {name: list(dict.fromkeys(field for topic, field in wanted if topic == name)) for name in self.topics}
+        self.topics = {
+            name: declared[name] for name in declared if any(topic == name for topic, _ in wanted)
+        }
+        self.fields = {
+            name: list(dict.fromkeys(field for topic, field in wanted if topic == name))
+            for name in self.topics
+        }
 
     def inputs(self) -> dict[str, str | Path]:
         """Archives and files of bags."""
-        return {file.name if file == bag else f"{bag.name}/{file.name}": file for bag in self._files() for file in bag_files(bag)}
+        return {
+            file.name if file == bag else f"{bag.name}/{file.name}": file
+            for bag in self._files()
+            for file in bag_files(bag)
+        }
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a bag, a file or a folder; raises as `read_bag` does, and `DataError` for topics of no recording."""
-        wanted = [[topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()]
+        wanted = [
+            [topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()
+        ]
         most_bytes, layouts = int(1e9 * self.options.unpacked_limit), self.options.messages or {}
         reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)
-        series = {name: self._series(topic, self.fields[name], reading, file) for name, topic in self.topics.items()}
-        spans = {f"topic '{one.topic.topic}'": (float(one.times[0]), float(one.times[-1])) for one in series.values()}
+        series = {
+            name: self._series(topic, self.fields[name], reading, file)
+            for name, topic in self.topics.items()
+        }
+        spans = {
+            f"topic '{one.topic.topic}'": (float(one.times[0]), float(one.times[-1]))
+            for one in series.values()
+        }
         grid = ticks_within(*common_span(spans, f"'{file}'"), self.options.rate_hz, f"'{file}'")
         channels = {}
         for name, one in self.channels.items():
             held, values = series[one.topic], series[one.topic].fields[one.field]
-            values = self.columns[name].to_si(values - one.offset if one.offset else values, channel(name).unit)
-            channels[name] = at_ticks(values, held.times, grid, hold=held.topic.interpolation == "hold", slack=1e-9)
+            values = self.columns[name].to_si(
+                values - one.offset if one.offset else values, channel(name).unit
+            )
+            channels[name] = at_ticks(
+                values, held.times, grid, hold=held.topic.interpolation == "hold", slack=1e-9
+            )
         if self.options.pose is not None:
-            channels |= self._reference(self.options.pose, series[self.options.pose.topic], grid, file)
+            channels |= self._reference(
+                self.options.pose, series[self.options.pose.topic], grid, file
+            )
         clock = Clock(float(grid[0]), self.options.rate_hz, len(grid))
         topics = {one.topic.topic: one.about for one in series.values()}
         provenance = {"file": file.name, "bag_start_ns": reading.summary["start"], "topics": topics}
@@ -90,7 +124,11 @@ class RosbagSource(FileSource):
         """Bags that a pattern matches, or those that are named."""
         files = self.options.files
         if isinstance(files, str):
-            return sorted(file for file in folder.glob(files) if file.is_dir() or file.suffix.lower() in {".zip", *STORAGES})
+            return sorted(
+                file
+                for file in folder.glob(files)
+                if file.is_dir() or file.suffix.lower() in {".zip", *STORAGES}
+            )
         bags = [folder / name for name in files]
         for bag in bags:
             if not bag.exists():
@@ -103,42 +141,69 @@ class RosbagSource(FileSource):
     def _series(self, topic: Topic, fields: Iterable[str], reading: Reading, path: Path) -> Series:
         """One topic's samples with their times, in seconds after the bag's first message."""
         where, name = f"'{path}': topic '{topic.topic}'", topic.topic
-        received, stamped = reading.arrays[f"{name}@received"], reading.arrays.get(f"{name}@stamped")
+        received, stamped = (
+            reading.arrays[f"{name}@received"],
+            reading.arrays.get(f"{name}@stamped"),
+        )
         if topic.stamps == "header" and stamped is None:
-            raise ConfigurationError(f"{where}: messages of type '{topic.type}' have no header; set stamps: received")
+            raise ConfigurationError(
+                f"{where}: messages of type '{topic.type}' have no header; set stamps: received"
+            )
         nanoseconds = received if stamped is None or topic.stamps == "received" else stamped
         stamps = (nanoseconds - reading.summary["start"]) * 1e-9
         start = -math.inf if self.options.start is None else self.options.start
         stop = math.inf if self.options.stop is None else self.options.stop
         kept = (stamps >= start) & (stamps < stop)
         if kept.sum() < 2:
-            raise DataError(f"{where}: fewer than two messages between start {start:g} s and stop {stop:g} s after the bag's first message")
+            raise DataError(
+                f"{where}: fewer than two messages between start {start:g} s and stop {stop:g} s after the bag's first message"
+            )
         times = stamps = stamps[kept]
         values = {field: reading.arrays[f"{name}.{field}"][kept] for field in fields}
         for field, samples in values.items():
             require_samples(samples, stamps, topic.max_gap, f"{where}: field '{field}'")
         rate_hz = None
         if topic.clock == "uniform":
-            times, rate_hz, jitter = uniform_times(stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.options.rate_hz)
+            times, rate_hz, jitter = uniform_times(
+                stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.options.rate_hz
+            )
         else:
-            require_clock(stamps, where, "repair or cut the range out, or take clock: uniform if samples come in batches")
+            require_clock(
+                stamps,
+                where,
+                "repair or cut the range out, or take clock: uniform if samples come in batches",
+            )
             jitter = float(np.diff(stamps).std())
         if topic.average and rate_hz is not None:
             kernel = _averaging(round(topic.average * rate_hz))
             lost = len(kernel) // 2
             if len(times) <= 2 * lost:
-                raise DataError(f"{where}: {len(times)} samples are fewer than its moving average needs")
+                raise DataError(
+                    f"{where}: {len(times)} samples are fewer than its moving average needs"
+                )
             times = times[lost : len(times) - lost]
-            values = {field: np.convolve(samples, kernel, mode="valid") for field, samples in values.items()}
-        about: dict[str, Any] = {"messages": len(times), "stamps": topic.stamps, "clock": topic.clock, "jitter_ms": round(1e3 * jitter, 3)}
+            values = {
+                field: np.convolve(samples, kernel, mode="valid")
+                for field, samples in values.items()
+            }
+        about: dict[str, Any] = {
+            "messages": len(times),
+            "stamps": topic.stamps,
+            "clock": topic.clock,
+            "jitter_ms": round(1e3 * jitter, 3),
+        }
         if rate_hz is not None:
             about["rate_hz"] = round(rate_hz, 5)
         if stamped is not None:
             late = (received - stamped) * 1e-9
-            about["latency_ms"] = [round(1e3 * float(one), 3) for one in (np.median(late), late.max())]
+            about["latency_ms"] = [
+                round(1e3 * float(one), 3) for one in (np.median(late), late.max())
+            ]
         return Series(topic, times - topic.delay, rate_hz, values, about)
 
-    def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
+    def _reference(
+        self, pose: Pose, series: Series, grid: FloatArray, path: Path
+    ) -> dict[str, FloatArray]:
         where = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
         plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, where)

@@ -18,18 +18,26 @@ class Topic:
     topic: str  # its name in the bag
     type: str  # of its messages
     stamps: Literal["header", "received"] = "header"  # of the message or of the bag
-    clock: Literal["stamps", "uniform"] = "stamps"  # the stamps themselves, or the even clock behind them
+    clock: Literal["stamps", "uniform"] = (
+        "stamps"  # the stamps themselves, or the even clock behind them
+    )
     rate_hz: Positive | None = None  # nominal rate of a uniform clock [Hz]
     max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
     delay: float = 0.0  # how much later than the sample its time says [s]
-    interpolation: Literal["linear", "hold"] = "linear"  # hold: for commands that stand until the next one
-    average: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0  # width of a centred moving average before interpolation [s]; 0 for none
+    interpolation: Literal["linear", "hold"] = (
+        "linear"  # hold: for commands that stand until the next one
+    )
+    average: Annotated[float, Field(ge=0.0, le=10.0)] = (
+        0.0  # width of a centred moving average before interpolation [s]; 0 for none
+    )
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:
             raise ValueError("a uniform clock needs the sensor's nominal rate_hz")
         if self.average and (self.clock != "uniform" or self.average * (self.rate_hz or 0.0) < 1.5):
-            raise ValueError("a moving average needs clock: uniform and a width of two samples or more")
+            raise ValueError(
+                "a moving average needs clock: uniform and a width of two samples or more"
+            )
 
 
 @dataclass(frozen=True)
@@ -76,12 +84,21 @@ class RosbagOptions:
             raise ValueError(f"topics lists '{doubled[0]}' twice; name its channels under one")
         if self.start is not None and self.stop is not None and not self.stop > self.start:
             raise ValueError(f"stop must be above start, {self.start:g}, not {self.stop}")
-        for topic in [*(declared.topic for declared in channels.values()), *([self.pose.topic] if self.pose else [])]:
+        for topic in [
+            *(declared.topic for declared in channels.values()),
+            *([self.pose.topic] if self.pose else []),
+        ]:
             if topic not in topics:
-                raise ValueError(f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}")
+                raise ValueError(
+                    f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}"
+                )
         if self.pose and topics[self.pose.topic].average:
-            raise ValueError(f"orientations cannot be averaged; leave average out of topic '{self.pose.topic}'")
+            raise ValueError(
+                f"orientations cannot be averaged; leave average out of topic '{self.pose.topic}'"
+            )
         if doubled := sorted(set(channels) & set(self.pose.channels if self.pose else ())):
-            raise ValueError(f"channel '{doubled[0]}' comes both from channels and from pose; leave one out")
+            raise ValueError(
+                f"channel '{doubled[0]}' comes both from channels and from pose; leave one out"
+            )
         if not channels and not self.pose:
             raise ValueError("neither channels nor a pose is declared")

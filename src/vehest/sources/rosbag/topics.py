@@ -42,12 +42,20 @@ def bag_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [regular_file(path)]
     try:
-        files = sorted(file for file in path.iterdir() if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED))
+        files = sorted(
+            file
+            for file in path.iterdir()
+            if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED)
+        )
     except OSError as error:
-        raise MissingError(f"cannot read '{path}' ({error.strerror}); check its permissions") from None
+        raise MissingError(
+            f"cannot read '{path}' ({error.strerror}); check its permissions"
+        ) from None
     if not files:
         found = f"neither {METADATA} nor a file ending in {' or '.join(STORAGES)}"
-        raise MissingError(f"'{path}' holds no bag: {found}; of other logs name the files, such as {path / '*.csv'}")
+        raise MissingError(
+            f"'{path}' holds no bag: {found}; of other logs name the files, such as {path / '*.csv'}"
+        )
     return files
 
 
@@ -60,11 +68,15 @@ def _unpacked_bag(path: Path, most_bytes: int) -> Iterator[Path]:
             folder = stack.enter_context(unpacked(path, most_bytes=most_bytes))
             bags = [file.parent for file in folder.rglob(METADATA)]
             if len(bags) != 1:
-                raise DataError(f"'{path}' holds {len(bags) or 'no'} bags (folders with a {METADATA}); one is needed")
+                raise DataError(
+                    f"'{path}' holds {len(bags) or 'no'} bags (folders with a {METADATA}); one is needed"
+                )
             bag = bags[0]
         if bag.is_dir():
             if not (bag / METADATA).is_file():
-                raise DataError(f"'{path}' has no {METADATA}, without which a folder is no bag; make one with 'ros2 bag reindex'")
+                raise DataError(
+                    f"'{path}' has no {METADATA}, without which a folder is no bag; make one with 'ros2 bag reindex'"
+                )
             if packed := sorted(bag.glob(f"*{PACKED}")):
                 folder = stack.enter_context(temporary_folder(path))
                 _decompress(path, packed, folder, most_bytes)
@@ -87,9 +99,13 @@ def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: in
                 while block := stream.read(1 << 20):
                     left -= len(block)
                     if left < 0:
-                        raise DataError(f"'{path}' would unpack to more than the limit of {most_bytes / 1e9:.3g} GB; raise unpacked_limit")
+                        raise DataError(
+                            f"'{path}' would unpack to more than the limit of {most_bytes / 1e9:.3g} GB; raise unpacked_limit"
+                        )
                     plain.write(block)
         except (zstd.ZstdError, EOFError) as error:
-            raise DataError(f"'{path}': '{file.name}' is truncated or damaged ({first_line(error)}); fetch it again") from None
+            raise DataError(
+                f"'{path}': '{file.name}' is truncated or damaged ({first_line(error)}); fetch it again"
+            ) from None
         except OSError as error:
             raise writing_error(folder, error) from None

@@ -33,7 +33,10 @@ UNITS = {  # of ROS's own types, REP 103
     "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
     "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
     "geometry_msgs/msg/TwistStamped": {"twist.linear": "m/s", "twist.angular": "rad/s"},
-    "geometry_msgs/msg/TwistWithCovarianceStamped": {"twist.twist.linear": "m/s", "twist.twist.angular": "rad/s"},
+    "geometry_msgs/msg/TwistWithCovarianceStamped": {
+        "twist.twist.linear": "m/s",
+        "twist.twist.angular": "rad/s",
+    },
     "nav_msgs/msg/Odometry": {"twist.twist.linear": "m/s", "twist.twist.angular": "rad/s"},
     "geometry_msgs/msg/AccelStamped": {"accel.linear": "m/s²", "accel.angular": "rad/s²"},
 }
@@ -46,13 +49,25 @@ def survey(path: Path) -> Log:
     require_no_spreadsheet(path)
     log = _survey(path)
     for run in log.runs:
-        if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
+        if (
+            log.seconds is not None
+            and run.stop - run.start > 1
+            and (fault := span_fault(log.seconds[run]))
+        ):
             raise DataError(f"'{path}': {fault}")
-    faults = {one.name: clock_fault(one.stamps, may_repeat=True) for one in log.columns if one.stamps is not None}
+    faults = {
+        one.name: clock_fault(one.stamps, may_repeat=True)
+        for one in log.columns
+        if one.stamps is not None
+    }
     skipped = log.skipped + tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
-    log = replace(log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=skipped)
+    log = replace(
+        log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=skipped
+    )
     if not log.columns:
-        raise DataError(f"'{path}' holds no column of numbers ({'; '.join(skipped[:3]) or 'it is empty'})")
+        raise DataError(
+            f"'{path}' holds no column of numbers ({'; '.join(skipped[:3]) or 'it is empty'})"
+        )
     return log
 
 
@@ -60,11 +75,17 @@ def _survey(path: Path) -> Log:
     ending = path.suffix.lower()
     if ending == ".mat":
         table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
-        raise DataError(f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}")
+        raise DataError(
+            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}"
+        )
     if ending in CAN:
-        raise DataError(f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare them (docs/sources/can.md)")
+        raise DataError(
+            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare them (docs/sources/can.md)"
+        )
     if ending == ".bag":
-        raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
+        raise DataError(
+            f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'"
+        )
     if path.is_dir() or ending in BAGS:
         return _survey_bag(path)
     if path.stat().st_size == 0:
@@ -74,7 +95,9 @@ def _survey(path: Path) -> Log:
     if ending == ".vbo":
         return _survey_vbo(path)
     if is_stored_recording(path):
-        raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
+        raise DataError(
+            f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'"
+        )
     return survey_table(path)
 
 
@@ -82,14 +105,25 @@ def _survey_bag(path: Path) -> Log:
     """Numbers in messages of ROS's own types, each field with the times of its messages."""
     reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
     arrays, topics, columns = reading.arrays, reading.summary["topics"], []
-    times = {name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9 for name, *_ in topics}
+    times = {
+        name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
+        for name, *_ in topics
+    }
     start = min((own[0] for own in times.values() if len(own) > 1), default=0.0)
     for topic, kind, fields in topics:
         clock = "header" if f"{topic}@stamped" in arrays else "received"
         for field in fields if len(times[topic]) > 1 else ():
             unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
             place = {"topic": topic, "type": kind, "stamps": clock, "field": field}
-            columns.append(RawColumn(f"{topic} {field}", unit, arrays[f"{topic}.{field}"], place, times[topic] - start))
+            columns.append(
+                RawColumn(
+                    f"{topic} {field}",
+                    unit,
+                    arrays[f"{topic}.{field}"],
+                    place,
+                    times[topic] - start,
+                )
+            )
     return Log(path, "rosbag", tuple(columns), skipped=tuple(reading.summary["skipped"]))
 
 
@@ -99,7 +133,9 @@ def _survey_mdf(file: Path) -> Log:
     columns = []
     for key, signal in signals.items():
         place = about["signals"][key]
-        entry = {"column": place["name"]} | ({} if key == place["name"] else {"group": place["group"]})
+        entry = {"column": place["name"]} | (
+            {} if key == place["name"] else {"group": place["group"]}
+        )
         columns.append(RawColumn(key, signal.unit, signal.values, entry, signal.stamps))
     return Log(file, "mdf", tuple(columns), skipped=tuple(skipped))
 
@@ -112,13 +148,20 @@ def _survey_vbo(file: Path) -> Log:
         require_slip_offsets(log, "Slip_COG, Slip_FL …")
         wanted = log.columns
     except DataError as error:
-        wanted = {name: samples for name, samples in log.columns.items() if not SLIP_AT_A_POINT.fullmatch(name)}
+        wanted = {
+            name: samples
+            for name, samples in log.columns.items()
+            if not SLIP_AT_A_POINT.fullmatch(name)
+        }
         skipped = (str(error),)
     devices: dict[str, Literal["car", "reference"]] = {}
     if any("CAN" in module for module in log.modules.values()):
-        devices = {name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in wanted}
+        devices = {
+            name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in wanted
+        }
     columns = tuple(
-        RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, "")) for name, samples in wanted.items()
+        RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, ""))
+        for name, samples in wanted.items()
     )
     clock, seconds = Stamps("time", "s", "clock time of the format"), log.seconds - log.seconds[0]
     runs, options = between_pauses(seconds, float(np.median(np.diff(seconds))))

@@ -17,7 +17,9 @@ from vehest.sources.table_rows import stretches, timed_runs
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
-COUNTER = re.compile(r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$")
+COUNTER = re.compile(
+    r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$"
+)
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SPELLINGS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
@@ -43,7 +45,10 @@ def find_clock(
     """
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
-        unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
+        unit, named = (
+            SPELLINGS.get(units.get(name, "").strip().lower(), ""),
+            bool(NAMED.match(plain_name(name))),
+        )
         own = _step(values, named=named)
         counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
@@ -69,7 +74,11 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
     steps, longest = np.diff(seconds), float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
     runs, pauses = stretches(steps < 0, len(seconds)), steps > longest
     stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
-    cut = timed_runs(seconds, longest, restarts=True) if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray else {}
+    cut = (
+        timed_runs(seconds, longest, restarts=True)
+        if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray
+        else {}
+    )
     return ([*cut.values()], {"max_gap": longest}) if cut else (runs, {})
 
 
@@ -85,27 +94,43 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
         return None
     steps = np.diff(values)
     grown = steps[steps > 0]
-    if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
+    if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(
+        steps
+    ):  # stamps of too coarse a resolution repeat
         return None
     step = float(np.median(steps)) or float(grown.sum() / len(steps))
-    grows = np.mean(steps > 0) >= GROWING if named else np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR
+    grows = (
+        np.mean(steps > 0) >= GROWING
+        if named
+        else np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR
+    )
     return step if step > 0 and grows else None
 
 
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     """A column of time in the unit in which a step makes a rate that loggers have; None where no unit does."""
-    fitting = [own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]]
+    fitting = [
+        own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
+    ]
     chosen = unit or next(iter(fitting), "s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
-    how = f"unit in the header, {rate:.6g} Hz" if unit else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    how = (
+        f"unit in the header, {rate:.6g} Hz"
+        if unit
+        else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    )
     return Stamps(name, chosen, how, asked=chosen not in fitting)
 
 
-def _run_starts(columns: Mapping[str, FloatArray], clock: str, steps: FloatArray, step: float) -> tuple[NDArray[np.bool_], str]:
+def _run_starts(
+    columns: Mapping[str, FloatArray], clock: str, steps: FloatArray, step: float
+) -> tuple[NDArray[np.bool_], str]:
     """Where runs begin with the next row, (N - 1,), and the column that counts them, if one does."""
-    for name, starts in _counters(columns, [name for name in columns if name != clock and COUNTER.match(plain_name(name))]):
+    for name, starts in _counters(
+        columns, [name for name in columns if name != clock and COUNTER.match(plain_name(name))]
+    ):
         if 0 < starts.sum() <= MOST_RESTARTS * (len(steps) + 1):
             return starts, name
     breaks = (steps < 0) | (steps > LONG_GAP * step)
@@ -115,7 +140,9 @@ def _run_starts(columns: Mapping[str, FloatArray], clock: str, steps: FloatArray
     return steps < 0, ""
 
 
-def _counters(columns: Mapping[str, FloatArray], names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def _counters(
+    columns: Mapping[str, FloatArray], names: Iterable[str]
+) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Columns of whole numbers that never take a value again, each with where it changes, (N - 1,)."""
     for name in names:
         values = columns[name]

@@ -17,8 +17,12 @@ class RawColumn:
     name: str  # for people; unique within its log
     unit: str  # as the file writes it, empty where it does not
     values: FloatArray  # in that unit, NaN where there is none, (N,)
-    place: Mapping[str, Any]  # how a data set's entry of a channel names it, such as ``{"column": "Gyro"}``
-    stamps: FloatArray | None = None  # its own times [s], (N,); None where the log has one clock for all
+    place: Mapping[
+        str, Any
+    ]  # how a data set's entry of a channel names it, such as ``{"column": "Gyro"}``
+    stamps: FloatArray | None = (
+        None  # its own times [s], (N,); None where the log has one clock for all
+    )
     # whether the file says that the car measured it, on its bus, or the reference did; empty where it does not
     device: Literal["", "car", "reference"] = ""
 
@@ -40,8 +44,16 @@ class Log:
     file: Path  # the file, or a bag's folder
     source: str  # that reads it
     columns: tuple[RawColumn, ...]  # without its clock
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the source, such as delimiter and decimal mark
-    clock: Stamps | None = None  # column of its times; None where there is none, or where the format has times of its own
-    seconds: FloatArray | None = None  # times of the rows [s], (N,), from the clock; None where columns have their own or there is no clock
-    runs: tuple[slice, ...] = ()  # rows of each uninterrupted run, the longest first; one of all where times never restart
+    options: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # of the source, such as delimiter and decimal mark
+    clock: Stamps | None = (
+        None  # column of its times; None where there is none, or where the format has times of its own
+    )
+    seconds: FloatArray | None = (
+        None  # times of the rows [s], (N,), from the clock; None where columns have their own or there is no clock
+    )
+    runs: tuple[
+        slice, ...
+    ] = ()  # rows of each uninterrupted run, the longest first; one of all where times never restart
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason

@@ -38,16 +38,47 @@ LONGEST_LINE = csv.field_size_limit()
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
-WIDE = re.compile(r"[ぁ-ヿ一-鿿]{2}")  # letters of Japanese, which accents in Windows-1252 make only one by one
+WIDE = re.compile(
+    r"[ぁ-ヿ一-鿿]{2}"
+)  # letters of Japanese, which accents in Windows-1252 make only one by one
 CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
-MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
+MARKS = frozenset(
+    {
+        "-",
+        "--",
+        "---",
+        "----",
+        "–",
+        "—",
+        "*",
+        "?",
+        "n.a.",
+        "none",
+        "missing",
+        "invalid",
+        "inv",
+        "void",
+        "#value!",
+        "#div/0!",
+    }
+)
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
-VELOCITY = re.compile(rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE)
+VELOCITY = re.compile(
+    rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
+)
 """Names that end in ms for metres a second, as those of delays and ages do not."""
-ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
+ABBREVIATED = {
+    "radps": "rad/s",
+    "degps": "deg/s",
+    "degs": "deg/s",
+    "rads": "rad/s",
+    "ms2": "m/s2",
+    "mss": "m/s2",
+    "kmh": "km/h",
+}
 
 
 @dataclass(frozen=True)
@@ -56,7 +87,9 @@ class Shape:
 
     layout: TextLayout
     names: tuple[str, ...] = ()  # of the columns; empty where no line above the numbers has them
-    units: Mapping[str, str] = field(default_factory=dict)  # name -> unit in the row below the names, if there is one
+    units: Mapping[str, str] = field(
+        default_factory=dict
+    )  # name -> unit in the row below the names, if there is one
     score: float = 0.0  # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row
 
 
@@ -67,30 +100,67 @@ def survey_table(file: Path) -> Log:
     skipped: list[str] = []
     if is_parquet(file):
         with parquet_file(file) as table:
-            units = {field.name: field.type.unit for field in table.schema_arrow if pa.types.is_timestamp(field.type)}
-            names = [field.name for field in table.schema_arrow if field.name in units or _is_numeric(field.type)]
+            units = {
+                field.name: field.type.unit
+                for field in table.schema_arrow
+                if pa.types.is_timestamp(field.type)
+            }
+            names = [
+                field.name
+                for field in table.schema_arrow
+                if field.name in units or _is_numeric(field.type)
+            ]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
     else:
         shape = shape_of(file)
         values, clocks, marks, skipped = _columns(file, shape)
         units, always, usual = dict(shape.units), ("delimiter", "decimal"), asdict(TextLayout())
-        options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != usual[name]}
+        options = {
+            name: option
+            for name, option in asdict(shape.layout).items()
+            if name in always or option != usual[name]
+        }
         options |= {"missing": sorted(marks)} if marks else {}
     if not values:
-        raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
+        raise DataError(
+            f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}"
+        )
     n_rows = len(next(iter(values.values())))
     if n_rows < 2:
-        raise DataError(f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names")
+        raise DataError(
+            f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names"
+        )
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    stamps, seconds, runs, cuts = find_clock({**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")})
+    stamps, seconds, runs, cuts = find_clock(
+        {**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")}
+    )
     if stamps is not None and stamps.column in clocks:
-        stamps = replace(stamps, unit=CLOCK, evidence=stamps.evidence.replace("unit in the header", "times of a clock"), asked=False)
-    named = {name: times for name, times in values.items() if stamps is None and NAMED.match(plain_name(name))}
-    faults = [_fault(name, times) for name, times in {**clocks, **named}.items() if stamps is None or name != stamps.column]
+        stamps = replace(
+            stamps,
+            unit=CLOCK,
+            evidence=stamps.evidence.replace("unit in the header", "times of a clock"),
+            asked=False,
+        )
+    named = {
+        name: times
+        for name, times in values.items()
+        if stamps is None and NAMED.match(plain_name(name))
+    }
+    faults = [
+        _fault(name, times)
+        for name, times in {**clocks, **named}.items()
+        if stamps is None or name != stamps.column
+    ]
     options, beside = {**options, **cuts}, {stamps.column if stamps else None, cuts.get("runs")}
-    columns = [RawColumn(name, written[name], samples, {"column": name}) for name, samples in values.items() if name not in beside]
-    plain = not {"rows_below_names", "missing"} & set(options) and (stamps is None or stamps.unit != CLOCK)
+    columns = [
+        RawColumn(name, written[name], samples, {"column": name})
+        for name, samples in values.items()
+        if name not in beside
+    ]
+    plain = not {"rows_below_names", "missing"} & set(options) and (
+        stamps is None or stamps.unit != CLOCK
+    )
     source = "tabular" if plain else "text_log"
     return Log(file, source, tuple(columns), options, stamps, seconds, runs, (*skipped, *faults))
 
@@ -99,8 +169,16 @@ def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
     back, same = int((steps < 0).sum()), int((steps == 0).sum())
-    what = f"goes backwards {back} times" if back else f"repeats {same} times" if same else "does not grow evenly"
-    return f"column '{printable(name)}' as the time: it {what}" + ("; sort the rows" if back > 1 else "")
+    what = (
+        f"goes backwards {back} times"
+        if back
+        else f"repeats {same} times"
+        if same
+        else "does not grow evenly"
+    )
+    return f"column '{printable(name)}' as the time: it {what}" + (
+        "; sort the rows" if back > 1 else ""
+    )
 
 
 def unit_in_name(name: str) -> str:
@@ -119,12 +197,24 @@ def shape_of(file: Path) -> Shape:
     """Layout of a table of text, by its beginning; raises `DataError` where it is none, or has one column or no line of names."""
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
-    lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]
+    lines = [
+        line[:LONGEST_LINE]
+        for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]
+    ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
-    marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",") if decimal != delimiter]
-    best = max((_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score)
+    marks = [
+        (delimiter, decimal)
+        for delimiter in DELIMITERS
+        for decimal in (".", ",")
+        if decimal != delimiter
+    ]
+    best = max(
+        (_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score
+    )
     if not best.score:
-        raise DataError(f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?")
+        raise DataError(
+            f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?"
+        )
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
@@ -145,15 +235,23 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
     data = [k for k, share in shares.items() if share >= LEAST_NUMBERS]
     if not data:
         return Shape(TextLayout())
-    first = next((k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0])
+    first = next(
+        (k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0]
+    )
     score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
     above = [k for k in shares if k < first]
     if not above:
         return Shape(TextLayout(), score=score)
     below = int(len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(rows[above[-1]]))
     names = tuple(rows[above[-1] - below])
-    units = {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)} if below else {}
-    layout = TextLayout(delimiter, decimal, encoding, skip_rows=above[-1] - below, rows_below_names=below)
+    units = (
+        {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)}
+        if below
+        else {}
+    )
+    layout = TextLayout(
+        delimiter, decimal, encoding, skip_rows=above[-1] - below, rows_below_names=below
+    )
     return Shape(layout, names, units, score)
 
 
@@ -165,7 +263,9 @@ def _share(row: Sequence[str], decimal: str) -> float:
 
 def _is_number(cell: str, decimal: str) -> bool:
     text = cell.strip().strip('"')
-    return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (decimal == "," and "." in text)
+    return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (
+        decimal == "," and "." in text
+    )
 
 
 def _are_units(cells: Sequence[str]) -> bool:
@@ -173,7 +273,9 @@ def _are_units(cells: Sequence[str]) -> bool:
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     if not filled:
         return any(cell.strip() for cell in cells)
-    return sum(map(_is_unit, filled)) >= max(1, 0.3 * len(filled)) and all(len(cell) <= 12 for cell in filled)
+    return sum(map(_is_unit, filled)) >= max(1, 0.3 * len(filled)) and all(
+        len(cell) <= 12 for cell in filled
+    )
 
 
 def _is_unit(text: str) -> bool:
@@ -184,11 +286,17 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
-        raise DataError(f"'{file}' is no table of text (it holds control characters); save its channels as CSV")
+        raise DataError(
+            f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
+        )
     try:
-        return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
+        return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(
+            head, final=len(head) < HEAD
+        )
     except UnicodeDecodeError:
-        for encoding in ("cp932", "cp1252") if re.search(rb"[\x80-\x9f]", head) else ():  # cp932: Shift-JIS as Windows writes it
+        for encoding in (
+            ("cp932", "cp1252") if re.search(rb"[\x80-\x9f]", head) else ()
+        ):  # cp932: Shift-JIS as Windows writes it
             with suppress(UnicodeDecodeError):
                 text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
                 if encoding == "cp1252" or WIDE.search(text):
@@ -196,7 +304,9 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
         return "latin-1", head.decode("latin-1")
 
 
-def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
+def _columns(
+    file: Path, shape: Shape
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
     """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not read, and why."""
     table = _table(file, shape)
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
@@ -224,7 +334,9 @@ def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str,
 def _table(file: Path, shape: Shape) -> pa.Table:
     """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as they stand."""
     inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
-    text = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
+    text = pc.ConvertOptions(
+        column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
+    )
     problem = None
     for convert in (inferred, text):
         try:
@@ -239,9 +351,15 @@ def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str
     """A column as numbers, and the marks in it that stand for a missing sample; None where it holds anything else."""
     marks: set[str] = set()
     if pa.types.is_string(column.type):
-        marks = {cell for cell in compute.unique(column).to_pylist() if cell is not None and cell.strip().lower() in MARKS}
+        marks = {
+            cell
+            for cell in compute.unique(column).to_pylist()
+            if cell is not None and cell.strip().lower() in MARKS
+        }
         if marks:
-            column = compute.if_else(compute.is_in(column, pa.array(sorted(marks))), pa.scalar(None, pa.string()), column)
+            column = compute.if_else(
+                compute.is_in(column, pa.array(sorted(marks))), pa.scalar(None, pa.string()), column
+            )
         column = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
     elif not _is_numeric(column.type):
         return None

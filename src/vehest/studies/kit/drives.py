@@ -7,7 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from vehest.evaluation.floors import SETS, Floor, cramer_rao_floor, drives_of, reference_floor, reference_spread
+from vehest.evaluation.floors import (
+    SETS,
+    Floor,
+    cramer_rao_floor,
+    drives_of,
+    reference_floor,
+    reference_spread,
+)
 from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, REGIMES, STRAIGHT_YAW_RATE, TRANSIENT
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import Reliability, reliability_figure
@@ -19,7 +26,15 @@ from vehest.trust.bands import LEVELS
 SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
 COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
 SHOWN = "coverage_90"
-_FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "crps", "error_icc", "band_blocks")
+_FIGURES = (
+    "coverage_90_p10",
+    "coverage_90_p90",
+    "width_90",
+    "interval_score",
+    "crps",
+    "error_icc",
+    "band_blocks",
+)
 
 
 def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
@@ -33,12 +48,26 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     for car, what in ((False, "bound, kinematics alone"), (True, "bound, axles known")):
         for inputs in SETS:
             if car or ("ay" in inputs and "steer" not in inputs):
-                found.append((what, ", ".join(SYMBOLS[name] for name in inputs), cramer_rao_floor(drives, inputs, car=car)))
+                found.append(
+                    (
+                        what,
+                        ", ".join(SYMBOLS[name] for name in inputs),
+                        cramer_rao_floor(drives, inputs, car=car),
+                    )
+                )
     rows = []
     for what, symbols, floor in found:
         if floor is not None:
             share = (floor.vy / spread.vy) ** 2 if spread.vy > 0 else float("nan")
-            rows.append({"what": what, "inputs": symbols, "vy": floor.vy, "sideslip": floor.sideslip, "share": share})
+            rows.append(
+                {
+                    "what": what,
+                    "inputs": symbols,
+                    "vy": floor.vy,
+                    "sideslip": floor.sideslip,
+                    "share": share,
+                }
+            )
     return Table(
         name,
         f"What the drive of test set `{test_set}` can show, root mean square over the scored samples: the reference, the white noise in it "
@@ -56,29 +85,48 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     )
 
 
-def regime_table(part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], name: str) -> Table | None:
+def regime_table(
+    part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], name: str
+) -> Table | None:
     """RMSE(β) of candidates by regime; None where metrics have no regimes."""
     metrics = part.metrics
-    own = metrics[(metrics["test_set"] == test_set) & metrics["subset"].isin(REGIMES) & (metrics["condition"] == "nominal")]
+    own = metrics[
+        (metrics["test_set"] == test_set)
+        & metrics["subset"].isin(REGIMES)
+        & (metrics["condition"] == "nominal")
+    ]
     seen = [regime for regime in REGIMES if regime in set(own["subset"])]
     if not seen:
         return None
     errors = own[own["metric"] == "rmse_sideslip"]
-    keys = zip(errors["estimator"], errors["variant"].fillna(""), errors["seed"], errors["subset"], strict=True)
+    keys = zip(
+        errors["estimator"],
+        errors["variant"].fillna(""),
+        errors["seed"],
+        errors["subset"],
+        strict=True,
+    )
     values = dict(zip(keys, errors["value"], strict=True))
     shares = own[own["metric"] == "share"].groupby("subset")["value"].first()
     rows = [
-        {"title": title} | {regime: values.get((*key, seed, regime), float("nan")) for regime in seen}
+        {"title": title}
+        | {regime: values.get((*key, seed, regime), float("nan")) for regime in seen}
         for key, (title, seed) in chosen.items()
     ]
-    headers = {regime: f"{_in_words(regime)} ({fixed(100 * float(shares[regime]), 0)} %)" for regime in seen}
+    headers = {
+        regime: f"{_in_words(regime)} ({fixed(100 * float(shares[regime]), 0)} %)"
+        for regime in seen
+    }
     return Table(
         name,
         f"RMSE(β) [deg] by regime, of each the seed chosen on validation; in brackets the share of the samples. Straight: yaw rate within "
         f"±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
         f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {LEAST_SECONDS:g} s are left out.",
         pd.DataFrame(rows),
-        {"title": Column("estimator"), **{regime: Column(headers[regime], decimals=3) for regime in seen}},
+        {
+            "title": Column("estimator"),
+            **{regime: Column(headers[regime], decimals=3) for regime in seen},
+        },
     )
 
 
@@ -90,21 +138,35 @@ def _in_words(regime: str) -> str:
 
 
 def band_blocks(
-    part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], lines: Mapping[Name, Line], file: str
+    part: PartArtefacts,
+    test_set: str,
+    chosen: Mapping[Name, tuple[str, int]],
+    lines: Mapping[Name, Line],
+    file: str,
 ) -> list[Block]:
     """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands."""
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows, drawn = [], []
     for name, (title, seed) in chosen.items():
-        own = {metric: values_of(values, name, [seed], test_set, metric)[0] for metric in (*COVERAGES, *_FIGURES)}
+        own = {
+            metric: values_of(values, name, [seed], test_set, metric)[0]
+            for metric in (*COVERAGES, *_FIGURES)
+        }
         if not np.isfinite(own[SHOWN]):
             continue
-        ends = [np.array([values_of(runs, name, [seed], test_set, metric)[0] for metric in COVERAGES]) for runs in (lows, highs)]
+        ends = [
+            np.array([values_of(runs, name, [seed], test_set, metric)[0] for metric in COVERAGES])
+            for runs in (lows, highs)
+        ]
         low, high = (100 * end[COVERAGES.index(SHOWN)] for end in ends)
         interval = f"{low:.0f} … {high:.0f}" if np.isfinite(low) else MISSING
-        percent = {metric: 100 * own[metric] for metric in (SHOWN, "coverage_90_p10", "coverage_90_p90")}
+        percent = {
+            metric: 100 * own[metric] for metric in (SHOWN, "coverage_90_p10", "coverage_90_p90")
+        }
         rows.append({"title": title, **own, **percent, "interval": interval})
-        drawn.append(Reliability(title, lines[name], np.array([own[metric] for metric in COVERAGES]), *ends))
+        drawn.append(
+            Reliability(title, lines[name], np.array([own[metric] for metric in COVERAGES]), *ends)
+        )
     if not rows:
         return []
     table = Table(

@@ -41,31 +41,63 @@ def explorer_of(
     spans = artefacts.split.tests[test_set]
     pieces = list(pieces_of(spans, artefacts.reference, artefacts.protocol))
     skip = artefacts.protocol.skip_seconds
-    parts = [recording.cut(max(piece.start, recording.start_time) + skip, piece.stop) for recording, piece in pieces]
+    parts = [
+        recording.cut(max(piece.start, recording.start_time) + skip, piece.stop)
+        for recording, piece in pieces
+    ]
 
     def measured(name: str) -> FloatArray:
-        return chained([part[name] if name in part else np.full(len(part), np.nan) for part in parts], gap)
+        return chained(
+            [part[name] if name in part else np.full(len(part), np.nan) for part in parts], gap
+        )
 
-    names = [name for name in CHANNELS if all(name in part for part in parts) and not CHANNELS[name].is_reference]
+    names = [
+        name
+        for name in CHANNELS
+        if all(name in part for part in parts) and not CHANNELS[name].is_reference
+    ]
     vx, vy_ref, step = measured("vx"), measured("vy_ref"), 1.0 / artefacts.protocol.rate_hz
-    columns: dict[str, FloatArray | None] = {"vx": vx, "vy": vy_ref, "ay": measured("ay") if "ay" in names else None}
+    columns: dict[str, FloatArray | None] = {
+        "vx": vx,
+        "vy": vy_ref,
+        "ay": measured("ay") if "ay" in names else None,
+    }
     inputs, candidates = [], []
     for i, name in enumerate(names[:MOST_INPUTS]):
         channel, values = CHANNELS[name], measured(name)
         columns[f"input{i}"] = np.degrees(values) if channel.is_angular else values
-        unit = {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
+        unit = (
+            {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
+        )
         inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
     for i, (own, (model, title, line)) in enumerate(shown.items()):
         columns[f"vy{i}"] = chained([part.vy for part in scored[own]], gap)
         bands = [part.bands for part in scored[own]]
-        band_vy, band_sideslip = (chained([one[q] for one in bands], gap) if all(q in one for one in bands) else None for q in _BANDS)
-        columns |= {f"bandv{i}": band_vy, f"bandb{i}": None if band_sideslip is None else np.degrees(band_sideslip)}
+        band_vy, band_sideslip = (
+            chained([one[q] for one in bands], gap) if all(q in one for one in bands) else None
+            for q in _BANDS
+        )
+        columns |= {
+            f"bandv{i}": band_vy,
+            f"bandb{i}": None if band_sideslip is None else np.degrees(band_sideslip),
+        }
         columns[f"health{i}"] = health_over(model, pieces, artefacts, gap)
-        candidates.append({"label": title, "colour": line.colour, "dark": on_dark(line.colour), "dash": line.dash})
-    turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if all(name in part for part in parts)), None)
+        candidates.append(
+            {"label": title, "colour": line.colour, "dark": on_dark(line.colour), "dash": line.dash}
+        )
+    turning = next(
+        (name for name in ("yaw_rate_ref", "yaw_rate") if all(name in part for part in parts)), None
+    )
     if turning is not None:
         columns["x"], columns["y"] = reckoned_course(vx, vy_ref, measured(turning), step)
-    content = {"start": start, "step": step, "length": len(vx), "timeLabel": label, "zoom": list(zoom), "inputs": inputs}
+    content = {
+        "start": start,
+        "step": step,
+        "length": len(vx),
+        "timeLabel": label,
+        "zoom": list(zoom),
+        "inputs": inputs,
+    }
     return explorer_json({**content, "candidates": candidates, "courseNote": RECKONED}, columns)
 
 
@@ -79,7 +111,12 @@ def chained(pieces: Sequence[FloatArray], gap: int) -> FloatArray:
     return np.concatenate(parts[:-1])
 
 
-def health_over(model: EvaluatedModel, pieces: Sequence[tuple[Recording, Span]], artefacts: PartArtefacts, gap: int) -> FloatArray | None:
+def health_over(
+    model: EvaluatedModel,
+    pieces: Sequence[tuple[Recording, Span]],
+    artefacts: PartArtefacts,
+    gap: int,
+) -> FloatArray | None:
     """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2 invalid, over all ranges.
 
     None where the model has no health, or reads another rate than that of the evaluation.
@@ -94,7 +131,13 @@ def health_over(model: EvaluatedModel, pieces: Sequence[tuple[Recording, Span]],
     found = []
     for recording, piece in pieces:
         first, end = scored_range(recording, piece, artefacts.protocol)
-        begin = recording.index_range(max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop)[0]
+        begin = recording.index_range(
+            max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop
+        )[0]
         rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
-        found.append(health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :])
+        found.append(
+            health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[
+                first - begin :
+            ]
+        )
     return chained(found, gap)

@@ -14,19 +14,26 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
 Name = tuple[str, str]  # estimator and variant
 
-Runs = dict[tuple[str, str, int, str], dict[str, float]]  # (estimator, variant, seed, test set) -> metric -> value
+Runs = dict[
+    tuple[str, str, int, str], dict[str, float]
+]  # (estimator, variant, seed, test set) -> metric -> value
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by run and test set; raises `DataError`."""
     metrics = artefacts.metrics
     nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
-    columns = (nominal[name].tolist() for name in ("estimator", "variant", "seed", "test_set", "metric", column))
+    columns = (
+        nominal[name].tolist()
+        for name in ("estimator", "variant", "seed", "test_set", "metric", column)
+    )
     runs: Runs = {}
     for estimator, variant, seed, test_set, metric, value in zip(*columns, strict=True):
         run = runs.setdefault((_text(estimator), _text(variant), int(seed), _text(test_set)), {})
         number = float(value)
-        if not (math.isnan(number) or math.isnan(run.get(metric, math.nan)) or run[metric] == number):
+        if not (
+            math.isnan(number) or math.isnan(run.get(metric, math.nan)) or run[metric] == number
+        ):
             raise DataError(
                 f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on '{test_set}' is both {run[metric]:g} and "
                 f"{number:g}; give models that differ in more than the seed different variants"
@@ -36,14 +43,18 @@ def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     return runs
 
 
-def values_of(runs: Runs, name: Name, seeds: Sequence[int], test_set: str, metric: str) -> FloatArray:
+def values_of(
+    runs: Runs, name: Name, seeds: Sequence[int], test_set: str, metric: str
+) -> FloatArray:
     """Values of a metric, one a seed; NaN where there is none."""
     return np.array([runs.get((*name, seed, test_set), {}).get(metric, math.nan) for seed in seeds])
 
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
     """A metric of the model itself, under whatever test set it was noted."""
-    known = (run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run)
+    known = (
+        run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run
+    )
     return next(known, math.nan)
 
 

@@ -15,10 +15,19 @@ from vehest.studies.kit.runs import by_name
 BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
 
 
-def ranking_of(artefacts: PartArtefacts, test_set: str, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
+def ranking_of(
+    artefacts: PartArtefacts, test_set: str, asked: Sequence[tuple[Name, Name]] = ()
+) -> Ranking:
     """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without infinite errors; raises `DataError`."""
-    segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(artefacts.models).items()}
-    finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
+    segments = {
+        name: [model.segments(test_set) for model in own]
+        for name, own in by_name(artefacts.models).items()
+    }
+    finite = {
+        name: own
+        for name, own in segments.items()
+        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)
+    }
     return rank(finite, artefacts.protocol.rate_hz, asked=asked)
 
 
@@ -27,9 +36,15 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
     columns: dict[str, str | float] = {"rmse_sideslip_low": low, "rmse_sideslip_high": high}
     for baseline in BASELINES:
-        compared = name[0] not in BASELINES and ranking.intervals and baseline not in ranking.missing_baselines
+        compared = (
+            name[0] not in BASELINES
+            and ranking.intervals
+            and baseline not in ranking.missing_baselines
+        )
         answers = {True: "yes", False: "no", None: "not told apart"}
-        columns[f"beats_{baseline}"] = answers[ranking.beats(name, baseline)] if compared else MISSING
+        columns[f"beats_{baseline}"] = (
+            answers[ranking.beats(name, baseline)] if compared else MISSING
+        )
     columns["against_best"] = _against_best(ranking, name)
     return columns
 
@@ -78,7 +93,9 @@ def _reasons(ranking: Ranking, titles: Mapping[Name, str]) -> str:
         reasons.append("which is a baseline")
     level = [titles[name] for name in ranking.not_told_apart]
     if level:
-        reasons.append(f"which is not told apart from {listed(level) if len(level) <= 6 else f'{len(level)} others'}")
+        reasons.append(
+            f"which is not told apart from {listed(level) if len(level) <= 6 else f'{len(level)} others'}"
+        )
     for baseline in BASELINES:
         if baseline in ranking.missing_baselines:
             reasons.append(f"which was not compared with {BASELINE_TITLES[baseline]}")

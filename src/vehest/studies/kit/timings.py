@@ -15,7 +15,9 @@ CAPTION = (
 )
 
 
-def timings_of_study(parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]]) -> list[str | Table]:
+def timings_of_study(
+    parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]],
+) -> list[str | Table]:
     """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title); nothing where it is not known."""
     rows = [row for part in parts for row in _rows(*part)]
     if not rows:
@@ -31,20 +33,32 @@ def timings_of_study(parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str,
     }
     phases = [str(name) for name in frame if name not in known]
     columns = {name: column for name, column in known.items() if name in frame}
-    columns |= {name: Column(f"of a training: {name.removesuffix('_seconds').replace('_', ' ')} [s]", digits=2) for name in phases}
+    columns |= {
+        name: Column(
+            f"of a training: {name.removesuffix('_seconds').replace('_', ' ')} [s]", digits=2
+        )
+        for name in phases
+    }
     if not any(title for title, *_ in parts):
         del columns["part"]
     return ["## Times", Table("timings", CAPTION, frame, columns)]
 
 
-def _rows(part: str, table: pd.DataFrame, titles: Mapping[tuple[str, str], str]) -> list[dict[str, object]]:
-    seeds = table.drop_duplicates(subset=[*NAME, "seed", "metric"])  # a time of the fit is noted under every test set
+def _rows(
+    part: str, table: pd.DataFrame, titles: Mapping[tuple[str, str], str]
+) -> list[dict[str, object]]:
+    seeds = table.drop_duplicates(
+        subset=[*NAME, "seed", "metric"]
+    )  # a time of the fit is noted under every test set
     rows = []
     for name, title in titles.items():
         own = seeds[(seeds["estimator"] == name[0]) & (seeds["variant"].fillna("") == name[1])]
         if own.empty:
             continue
-        medians = {str(metric): float(value) for metric, value in own.groupby("metric")["value"].median().items()}
+        medians = {
+            str(metric): float(value)
+            for metric, value in own.groupby("metric")["value"].median().items()
+        }
         row: dict[str, object] = {"part": part, "title": title, "fits": own["seed"].nunique()}
         row |= {"train_seconds": medians.pop("train_seconds", float("nan"))}
         row |= {"all_seconds": float(own.loc[own["metric"] == "train_seconds", "value"].sum())}

@@ -15,16 +15,31 @@ from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
-LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
+LITTLE_SIDESLIP = (
+    0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
+)
 CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
-SILENT = 0.7  # bound over the reference itself, above which a drive says less of v than was known before
-DIFFERENT = 1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
+SILENT = (
+    0.7  # bound over the reference itself, above which a drive says less of v than was known before
+)
+DIFFERENT = (
+    1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
+)
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
     """Sentences, each about one test set or one estimator, those first that are left out; none where there is nothing to warn of."""
-    left_out = [f"{as_code(name)} is left out: {as_text(reason)}" for name, reason in artefacts.failed.items()]
-    return [*left_out, *_excitation(artefacts), *_floors(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
+    left_out = [
+        f"{as_code(name)} is left out: {as_text(reason)}"
+        for name, reason in artefacts.failed.items()
+    ]
+    return [
+        *left_out,
+        *_excitation(artefacts),
+        *_floors(artefacts),
+        *_kinds(artefacts),
+        *_epoch_limits(artefacts),
+    ]
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
@@ -35,9 +50,14 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     level, found = _level(artefacts, artefacts.split.tests[test_set]), []
     if level < LITTLE_SIDESLIP:
         found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
-    bound, error = (_lowest(runs_of(artefacts), test_set, name) for name in ("floor_cramer_rao", "rmse_sideslip"))
+    bound, error = (
+        _lowest(runs_of(artefacts), test_set, name)
+        for name in ("floor_cramer_rao", "rmse_sideslip")
+    )
     if min(bound, error) > SILENT * level:
-        found.append(f"what was measured tells sideslip to no better than {bound:.2g}° (Cramér-Rao), where v = 0 errs by {level:.2g}°")
+        found.append(
+            f"what was measured tells sideslip to no better than {bound:.2g}° (Cramér-Rao), where v = 0 errs by {level:.2g}°"
+        )
     return found
 
 
@@ -70,7 +90,10 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
     """Tests whose reference is about as noisy as the lowest error is large, or whose inputs say little of v."""
     runs, found = runs_of(artefacts), list[str]()
     for test_set, spans in artefacts.split.tests.items():
-        error, noise, bound = (_lowest(runs, test_set, name) for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao"))
+        error, noise, bound = (
+            _lowest(runs, test_set, name)
+            for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
+        )
         if error < CLOSE * noise:
             found.append(
                 f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
@@ -105,14 +128,18 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
             elif own > 0 and other > DIFFERENT * own:
                 short.append(f"{word} ({own / other:.2g} times)")
         if beyond:
-            found.append(f"Test set `{test_set}` goes beyond the training ranges in {listed(beyond)}: estimators extrapolate there.")
+            found.append(
+                f"Test set `{test_set}` goes beyond the training ranges in {listed(beyond)}: estimators extrapolate there."
+            )
         if short:
             found.append(
                 f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than what was learnt."
             )
         kinds = [artefacts.kinds_of(own) for own in (spans, artefacts.split.train)]
         if kinds[0] != kinds[1]:
-            found.append(f"Test set `{test_set}` is {kinds[0]}, the training ranges are {kinds[1]}.")
+            found.append(
+                f"Test set `{test_set}` is {kinds[0]}, the training ranges are {kinds[1]}."
+            )
     return found
 
 
@@ -125,8 +152,14 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             limit = model.training.get("max_epochs")
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
-            found.append(f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)")
-    return [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."] if found else []
+            found.append(
+                f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)"
+            )
+    return (
+        [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."]
+        if found
+        else []
+    )
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
@@ -145,4 +178,7 @@ def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, Flo
             parts["ay"].append(own["ay"][known])
         parts["vx"].append(own["vx"][known])
         parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
-    return {name: np.concatenate([*values, np.zeros(0 if any(map(len, values)) else 1)]) for name, values in parts.items()}
+    return {
+        name: np.concatenate([*values, np.zeros(0 if any(map(len, values)) else 1)])
+        for name, values in parts.items()
+    }
