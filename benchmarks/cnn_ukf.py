@@ -27,8 +27,13 @@ import torch
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "results" / "benchmarks" / "cnn_ukf.json"
 THREADS = int(os.environ.get("BENCH_THREADS", "1"))
-HOURS, RATE, STEPS, BATCH = 2.0, 100, 256, 32
-MEMBERS, MINUTES, SAMPLES_A_STEP = 20, 10.0, 1024
+HOURS = 2.0
+RATE = 100
+STEPS = 256
+BATCH = 32
+MEMBERS = 20
+MINUTES = 10.0
+SAMPLES_A_STEP = 1024
 FLOPS_A_SAMPLE = 2 * (
     3 * (17 * 250 + 250 * 125 + 125 * 2) - 17 * 250
 )  # of matrix products: forwards, by the weights, by what is below
@@ -38,7 +43,9 @@ DRIVES = (
     "train_lane_change_1_on_001",
     "train_random_steer_on_001",
 )
-LEAST_RATIO, MOST_EPOCH, LEAST_ENSEMBLE = 6.0, 240.0, 2.5  # 1, s, 1
+LEAST_RATIO = 6.0
+MOST_EPOCH = 240.0
+LEAST_ENSEMBLE = 2.5  # 1, s, 1
 MOST_DIFFERENCE = 1e-4  # relative, of losses and gradients, of a network in single precision
 TYRES = {"cornering_stiffness": 1.2e5, "friction": 1.1, "reduction": 1e-3}
 LEVELS = {
@@ -100,7 +107,8 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
     for layer in (1, 2, 3):
         hidden = hidden @ parameters[f"weight_{layer}"][0] + parameters[f"bias_{layer}"][0]
         hidden = torch.relu(hidden) if layer < 3 else hidden.double()
-    angle, shares = hidden[..., 0] * estimator.network.unit.double(), torch.sigmoid(hidden[..., 1:])
+    angle = hidden[..., 0] * estimator.network.unit.double()
+    shares = torch.sigmoid(hidden[..., 1:])
     process = torch.diag_embed(shares[..., 1:].square())
     of_sensors = training.sensors[batch.trusted.long()].diagonal(dim1=-2, dim2=-1)
     sensors = torch.diag_embed(
@@ -108,7 +116,8 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
     )
     measured = torch.cat([batch.measured, angle.unsqueeze(-1)], -1)
     track = training.filter.track
-    n, total = 2, 3.0
+    n = 2
+    total = 3.0
     weights = torch.tensor([1.0 / total, *[0.5 / total] * (2 * n)], dtype=torch.float64)
 
     def points(mean: Any, covariance: Any) -> Any:
@@ -116,11 +125,11 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
         centre = mean.unsqueeze(-2)
         return torch.cat([centre, centre + offsets, centre - offsets], -2)
 
-    mean, covariance, means = (
-        batch.start,
-        torch.tensor(START, dtype=torch.float64).square().diag().expand(len(batch.start), n, n),
-        [],
+    mean = batch.start
+    covariance = (
+        torch.tensor(START, dtype=torch.float64).square().diag().expand(len(batch.start), n, n)
     )
+    means = []
     for k in range(batch.sideslip.shape[1]):
         now = batch.driven[:, k, None]
         if k:
@@ -148,7 +157,8 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
 
 def timed(work: Callable[[], Any]) -> tuple[float, float, Any]:
     """Seconds, those of the processor over all threads, and what came of it."""
-    started, began = time.perf_counter(), time.process_time()
+    started = time.perf_counter()
+    began = time.process_time()
     outcome = work()
     return time.perf_counter() - started, time.process_time() - began, outcome
 
@@ -261,7 +271,8 @@ def ensemble(recordings: list[Any]) -> dict[str, Any]:
         return work
 
     def by_torch() -> None:
-        nn, generator = torch.nn, torch.Generator().manual_seed(0)
+        nn = torch.nn
+        generator = torch.Generator().manual_seed(0)
         for _ in range(MEMBERS):
             own = nn.Sequential(
                 nn.Linear(17, 250),

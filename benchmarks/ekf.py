@@ -21,8 +21,11 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "filters"))
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "ekf.json"
-RATE, HOURS, SHORT = 20, float(os.environ.get("BENCH_HOURS", "10")), 200
-MOST_SECONDS, MOST_DIFFERENCE = 60.0, 1e-9
+RATE = 20
+HOURS = float(os.environ.get("BENCH_HOURS", "10"))
+SHORT = 200
+MOST_SECONDS = 60.0
+MOST_DIFFERENCE = 1e-9
 
 
 def main() -> None:

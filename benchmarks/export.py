@@ -175,7 +175,8 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     from vehest.run.calibrate import trust_of
     from vehest.trust.contract import GuardedStepper
 
-    model, trust = load_model(folder), trust_of(folder, output)
+    model = load_model(folder)
+    trust = trust_of(folder, output)
     samples = {
         name: values
         for name, values in rows_of(model, folder, dataset, root, output).items()
@@ -184,17 +185,16 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     samples = {name: samples[name] for name in model.channels}
     steps = len(next(iter(samples.values())))
     wanted = replayed(GuardedStepper(in_float64(model), trust), np.full(steps, np.nan), samples)
-    stepper, sampled = (
-        GuardedStepper(model, trust),
-        [
-            dict(zip(samples, row, strict=True))
-            for row in zip(*(v.tolist() for v in samples.values()), strict=True)
-        ],
-    )
+    stepper = GuardedStepper(model, trust)
+    sampled = [
+        dict(zip(samples, row, strict=True))
+        for row in zip(*(v.tolist() for v in samples.values()), strict=True)
+    ]
     begun = time.process_time()
     for sample in sampled:
         stepper.step(sample)
-    python, onnx = 1e6 * (time.process_time() - begun) / steps, onnx_time(model, samples)
+    python = 1e6 * (time.process_time() - begun) / steps
+    onnx = onnx_time(model, samples)
     rows = []
     for precision in ("double", "float"):
         try:
@@ -269,7 +269,8 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
 def report(table: pd.DataFrame) -> str:
     """The page: verdicts, then the table."""
     double, single = (table[table["precision"] == kind] for kind in ("double", "float"))
-    lines, ratio = ["# Models in C against Python", ""], double["python_over_c"]
+    lines = ["# Models in C against Python", ""]
+    ratio = double["python_over_c"]
     for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
         good = rows["largest_difference_vy"] <= limit
         beyond = ", ".join(
@@ -320,7 +321,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "export")
     words = parser.parse_args()
-    root, output = os.environ.get("VEHEST_DATA"), Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
+    root = os.environ.get("VEHEST_DATA")
+    output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
     found = models(output)
     if root is None or not found:
         sys.exit(

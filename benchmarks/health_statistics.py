@@ -48,15 +48,11 @@ RATE = 20.0
 WHEELS = tuple(f"wheel_speed_{place}" for place in ("fl", "fr", "rl", "rr"))
 PLAIN = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 WATCHED = (*PLAIN, *WHEELS)
-LASTS, LEARNT, TRIED = (
-    10.0,
-    300.0,
-    150.0,
-)  # s: of a fault; of a simulated drive; of a drive that faults are tried in
-LEAST, MOST = (
-    25.0,
-    6,
-)  # s of drives that faults are tried on, and how many of them after the same learning
+LASTS = 10.0
+LEARNT = 300.0
+TRIED = 150.0  # s: of a fault; of a simulated drive; of a drive that faults are tried in
+LEAST = 25.0
+MOST = 6  # s of drives that faults are tried on, and how many of them after the same learning
 HORIZONS = (1.0, 3.0, 10.0)  # s after its onset, within which a fault has to be found
 GUARDED = ("nan", "inf", "huge")  # faults that the guard finds, whatever health does
 FERRARI = "20140222_01_01_03_250lm"
@@ -198,7 +194,8 @@ def groups_of(model: HealthModel) -> list[str]:
         for name, value in vars(kernel).items()
         if name.isupper() and isinstance(value, int)
     }
-    names, jumps = [], ("jump", "step")
+    names = []
+    jumps = ("jump", "step")
     for position, one in enumerate(model.statistics):
         name = (
             jumps[position // len(model.channels)] if one.kind == kernel.JUMP else kinds[one.kind]
@@ -209,7 +206,8 @@ def groups_of(model: HealthModel) -> list[str]:
 
 def ratios_of(model: HealthModel, limits: GuardLimits, rows: FloatArray) -> FloatArray:
     """The largest statistic of each group over its limit, (T, G)."""
-    received, labels = np.ascontiguousarray(rows), np.array(groups_of(model))
+    received = np.ascontiguousarray(rows)
+    labels = np.array(groups_of(model))
     statistics = np.empty((len(rows), len(labels)))
     measured = Guard(model.channels, (), limits, model.rate_hz)(received).measured
     kernel.health_kernel(
@@ -225,7 +223,8 @@ def faults_of(
     test: Recording, channels: Sequence[str], ratios: Callable[[FloatArray], FloatArray]
 ) -> list[tuple[int, FloatArray]]:
     """First row of each fault, and what it shows from there on while it lasts."""
-    part, found = test.cut(test.start_time, test.start_time + TRIED), []
+    part = test.cut(test.start_time, test.start_time + TRIED)
+    found = []
     clean = {name: part[name] for name in channels}
     for kind in (kind for kind in KINDS if kind not in GUARDED):
         for channel in (
@@ -245,16 +244,13 @@ def tried(drives: Drives) -> list[Trial]:
     """Statistics of each drive with and without faults."""
     found = []
     for train, validation, tests in drives:
-        everything, rate = [*train, *validation, *tests], tests[0].rate_hz
+        everything = [*train, *validation, *tests]
+        rate = tests[0].rate_hz
         channels = tuple(name for name in WATCHED if all(name in own for own in everything))
-        model, limits = (
-            learn_health(train, validation, channels, rate),
-            learn_limits([*train, *validation], channels, rate),
-        )
-        ratios, long = (
-            partial(ratios_of, model, limits),
-            [test for test in tests if test.duration >= LEAST],
-        )
+        model = learn_health(train, validation, channels, rate)
+        limits = learn_limits([*train, *validation], channels, rate)
+        ratios = partial(ratios_of, model, limits)
+        long = [test for test in tests if test.duration >= LEAST]
         for test in tests:
             faulty = (
                 faults_of(test, channels, ratios) if any(test is own for own in long[:MOST]) else []
@@ -283,7 +279,10 @@ def outcome(
     trials: Sequence[Trial], left_out: Sequence[str] = (), factor: float = 1.0
 ) -> dict[str, Any]:
     """Faults found and alarms, which have a second without any between two, with the exact 95 % Poisson interval an hour."""
-    found, tried_faults, counts, hours = 0, 0, [0, 0], 0.0
+    found = 0
+    tried_faults = 0
+    counts = [0, 0]
+    hours = 0.0
     for trial in trials:
         hours += len(trial.nominal) / trial.rate_hz / 3600.0
         for position, more in enumerate(([], ["outside"])):
@@ -300,10 +299,8 @@ def outcome(
                 bool(flags[: round(horizon * trial.rate_hz)].any()) for horizon in HORIZONS
             )
             tried_faults += len(HORIZONS)
-    low, high = (
-        (chi2.ppf(0.025, 2 * counts[0]) / 2.0 if counts[0] else 0.0),
-        chi2.ppf(0.975, 2 * counts[0] + 2) / 2.0,
-    )
+    low = chi2.ppf(0.025, 2 * counts[0]) / 2.0 if counts[0] else 0.0
+    high = chi2.ppf(0.975, 2 * counts[0] + 2) / 2.0
     rate = {
         "hours": hours,
         "alarms": counts[0],
@@ -378,7 +375,8 @@ def main() -> None:
         print(name, {key: float(f"{value:.4g}") for key, value in own.items()}, flush=True)
     if given.opened:
         return
-    rows, everything = [], []
+    rows = []
+    everything = []
     for name, drives in SETS.items():
         trials = tried(drives())
         everything += trials

@@ -26,9 +26,12 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "results" / "benchmarks" / "ingest.json"
 RECORDING = "20140222_01_01_03_250lm"
-ROWS, COLUMNS, REPEATS = int(os.environ.get("BENCH_ROWS", "791000")), 55, 5
+ROWS = int(os.environ.get("BENCH_ROWS", "791000"))
+COLUMNS = 55
+REPEATS = 5
 TABLE_MB = ROWS * COLUMNS * 8 / 1e6
-MOST_TIME, MOST_MEMORY = 2.0, 3.0  # of the bare call's time, of the table's size
+MOST_TIME = 2.0
+MOST_MEMORY = 3.0  # of the bare call's time, of the table's size
 
 
 def generate(root: Path) -> None:
@@ -163,7 +166,8 @@ def main() -> None:
         f"{ROWS} rows x {COLUMNS} columns: source reads as many columns as there are channels": all_channels,
         f"{ROWS} rows x {COLUMNS} columns: whole ingest of the 12 declared channels (hash, read, check, Parquet)": whole_stage,
     }
-    free, needed = shutil.disk_usage(tempfile.gettempdir()).free, ROWS * COLUMNS * 14
+    free = shutil.disk_usage(tempfile.gettempdir()).free
+    needed = ROWS * COLUMNS * 14
     if free < needed:
         sys.exit(
             f"{needed / 1e9:.1f} GB are needed in {tempfile.gettempdir()}, {free / 1e9:.1f} GB are free; set TMPDIR"
@@ -194,10 +198,8 @@ def main() -> None:
         + "\n"
     )
     for row in rows:
-        time_share, memory_share = (
-            row["ours_seconds"] / row["baseline_seconds"],
-            row["ours_mb"] / TABLE_MB,
-        )
+        time_share = row["ours_seconds"] / row["baseline_seconds"]
+        memory_share = row["ours_mb"] / TABLE_MB
         met = "met" if time_share <= MOST_TIME and memory_share < MOST_MEMORY else "MISSED"
         print(
             f"{row['ratio']:6.2f} x  {row['case']}  ({row['baseline_seconds']:.2f} s -> {row['ours_seconds']:.2f} s; "

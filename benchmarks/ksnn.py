@@ -26,8 +26,13 @@ import numpy as np
 from beside import BUSY, result_file, spinning
 
 RESULT = result_file("ksnn")
-SAMPLES, VALIDATION_SECONDS, WINDOW, BATCH = 6000, 30.0, 30, 64
-PLAIN_SEEDS, EPOCHS, ROUNDS = 1, 4, 3
+SAMPLES = 6000
+VALIDATION_SECONDS = 30.0
+WINDOW = 30
+BATCH = 64
+PLAIN_SEEDS = 1
+EPOCHS = 4
+ROUNDS = 3
 THREADS = 2
 STRUCTURES = {  # family, settings, seeds, and the ratio that is asked for
     "ksnn no bias, (P, Q) = (2, 0)": (
@@ -129,7 +134,9 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | Non
     series, targets, starts = (
         torch.as_tensor(values) for values in (learnt.series, learnt.targets, learnt.starts)
     )
-    series, targets, rows = prepare(network, series.float()), targets.float(), torch.arange(WINDOW)
+    series = prepare(network, series.float())
+    targets = targets.float()
+    rows = torch.arange(WINDOW)
     order = torch.randperm(
         len(starts), generator=torch.Generator().manual_seed(_shuffle_seed(seed))
     )

@@ -61,7 +61,8 @@ def timed(launcher: LocalLauncher | RayLauncher, groups: Sequence[Group]) -> dic
     """What launching costs [s]: until the first group begins, and what is added to a task of a group."""
     asked = time.perf_counter()
     begun: list[float] = []
-    seconds, ended = [], asked
+    seconds = []
+    ended = asked
     for done in launcher.launch(
         groups, StopSignals(), lambda *_: begun.append(time.perf_counter())
     ):
@@ -159,7 +160,8 @@ def sweep(scratch: Path, combinations: int, seeds: int, tracking: str) -> dict[s
         time.sleep(1.0)
     if process.returncode:
         raise SystemExit((scratch / f"{tracking}.log").read_text())
-    seconds, number = time.perf_counter() - begun, combinations * seeds
+    seconds = time.perf_counter() - begun
+    number = combinations * seeds
     busy = np.array([own for own in samples if 0.2 * number < own[0] < number and own[1] > 0])
     made = {"trainings": number, "seconds": round(seconds, 1)}
     if len(busy) > 5:
@@ -284,7 +286,8 @@ def million(
     measured: Mapping[str, Any], seconds: float = 10.0, trainings: float = 1e6, cores: float = 1e3
 ) -> dict[str, float]:
     """10⁶ trainings of 10 s on 1,000 cores, each part by itself, from what was measured here [h, unless it says otherwise]."""
-    plain, tracked = measured["sweep"]["none"], measured["sweep"]["mlflow"]
+    plain = measured["sweep"]["none"]
+    tracked = measured["sweep"]["mlflow"]
     wanted = trainings / (trainings * seconds / cores)
     listing = measured["listing"]
     quick = {
@@ -332,7 +335,8 @@ def computed(result: dict[str, Any]) -> None:
             result["launchers"]["local"], result["launchers"]["ray"]
         )
     if "sweep" in result:
-        plain, tracked = result["sweep"]["none"], result["sweep"]["mlflow"]
+        plain = result["sweep"]["none"]
+        tracked = result["sweep"]["mlflow"]
         if "parent_cpu_s_a_training" in plain and "parent_cpu_s_a_training" in tracked:
             tracked["mlflow_s_a_training"] = round(
                 tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4

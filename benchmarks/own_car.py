@@ -23,7 +23,8 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "own_car"
 DRIVE = Path("revs") / "20140222_01_01_03_250lm"
-WHEELBASE, MASS = "2.4", "982"  # m, kg (data sheet)
+WHEELBASE = "2.4"
+MASS = "982"  # m, kg (data sheet)
 G = 9.80665
 
 
@@ -73,7 +74,8 @@ def main() -> None:
         os.environ["VEHEST_OUTPUT"] = str(folder / "outputs")
         os.environ.pop("VEHEST_DATA")
         write_log(Path(data), folder / "lap.csv")
-        rows, output = [], ""
+        rows = []
+        output = ""
         new = ["new", "my_car", "lap.csv", "--yes", "--wheelbase", WHEELBASE, "--mass", MASS]
         run = ["run", "my_car", "--minutes", f"{minutes:g}", "tracking=none"]
         for words in (new, run, run):

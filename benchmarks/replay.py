@@ -58,7 +58,8 @@ def check(names: list[str]) -> None:
     from replayed_drive import FERRARI, compare
 
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
-    drive, rows = ferrari(*FERRARI), []
+    drive = ferrari(*FERRARI)
+    rows = []
     for name in names or ["pretrained", *map(str, models_of_training_range(output))]:
         with tempfile.TemporaryDirectory() as folder:
             found = compare(name, drive, Path(folder), output)
@@ -100,14 +101,17 @@ def soak(minutes: float, model: str) -> int:
     if os.environ.get("VEHEST_DATA"):
         from can_drive import ferrari
 
-        name, drive = "ferrari_250lm", ferrari(*FERRARI)
+        name = "ferrari_250lm"
+        drive = ferrari(*FERRARI)
     else:
-        name, drive = "planar", planar_drive(150.0, 100.0)
+        name = "planar"
+        drive = planar_drive(150.0, 100.0)
     repeats = max(math.ceil(60.0 * minutes / drive.duration), 1)
     with tempfile.TemporaryDirectory() as folder:
         drive = drive.cut(drive.start_time, drive.start_time + 60.0 * minutes / repeats)
         written = write_log(drive, Path(folder), ".blf", jitter=JITTER, lost=LOST, repeats=repeats)
-        signals, out = told_for(load_model(model).channels), Path(folder) / "estimates.csv"
+        signals = told_for(load_model(model).channels)
+        out = Path(folder) / "estimates.csv"
         resident: list[float] = []
 
         def look() -> bool:

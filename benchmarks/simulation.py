@@ -24,7 +24,10 @@ ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "results" / "benchmarks" / "simulation.json"
 DATASETS = os.environ.get("BENCH_DATASETS", "sim_small,sim_bmw").split(",")
 MOST_SECONDS = {"sim_small": 20.0, "sim_bmw": 480.0}  # on two cores
-SECONDS, SPEED, STEP, REPEATS = 2.0, 25.0, 1e-3, 3
+SECONDS = 2.0
+SPEED = 25.0
+STEP = 1e-3
+REPEATS = 3
 STEERING = 0.02  # rad/s for the first second
 
 
@@ -58,7 +61,8 @@ def plant_runs() -> tuple[float, float, float]:
         return x
 
     def compiled() -> Any:
-        turning, straight = np.array([STEERING, 0.0, 0.0, 0.0, 0.0]), np.zeros(5)
+        turning = np.array([STEERING, 0.0, 0.0, 0.0, 0.0])
+        straight = np.zeros(5)
         return plant.advance(
             plant.advance(start, turning, n_steps // 2), straight, n_steps - n_steps // 2
         ).values

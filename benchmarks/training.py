@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "training.json"
-SAMPLES, REPEATS, MEMBERS = 6000, 3, 5
+SAMPLES = 6000
+REPEATS = 3
+MEMBERS = 5
 STRUCTURES = {
     "ksnn_linear_bias_p2": ("ksnn", {"n_hidden": 0, "bias": True}),
     "ksnn_nonlinear_no_bias_p2_q2": ("ksnn", {"n_hidden": 2, "bias": False}),

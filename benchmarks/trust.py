@@ -77,10 +77,8 @@ def faults_row() -> dict[str, Any]:
     from vehest.trust.faults import KINDS, Fault, inject
 
     model = vehest.load_model()
-    trust, drive = (
-        vehest.api._TRUST[model],
-        prepared_recording(model, linear_drive(150.0, 100.0, 0)[0]),
-    )
+    trust = vehest.api._TRUST[model]
+    drive = prepared_recording(model, linear_drive(150.0, 100.0, 0)[0])
     faults = [
         Fault(kind, "vx" if kind == "lost_wheel" else "ay", severity, onset=onset)  # type: ignore[arg-type]
         for kind in KINDS

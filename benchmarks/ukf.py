@@ -35,7 +35,8 @@ from beside import result_file, spinning
 
 ROOT = Path(__file__).parents[1]
 RESULT = result_file("ukf")
-STEPS, ONLINE_STEPS = 500, 10_000
+STEPS = 500
+ONLINE_STEPS = 10_000
 THREADS = int(os.environ.get("BENCH_THREADS", "2"))
 CASES = {
     28: (8.0, 3, 2),
@@ -45,17 +46,18 @@ TRAINED_ON = {
     "f1tenth": "iros",
     "sim_tyre_sets": "learn",
 }  # how the names of training recordings begin
-MOST_MEMORY, MOST_DIFFERENCE, MOST_COMPILING = 0.5, 1e-3, 90.0  # of the plain one's, relative, s
-MEDIAN_STEP, WORST_STEP = 2.0, 10.0  # ms
-FORCE_SIGN_STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = (
-    100.0,
-    1e-6,
-    -2.0,
-    0.01,
-    -9.0,
-    1e-7,
-    0.01,
-)
+MOST_MEMORY = 0.5
+MOST_DIFFERENCE = 1e-3
+MOST_COMPILING = 90.0  # of the plain one's, relative, s
+MEDIAN_STEP = 2.0
+WORST_STEP = 10.0  # ms
+FORCE_SIGN_STEEPNESS = 100.0
+STILL = 1e-6
+KAPPA = -2.0
+GAP = 0.01
+LEAST_ENTROPY = -9.0
+FLOOR = 1e-7
+SCALE = 0.01
 
 
 class Problem(NamedTuple):
@@ -139,10 +141,8 @@ def pretrain(file: str) -> None:
 
     torch.set_num_threads(1)
     task = problem(1)
-    model, counted = (
-        task.estimator.filter,
-        Weights(*[task.weights * task.weights.new_tensor([1.0] * 4 + [0.0])] * 3),
-    )
+    model = task.estimator.filter
+    counted = Weights(*[task.weights * task.weights.new_tensor([1.0] * 4 + [0.0])] * 3)
     train = [
         task.estimator.drive(recording, torch.float32)
         for recording in recordings(TRAINED_ON[dataset()])
@@ -171,12 +171,11 @@ def plain(task: Problem) -> Any:
     from torchdiffeq._impl import fixed_grid, rk_common
 
     fixed_grid.rk4_alt_step_func = rk_common.rk4_step_func
-    car_filter, drives = task.estimator.filter, task.drives
-    car, chassis, network = (
-        car_filter.dynamics.car.learnt,
-        car_filter.dynamics.car,
-        car_filter.dynamics.network,
-    )
+    car_filter = task.estimator.filter
+    drives = task.drives
+    car = car_filter.dynamics.car.learnt
+    chassis = car_filter.dynamics.car
+    network = car_filter.dynamics.network
     p = {name.removeprefix("log_"): logarithm.exp() for name, logarithm in car.named_parameters()}
     rear = p["cg_to_rear_axle"]
     front = chassis.wheelbase - rear
@@ -193,7 +192,8 @@ def plain(task: Problem) -> Any:
         )
         hidden = torch.sigmoid(network[0](seen / network.input_scale))
         out = network[4](torch.sigmoid(network[2](hidden))) * network.output_scale
-        rear_x, front_x = friction * out[..., 0], friction * out[..., 1]
+        rear_x = friction * out[..., 0]
+        front_x = friction * out[..., 1]
         rear_y = (
             -friction
             * functional.softplus(out[..., 2])
@@ -216,16 +216,15 @@ def plain(task: Problem) -> Any:
         ay = (sideways + rear_y) / chassis.mass
         lost = p["friction_viscous"] * rim + p["friction_coulomb"] * torch.sign(rim)
         torque = p["torque_constant"] * current - chassis.wheel_radius * (front_x + rear_x) - lost
-        turning, spinning = (
-            (sideways * front - rear_y * rear) / p["yaw_inertia"],
-            chassis.wheel_radius / p["powertrain_inertia"] * torque,
-        )
+        turning = (sideways * front - rear_y * rear) / p["yaw_inertia"]
+        spinning = chassis.wheel_radius / p["powertrain_inertia"] * torque
         return ax, ay, turning, spinning
 
     def moved(x: Any, u: Any) -> Any:
         def rates(_: Any, x: Any) -> Any:
             ax, ay, turning, spinning = motion(x, u)
-            vy_yaw, vx_yaw = x[..., 1] * x[..., 2], x[..., 0] * x[..., 2]
+            vy_yaw = x[..., 1] * x[..., 2]
+            vx_yaw = x[..., 0] * x[..., 2]
             return torch.stack(
                 [ax + vy_yaw, ay - vx_yaw, turning, spinning, torch.zeros_like(ax)], -1
             )
@@ -248,10 +247,8 @@ def plain(task: Problem) -> Any:
     def product(left: Any, right: Any) -> Any:
         return (weights[:, None] * left).mT @ right
 
-    process, observation = (
-        _noise(car_filter.process_noise, drives.states, LEAST_ENTROPY),
-        _noise(car_filter.observation_noise, drives.states),
-    )
+    process = _noise(car_filter.process_noise, drives.states, LEAST_ENTROPY)
+    observation = _noise(car_filter.observation_noise, drives.states)
     initial = _factor(car_filter.initial_noise.factor, car_filter.initial_noise.unit)
     mean = drives.states[:, 0]
     covariance = (initial @ initial.mT + FLOOR * torch.eye(n)).expand(len(mean), n, n)
@@ -328,12 +325,16 @@ def training_step(
     import torch
 
     torch.set_num_threads(THREADS)
-    task, warm = problem(sequences, STEPS, dtype, weights), problem(2, 3, dtype)
+    task = problem(sequences, STEPS, dtype, weights)
+    warm = problem(2, 3, dtype)
     WAYS[way](task if way == "jax" else warm).backward()  # JAX compiles for every shape
-    before, seconds, busy = _peak(), [], []
+    before = _peak()
+    seconds = []
+    busy = []
     for _ in range(repeats):
         task.estimator.filter.zero_grad()
-        started, began = time.perf_counter(), time.process_time()
+        started = time.perf_counter()
+        began = time.process_time()
         loss = WAYS[way](task)
         loss.backward()
         seconds.append(time.perf_counter() - started)
@@ -372,7 +373,8 @@ def online_steps() -> tuple[float, float]:
 
 def first_steps() -> float:
     """Seconds that the first training step of a process takes longer than its second."""
-    task, seconds = problem(2, 3), []
+    task = problem(2, 3)
+    seconds = []
     for _ in range(2):
         started = time.perf_counter()
         ours(task).backward()

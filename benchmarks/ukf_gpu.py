@@ -27,16 +27,16 @@ from torch.utils.checkpoint import checkpoint
 
 ROOT = Path(__file__).parents[1]
 RESULT = Path(os.environ.get("OUT", ROOT / "results" / "benchmarks")) / "ukf_gpu.json"
-STEPS, SEQUENCES, REPEATS = 500, (4096, 256), 3
-STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = (
-    100.0,
-    1e-6,
-    -2.0,
-    0.01,
-    -9.0,
-    1e-7,
-    0.01,
-)
+STEPS = 500
+SEQUENCES = (4096, 256)
+REPEATS = 3
+STEEPNESS = 100.0
+STILL = 1e-6
+KAPPA = -2.0
+GAP = 0.01
+LEAST_ENTROPY = -9.0
+FLOOR = 1e-7
+SCALE = 0.01
 
 
 def write(file: str) -> None:
@@ -60,7 +60,8 @@ def write(file: str) -> None:
 
 def drawn_sequences(drives: list[tuple[Tensor, ...]], count: int) -> list[Tensor]:
     """States, inputs and measurements at random places, (count, STEPS, ...)."""
-    generator, parts = torch.Generator().manual_seed(0), []
+    generator = torch.Generator().manual_seed(0)
+    parts = []
     drives = [drive for drive in drives if len(drive[0]) >= STEPS]
     for _ in range(count):
         drive = drives[int(torch.randint(len(drives), (), generator=generator))]
@@ -120,7 +121,8 @@ class Filter(torch.nn.Module):
 
     def parts(self) -> list[Tensor]:
         """Tensors of the parameters that a step needs."""
-        car, network = self.own.dynamics.car.learnt, self.own.dynamics.network
+        car = self.own.dynamics.car.learnt
+        network = self.own.dynamics.network
         learnt = {name.removeprefix("log_"): value.exp() for name, value in car.named_parameters()}
         names = (
             "cg_to_rear_axle",
@@ -158,10 +160,8 @@ class Filter(torch.nn.Module):
         vx, vy, yaw_rate, rim, friction = x.unbind(-1)
         steer, current = (part[:, None].expand(vx.shape) for part in u.unbind(-1))
         along = vx + STILL
-        slip_front, slip_rear = (
-            torch.atan((vy + front * yaw_rate) / along) - steer,
-            torch.atan((vy - rear * yaw_rate) / along),
-        )
+        slip_front = torch.atan((vy + front * yaw_rate) / along) - steer
+        slip_rear = torch.atan((vy - rear * yaw_rate) / along)
         seen = (
             torch.stack(
                 [vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along],
@@ -173,7 +173,8 @@ class Filter(torch.nn.Module):
             functional.linear(torch.sigmoid(functional.linear(seen, w1, b1)), w2, b2)
         )
         out = functional.linear(hidden, w3, b3) * out_scale
-        rear_x, front_x = friction * out[..., 0], friction * out[..., 1]
+        rear_x = friction * out[..., 0]
+        front_x = friction * out[..., 1]
         rear_y = -friction * functional.softplus(out[..., 2]) * torch.tanh(STEEPNESS * slip_rear)
         front_y = -friction * functional.softplus(out[..., 3]) * torch.tanh(STEEPNESS * slip_front)
         drag = drag_0 * torch.sign(vx) + drag_1 * vx + drag_2 * vx**2
@@ -246,7 +247,8 @@ class Filter(torch.nn.Module):
         predicted = (self.shares[:, None] * expected).sum(1)
         deviation = expected - predicted[:, None]
         weighted = (self.shares[:, None] * deviation).mT
-        innovation, cross = weighted @ deviation + r, weighted @ (at - mean[:, None])
+        innovation = weighted @ deviation + r
+        cross = weighted @ (at - mean[:, None])
         gain = solved(factor(innovation, 4), cross, 4).mT
         mean = torch.maximum(mean + (gain @ (z - predicted)[..., None])[..., 0], self.lower)
         covariance = covariance - gain @ innovation @ gain.mT
@@ -348,7 +350,8 @@ def gradients_of(filter_: Any) -> Tensor:
 
 def timed(work: Any, filter_: Any, repeats: int, wait: Any) -> tuple[float, float, Tensor]:
     """Median seconds of forward and backward, loss and gradients."""
-    seconds, value = [], 0.0
+    seconds = []
+    value = 0.0
     for _ in range(repeats):
         for parameter in filter_.parameters():
             parameter.grad = None
@@ -368,9 +371,11 @@ def run(file: str) -> None:
     from vehest.estimators.learned_ukf import WEIGHTS
     from vehest.training.through_filter import Drive
 
-    held, cores = torch.load(file, weights_only=True), os.cpu_count() or 1
+    held = torch.load(file, weights_only=True)
+    cores = os.cpu_count() or 1
     torch.set_num_threads(cores)
-    weights, rows = torch.tensor([*WEIGHTS, 1.0]), []
+    weights = torch.tensor([*WEIGHTS, 1.0])
+    rows = []
     cpu = model_of(held)
     gpu = model_of(held).cuda() if torch.cuda.is_available() else None
     for count in SEQUENCES:
@@ -413,7 +418,8 @@ def on_gpu(
 ) -> dict[str, Any]:
     """One row's part of the GPU: eager, compiled, and compiled steps replayed from one graph."""
     torch._dynamo.reset()
-    model, wait = Filter(filter_).cuda(), torch.cuda.synchronize
+    model = Filter(filter_).cuda()
+    wait = torch.cuda.synchronize
     found: dict[str, Any] = {}
     ways = {
         "eager": (model.update, model.forward),

@@ -11,15 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-STILL, STEEPNESS, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = (
-    1e-6,
-    100.0,
-    -2.0,
-    0.01,
-    -9.0,
-    1e-7,
-    0.01,
-)  # as in ukf.py
+STILL = 1e-6
+STEEPNESS = 100.0
+KAPPA = -2.0
+GAP = 0.01
+LEAST_ENTROPY = -9.0
+FLOOR = 1e-7
+SCALE = 0.01  # as in ukf.py
 
 
 def loss_of(task: Any) -> torch.Tensor:
@@ -99,10 +97,8 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
             vx, vy, yaw_rate, rim, friction = (x[..., i] for i in range(5))
             steer, current = (jnp.broadcast_to(u[..., i], vx.shape) for i in range(2))
             along = vx + STILL
-            slip_front, slip_rear = (
-                jnp.arctan((vy + front * yaw_rate) / along) - steer,
-                jnp.arctan((vy - rear * yaw_rate) / along),
-            )
+            slip_front = jnp.arctan((vy + front * yaw_rate) / along) - steer
+            slip_rear = jnp.arctan((vy - rear * yaw_rate) / along)
             seen = jnp.stack(
                 [vx, vy, yaw_rate, rim, friction, steer, slip_front, slip_rear, (rim - vx) / along],
                 -1,
@@ -111,7 +107,8 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
             for weight, offset in layers[:2]:
                 hidden = jax.nn.sigmoid(hidden @ weight + offset)
             out = (hidden @ layers[2][0] + layers[2][1]) * known["dynamics.network.output_scale"]
-            rear_x, front_x = friction * out[..., 0], friction * out[..., 1]
+            rear_x = friction * out[..., 0]
+            front_x = friction * out[..., 1]
             rear_y = -friction * jax.nn.softplus(out[..., 2]) * jnp.tanh(STEEPNESS * slip_rear)
             front_y = -friction * jax.nn.softplus(out[..., 3]) * jnp.tanh(STEEPNESS * slip_front)
             drag = (
@@ -175,10 +172,8 @@ def _compiled(fixed: tuple[float, ...]) -> Any:
                 + scale * varying @ varying.mT
             )
 
-        process, observation = (
-            noise("process_noise", process_floor),
-            noise("observation_noise", observation_floor),
-        )
+        process = noise("process_noise", process_floor)
+        observation = noise("observation_noise", observation_floor)
         entropy = 0.5 * (n * math.log(2.0 * math.pi * math.e) + jnp.linalg.slogdet(process)[1])
         process = (
             jnp.exp(2.0 / n * jnp.maximum(LEAST_ENTROPY - entropy, 0.0))[..., None, None] * process

@@ -26,7 +26,9 @@ import pyarrow.parquet as pq
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "results" / "benchmarks" / "workflow.json"
 REPEATS = 5
-RATE, MINUTE, LONG = 100.0, 60.0, 15 * 3600.0
+RATE = 100.0
+MINUTE = 60.0
+LONG = 15 * 3600.0
 LIBRARIES = "import numba, scipy.special, pyarrow.parquet, hydra"
 
 
@@ -34,7 +36,8 @@ def measured(
     command: Sequence[str], folder: Path, repeats: int = REPEATS, source: Path | None = None
 ) -> dict[str, float]:
     """Seconds of the quickest run and peak memory [MB] of the largest, of the code in ``source`` or else of the installed one."""
-    seconds, memory = [], []
+    seconds = []
+    memory = []
     environment = {**os.environ, "VEHEST_OUTPUT": str(folder / "outputs")} | (
         {"PYTHONPATH": str(source)} if source else {}
     )
@@ -58,7 +61,8 @@ def measured(
 def write_drive(file: Path, seconds: float) -> None:
     """A sine in the shape of a drive; in a process of its own, whose memory would count as that of its children."""
     t = np.arange(round(seconds * RATE)) / RATE
-    vx, yaw_rate = 25.0 + 3.0 * np.sin(t / 7.0), 0.2 * np.sin(t / 2.0)
+    vx = 25.0 + 3.0 * np.sin(t / 7.0)
+    yaw_rate = 0.2 * np.sin(t / 2.0)
     columns = {
         "time": t,
         "yaw_rate": yaw_rate,
@@ -76,10 +80,8 @@ def cases_of(folder: Path, source: Path | None = None) -> dict[str, dict[str, fl
     for file in ("minute.parquet", "long.parquet"):
         (folder / file).symlink_to(folder.parent / file)
     vehest = (sys.executable, "-c", "from vehest.cli import main; main()")
-    run, minute = (
-        (*vehest, "run", "quickstart", "tracking=none"),
-        (*vehest, "estimate", "minute.parquet", "-o", "out.parquet"),
-    )
+    run = (*vehest, "run", "quickstart", "tracking=none")
+    minute = (*vehest, "estimate", "minute.parquet", "-o", "out.parquet")
     for command in (run, minute):
         measured(command, folder, 1, source)
     return {

@@ -63,7 +63,8 @@ SHOWN = [
 
 def install(site: Path, place: Path) -> None:
     """Modules, templates and entry points into a new folder, as pip would install them, and the configuration into ``place``/conf."""
-    about, configuration = site / "vehest_examples-1.0.dist-info", place / "conf" / "estimator"
+    about = site / "vehest_examples-1.0.dist-info"
+    configuration = place / "conf" / "estimator"
     about.mkdir(parents=True)
     configuration.mkdir(parents=True, exist_ok=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: vehest-examples\nVersion: 1.0\n")
@@ -77,7 +78,8 @@ def install(site: Path, place: Path) -> None:
 def main() -> None:
     """Run the comparison, print the leaderboard and write it."""
     with tempfile.TemporaryDirectory(prefix="examples-") as scratch:
-        site, place = Path(scratch) / "site", Path(scratch) / "place"
+        site = Path(scratch) / "site"
+        place = Path(scratch) / "place"
         install(site, place)
         (place / "pipelines").mkdir()
         (place / "pipelines" / "examples.yaml").write_text(yaml.safe_dump(PIPELINE))

@@ -44,8 +44,12 @@ def drives_of(dataset: str, pattern: str) -> list[Recording]:
 
 def quantities(drive: Recording) -> pd.DataFrame:
     """A column a quantity, of `DIGITS`; what inertial channels show beside the reference's derivatives counts either sign."""
-    vx, vy, turn, rate = drive["vx_ref"], drive["vy_ref"], drive["yaw_rate_ref"], drive.rate_hz
-    ax, ay = np.gradient(vx) * rate - vy * turn, np.gradient(vy) * rate + vx * turn
+    vx = drive["vx_ref"]
+    vy = drive["vy_ref"]
+    turn = drive["yaw_rate_ref"]
+    rate = drive.rate_hz
+    ax = np.gradient(vx) * rate - vy * turn
+    ay = np.gradient(vy) * rate + vx * turn
     return pd.DataFrame(
         {
             "v_x [m/s]": vx,
@@ -71,10 +75,15 @@ def derivative(samples: np.ndarray, rate_hz: float) -> np.ndarray:
 
 def identified(drives: Sequence[Recording]) -> Iterator[str]:
     """Lines: motor, steering and vibration of the real car, with mass, wheel radius and wheelbase as given."""
-    mass, radius, wheelbase = CAR["mass"], CAR["wheel_radius"], CAR["cg_to_front_axle"] + REAR
+    mass = CAR["mass"]
+    radius = CAR["wheel_radius"]
+    wheelbase = CAR["cg_to_front_axle"] + REAR
     columns = []
     for drive in drives:
-        vx, vy, turn, rate = drive["vx_ref"], drive["vy_ref"], drive["yaw_rate_ref"], drive.rate_hz
+        vx = drive["vx_ref"]
+        vy = drive["vy_ref"]
+        turn = drive["yaw_rate_ref"]
+        rate = drive.rate_hz
         scrub = -(derivative(vy, rate) + vx * turn) * np.tan(drive["steer"]) * REAR / wheelbase
         left = derivative(vx, rate) - vy * turn - scrub
         rows = (left, drive["motor_current"], -derivative(drive["vx"], rate), -np.ones_like(vx))
@@ -89,10 +98,8 @@ def identified(drives: Sequence[Recording]) -> Iterator[str]:
     )
     largest = max(drive["steer"].max() for drive in drives)
     yield f"steering_rate: 99 % below {np.quantile(steer_rate, 0.99):.2f} rad/s; largest_steer {largest:.3f} rad"
-    shown, speed = (
-        pd.concat(map(quantities, drives)),
-        np.concatenate([drive["motor_speed"] for drive in drives]),
-    )
+    shown = pd.concat(map(quantities, drives))
+    speed = np.concatenate([drive["motor_speed"] for drive in drives])
     spread = (shown.filter(like="less its truth") ** 2).groupby(speed // 10 * 10).mean() ** 0.5
     yield f"RMS by wheel speed from [rad/s]:\n{spread.loc[10:70].round(2).to_string()}"
     for channel in ("yaw_rate_ref", "vx_ref", "vy_ref", "vx", "motor_current"):

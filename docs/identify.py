@@ -39,10 +39,8 @@ Figures = dict[str, float]  # by name; those that end in ``_sd`` are standard de
 Parts = Iterator[tuple[str, Figures]]  # each with its title
 
 BLOCK = 50  # samples that are resampled together
-ACROSS, ALONG = (
-    ("lateral", "forward", "lever ahead", "one"),
-    ("forward", "lateral", "lever along", "one"),
-)
+ACROSS = ("lateral", "forward", "lever ahead", "one")
+ALONG = ("forward", "lateral", "lever along", "one")
 
 
 def declared(dataset: str) -> dict[str, Any]:
@@ -53,7 +51,8 @@ def declared(dataset: str) -> dict[str, Any]:
 
 def factors_of(columns: Mapping[str, Any], measured: Any, chosen: Any = slice(None)) -> Figures:
     """Factors of least squares by the columns' names, and their standard deviations."""
-    rows, values = np.stack(list(columns.values()), axis=1)[chosen], np.asarray(measured)[chosen]
+    rows = np.stack(list(columns.values()), axis=1)[chosen]
+    values = np.asarray(measured)[chosen]
     blocks = len(rows) // BLOCK
     generator = np.random.default_rng(0)
     drawn = []
@@ -188,10 +187,8 @@ def av21(folder: Path) -> Parts:
             }
         )
         moving = table[table["vx"] > 5.0]
-        angle, straight = (
-            np.degrees(np.arctan2(moving["vy"], moving["vx"])),
-            np.abs(moving["r"]) < 0.01,
-        )
+        angle = np.degrees(np.arctan2(moving["vy"], moving["vx"]))
+        straight = np.abs(moving["r"]) < 0.01
         ratios.append(float((moving["wheels"] / moving["vx"]).median()))
         found = explained(
             [table.assign(kept=table["vx"] > 5.0)], "wheels", ("vx",), np.arange(-0.2, 0.21, 0.02)
@@ -215,19 +212,19 @@ def av21(folder: Path) -> Parts:
 
 def dart(folder: Path) -> Parts:
     """Poses at 100 Hz with sensors at 10 Hz, in the rows from which ``elapsed time sensors`` has changed."""
-    given, drives = declared("dart"), []
+    given = declared("dart")
+    drives = []
     found: Figures
     dropped = dropped_rows_from_config(given["drop_rows"], "dart")
-    place, encoder, accelerometer = (
-        ["vicon x", "vicon y"],
-        "vel encoder",
-        ("acc x (IMU)", "acc y (IMU)"),
-    )
+    place = ["vicon x", "vicon y"]
+    encoder = "vel encoder"
+    accelerometer = ("acc x (IMU)", "acc y (IMU)")
     for file in sorted(folder.glob("*/*.csv")):
         table = pd.read_csv(file)
         excluded = any(fnmatchcase(file.stem, pattern) for pattern in given["exclude"])
         rows = kept_rows(len(table), () if excluded else dropped.get(file.stem, ()), file)
-        seconds, poses = float(np.ptp(table["vicon time"])), table[place].to_numpy(np.float64)
+        seconds = float(np.ptp(table["vicon time"]))
+        poses = table[place].to_numpy(np.float64)
         title = ("left out " if excluded else "") + f"{file.parent.name}/{file.stem}"
         found = {
             "rows": len(table),
@@ -305,7 +302,8 @@ def dart(folder: Path) -> Parts:
         | {"origin left of the axis [m]": by["encoder by yaw rate [m]"] / by["encoder by vx"]},
     )
 
-    delays, found = np.arange(-0.05, 0.1501, 0.0025), {}
+    delays = np.arange(-0.05, 0.1501, 0.0025)
+    found = {}
     for name, of, chosen in (
         ("W (IMU)", "yaw_rate", np.ones_like(gentle)),
         (encoder, "vx", gentle.copy()),
@@ -353,7 +351,9 @@ def spread(name: str, values: Sequence[float]) -> Figures:
 
 def _dart_steering(drives: Sequence[pd.DataFrame]) -> Figures:
     """Angle of a kinematic single track, atan(L·r/vx), for each command that has stood for a while at little lateral acceleration."""
-    knots, parts, delays = np.linspace(-1.0, 1.0, 9), [], []
+    knots = np.linspace(-1.0, 1.0, 9)
+    parts = []
+    delays = []
     drives = [
         drive.assign(angle=np.arctan(0.175 * drive["yaw_rate"] / np.maximum(drive["vx"], 0.3)))
         for drive in drives
@@ -373,10 +373,8 @@ def _dart_steering(drives: Sequence[pd.DataFrame]) -> Figures:
     found = factors_of(corners, angle)
     curve = [found[name] for name in corners]
     for drive in drives:
-        wanted, gentle = (
-            np.interp(drive["steering"].to_numpy(), knots, curve),
-            drive["moving"] & (drive["across"] < 3.0),
-        )
+        wanted = np.interp(drive["steering"].to_numpy(), knots, curve)
+        gentle = drive["moving"] & (drive["across"] < 3.0)
         if (
             np.quantile(np.abs(wanted[10:] - wanted[:-10]), 0.9) >= 0.02
         ):  # slow steering has no delay to find
@@ -419,7 +417,8 @@ def roboracer(folder: Path) -> Parts:
                 0, 1
             ]
         yield "The publishers' reference", found
-        motor, angle = joined(runs, "Speed"), joined(runs, "steering_angle")
+        motor = joined(runs, "Speed")
+        angle = joined(runs, "steering_angle")
         calm = (np.abs(joined(runs, "change of vx")) < 1.0) & (np.abs(yaw_rate) < 1.0)
         gain = float(motor[calm] @ vx[calm] / (vx[calm] @ vx[calm]))
         about = {"rpm for 1 m/s": gain, "vx less the car's, deviation": (motor / gain - vx).std()}
@@ -436,7 +435,8 @@ def roboracer(folder: Path) -> Parts:
 
 def _roboracer_run(table: pd.DataFrame) -> pd.DataFrame:
     """A run with its motion from poses; rows count in which the car moves and the pose is not lost within 5 rows. Prints where it is."""
-    place, rate = ["pose_x", "pose_y"], 20.0
+    place = ["pose_x", "pose_y"]
+    rate = 20.0
     run = with_motion(table.rename(columns={"yaw_rate": "gyro"}), place, "yaw", 5, rate)
     run = run.assign(
         gyro=np.radians(run["gyro"]),
@@ -455,13 +455,12 @@ def _roboracer_run(table: pd.DataFrame) -> pd.DataFrame:
     ranges: list[
         tuple[float, float]
     ] = []  # where the pose's speed from row to row is not the motor's, ±0.35 s
-    speed, motor, stamps = (
-        np.linalg.norm(np.diff(run[place], axis=0), axis=1) * rate,
-        run["Speed"] / 4320.0,
-        run["t"].to_numpy(),
-    )
+    speed = np.linalg.norm(np.diff(run[place], axis=0), axis=1) * rate
+    motor = run["Speed"] / 4320.0
+    stamps = run["t"].to_numpy()
     for row in np.flatnonzero(np.abs(speed - np.abs(motor.rolling(2).mean()[1:])) > 1.0):
-        begin, end = stamps[row] - 0.35, stamps[row + 1] + 0.35
+        begin = stamps[row] - 0.35
+        end = stamps[row + 1] + 0.35
         if ranges and begin <= ranges[-1][1]:
             begin = ranges.pop()[0]
         ranges.append((begin, end))
@@ -472,12 +471,10 @@ def _roboracer_run(table: pd.DataFrame) -> pd.DataFrame:
     return run.assign(kept=kept)
 
 
-IMU, MOTOR, BODY, SERVO = (
-    "/imu",
-    "/vesc/core",
-    "/optitrack/rigid_body_0",
-    "/vesc/servo_position_command",
-)
+IMU = "/imu"
+MOTOR = "/vesc/core"
+BODY = "/optitrack/rigid_body_0"
+SERVO = "/vesc/servo_position_command"
 RATES = {IMU: 400.0, MOTOR: 100.0, BODY: 100.0}
 FIELDS = {
     IMU: {
@@ -552,7 +549,8 @@ def f1tenth(folder: Path) -> Parts:
         sensed |= {
             name: bag.arrays[f"{topic}.{field}"][later] for name, field in FIELDS[topic].items()
         }
-    poses, even = np.stack([sensed[part] for part in POSE_FIELDS], axis=1), times[BODY]
+    poses = np.stack([sensed[part] for part in POSE_FIELDS], axis=1)
+    even = times[BODY]
     fast = np.flatnonzero(np.hypot(*np.gradient(poses[:, :2], even, axis=0).T) > 1.0)
     stamps = (bag.arrays[f"{BODY}@stamped"] - bag.summary["start"]) * 1e-9
     for name, clock in (("header", stamps[stamps >= START]), ("even", even)):
@@ -563,10 +561,8 @@ def f1tenth(folder: Path) -> Parts:
     yield "Whose time stamps, and which clock", found
 
     times[SERVO] = (bag.arrays[f"{SERVO}@received"] - bag.summary["start"]) * 1e-9
-    begin, end = (
-        max(own[0] for topic, own in times.items() if topic != SERVO),
-        min(own[-1] for own in times.values()),
-    )
+    begin = max(own[0] for topic, own in times.items() if topic != SERVO)
+    end = min(own[-1] for own in times.values())
     grid = np.arange(np.ceil(begin * 100.0), np.floor(end * 100.0) + 1) / 100.0
     motion = PoseOptions().references(
         *ground_plane(poses[:, :3], poses[:, 3:], "z", "pose"),
@@ -584,7 +580,8 @@ def f1tenth(folder: Path) -> Parts:
     moving = before[(before.vx > MOVING) & (np.abs(before.vx * before.yaw_rate) < GENTLE)]
     found = rigid_body(*(moving[name].to_numpy() for name in ("vx", "vy", "yaw_rate")), trim=False)
     yield "Rigid body", found
-    cosine, sine = np.cos(found["body_yaw"]), np.sin(found["body_yaw"])
+    cosine = np.cos(found["body_yaw"])
+    sine = np.sin(found["body_yaw"])
     drive = before.assign(
         vx=cosine * before.vx + sine * before.vy, vy=-sine * before.vx + cosine * before.vy
     )
@@ -639,7 +636,8 @@ def _imu(before: pd.DataFrame, drive: pd.DataFrame) -> Figures:
 def _servo(drive: pd.DataFrame, csv: pd.DataFrame) -> Figures:
     values, counts = np.unique(np.round(drive.steer, 9), return_counts=True)
     neutral = float(values[np.argmax(counts)])
-    across, away = np.abs(drive.vx * drive.yaw_rate), neutral - drive.steer
+    across = np.abs(drive.vx * drive.yaw_rate)
+    away = neutral - drive.steer
     turning = (drive.vx > MOVING) & (across > 0.3)
     full = (np.abs(away) > 0.345) & (drive.vx > MOVING) & (across < 2.0)
     full &= signal.convolve(full.astype(float), np.ones(31), mode="same") > 30.5
@@ -662,10 +660,8 @@ def _motor(drive: pd.DataFrame, csv: pd.DataFrame) -> Figures:
     found: Figures = {}
     for name, one in (("erpm_per_mps", drive), ("bag", drive), ("CSV", csv)):
         first = name == "erpm_per_mps"
-        lock, change = (
-            np.arctan(WHEELBASE * one.yaw_rate / np.maximum(one.vx, 0.1)),
-            signal.savgol_filter(one.vx, 21, 2, deriv=1, delta=0.01),
-        )
+        lock = np.arctan(WHEELBASE * one.yaw_rate / np.maximum(one.vx, 0.1))
+        change = signal.savgol_filter(one.vx, 21, 2, deriv=1, delta=0.01)
         key = name if first else f"{name}: motor over vx at no current"
         columns: dict[str, Any] = {
             key: one.vx,
@@ -696,8 +692,10 @@ def _publishers_filter(runs: Iterable[pd.DataFrame]) -> Figures:
     spectra = [
         signal.welch(run.yaw_rate.to_numpy(), 100.0, nperseg=512) for run in runs if len(run) > 1024
     ]
-    frequency, power = spectra[0][0], np.median([spectrum for _, spectrum in spectra], axis=0)
-    band, scores = (frequency > 5) & (frequency < 45), {}
+    frequency = spectra[0][0]
+    power = np.median([spectrum for _, spectrum in spectra], axis=0)
+    band = (frequency > 5) & (frequency < 45)
+    scores = {}
     for window in range(5, 31, 2):
         response = np.abs(
             signal.freqz(
@@ -715,7 +713,8 @@ def _publishers_filter(runs: Iterable[pd.DataFrame]) -> Figures:
 
 def _same_drive(drive: pd.DataFrame, runs: Iterable[pd.DataFrame]) -> Figures:
     """Slides the liveliest seconds of the bag along every run."""
-    gyro, n = drive.gyro.to_numpy(), min(map(len, runs))
+    gyro = drive.gyro.to_numpy()
+    n = min(map(len, runs))
     first = int(np.argmax(np.lib.stride_tricks.sliding_window_view(gyro, n).std(axis=1)))
     piece = gyro[first : first + n]
     nearest = [
@@ -733,7 +732,8 @@ def _same_drive(drive: pd.DataFrame, runs: Iterable[pd.DataFrame]) -> Figures:
 
 def _residuals(given: dict[str, Any], runs: Mapping[str, pd.DataFrame]) -> Figures:
     """As vehest ingests the bag, and of the CSV files; also where abs(vx·r) is below 4 m/s², and by the deviation of ay."""
-    topics, channels = given["topics"], ("vx_ref", "vy_ref", "ay", "yaw_rate")
+    topics = given["topics"]
+    channels = ("vx_ref", "vy_ref", "ay", "yaw_rate")
     changes = {"bag": {}, "bag, window of 15 samples": {"pose": given["pose"] | {"window": 15}}}
     changes["bag, IMU averaged over 10 ms"] = {
         "topics": topics | {"imu": topics["imu"] | {"average": 0.01}}
@@ -760,7 +760,8 @@ def _residuals(given: dict[str, Any], runs: Mapping[str, pd.DataFrame]) -> Figur
         }
         share = rest[moving].std() / low_pass(ay, 10.0, 100.0)[moving].std()
         found |= {f"{name}, mean": rest[moving].mean(), f"{name}, of ay": share}
-    one, wide = recordings["bag"], recordings["bag, window of 15 samples"]
+    one = recordings["bag"]
+    wide = recordings["bag, window of 15 samples"]
     for channel in ("vx_ref", "vy_ref", "yaw_rate_ref"):
         found[f"{channel} changes with a window of 15 samples"] = float(
             np.std((wide[channel] - one[channel])[one["vx_ref"] > MOVING])

@@ -44,7 +44,8 @@ FILTER_NOTE = (
 
 def chosen_step(table: Path = TABLE) -> pd.Series:
     """The row of the study's table that has the model, with its median FVU on the car that made the choice."""
-    frame, scores = pd.read_csv(table), pd.read_csv(table.parents[1] / "metrics.csv")
+    frame = pd.read_csv(table)
+    scores = pd.read_csv(table.parents[1] / "metrics.csv")
     (row,) = (row for _, row in frame[frame["model"].notna()].iterrows())
     own = (
         scores["trained_on"].str.endswith(f"/{row['part']}")
@@ -72,7 +73,8 @@ def note_of(row: pd.Series, estimator: Estimator) -> str:
         if estimator.name == "ksnn"
         else ""
     )
-    left, worse = row["other_simulator_fvu"], ""
+    left = row["other_simulator_fvu"]
+    worse = ""
     if left > 1.0:  # of the candidate with the lowest error there
         worse = " All candidates of the rule are worse than v = 0 on the simulated car that it asked; this one leaves FVU "
         worse += f"{fixed(left, 1)}."
@@ -88,7 +90,8 @@ def note_of(row: pd.Series, estimator: Estimator) -> str:
 
 def write(row: pd.Series, model: Path) -> None:
     """Copy a model with a note on its errors in the study."""
-    estimator, trained = load_model(model), read_description(model).about
+    estimator = load_model(model)
+    trained = read_description(model).about
     about = {
         "seed": trained.seed,
         "datasets": list(trained.datasets),
@@ -156,7 +159,8 @@ def write_filter(output: Path) -> None:
 
 def development_drives(output: Path) -> list[Stretch]:
     """Drives of the cars that the filter's choices were made on, with ax from the speed where it was not measured."""
-    runner, found = Runner(output, Messages(), StopSignals()), []
+    runner = Runner(output, Messages(), StopSignals())
+    found = []
     for car in (car for car in CARS if car.development):
         for drive in drives_of(car, runner, os.environ["VEHEST_DATA"]):
             ax = drive["ax"] if "ax" in drive else np.gradient(drive["vx"], 1.0 / drive.rate_hz)
@@ -169,7 +173,8 @@ def main() -> None:
     """Command line."""
     if sys.argv[1:] not in ([], ["--trust"]):
         sys.exit(__doc__)
-    output, row = Path(os.environ.get("VEHEST_OUTPUT", "outputs")), chosen_step()
+    output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
+    row = chosen_step()
     if "--trust" not in sys.argv:
         write(row, find_model(str(row["model"]), output, print))
     write_its_trust(str(row["part"]), output)

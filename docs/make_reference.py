@@ -277,10 +277,8 @@ def settings(*estimators: str) -> Iterable[str]:
     listed: set[tuple[str, ...]] = set()
     for name in estimators:
         rows = list(_declared(estimator_class(name).settings_type(), ""))
-        same, own = (
-            [row[0] for row in rows if row in listed],
-            [row for row in rows if row not in listed],
-        )
+        same = [row[0] for row in rows if row in listed]
+        own = [row for row in rows if row not in listed]
         if len(estimators) > 1:
             yield f"`{name}`" + (
                 f", besides {', '.join(same)} as above:"
@@ -298,7 +296,8 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
     from vehest.declared import Group, declaration
 
     for field in fields(settings):
-        value, declared = getattr(settings, field.name), declaration(field)
+        value = getattr(settings, field.name)
+        declared = declaration(field)
         if isinstance(value, Group):
             yield from _declared(value, f"{above}{field.name}.")
         elif declared is not None:

@@ -180,7 +180,8 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
                 for name, values in scipy.io.loadmat(file).items()
                 if not name.startswith("_")
             }
-            speed, yaw_rate = held["Speed_mps"], held["YawRate_radps"]
+            speed = held["Speed_mps"]
+            yaw_rate = held["YawRate_radps"]
             ay = held["LateralAcceleration_mps2"] + 1.43 * np.gradient(
                 yaw_rate, 0.005
             )  # from behind to the point of the sideslip
@@ -194,10 +195,8 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
         return
     if car.dataset == "autorally":
         for file in sorted((Path(root) / "autorally").glob("mppi_states_controls*.mat")):
-            states, accelerations = (
-                scipy.io.loadmat(file)["states"],
-                scipy.io.loadmat(str(file).replace("states_controls", "accels"))["a"],
-            )
+            states = scipy.io.loadmat(file)["states"]
+            accelerations = scipy.io.loadmat(str(file).replace("states_controls", "accels"))["a"]
             found = {
                 "yaw_rate": states[2],
                 "vx": states[0],
@@ -275,7 +274,9 @@ def errors_of(
 
     ``others`` are the numbers found on the car's other drives, from which "carried over" starts; NaN without any.
     """
-    speed, truth, has_ax = recording["vx"], recording["vy_ref"], "ax" in recording
+    speed = recording["vx"]
+    truth = recording["vy_ref"]
+    has_ax = "ax" in recording
     ax = recording["ax"] if has_ax else np.gradient(speed, 1.0 / recording.rate_hz)
     inputs = {"yaw_rate": recording["yaw_rate"], "vx": speed, "ay": recording["ay"], "ax": ax}
     plain = Recording(recording.id, recording.vehicle, recording.rate_hz, 0.0, inputs)
@@ -291,7 +292,8 @@ def errors_of(
         else found["v = 0"] * np.nan
     )
     variance = np.zeros(len(speed))
-    models, found["carried over"] = models_of(car, plain.rate_hz, has_ax), found["v = 0"] * np.nan
+    models = models_of(car, plain.rate_hz, has_ax)
+    found["carried over"] = found["v = 0"] * np.nan
     if others:
         with suppress(DataError):  # numbers that are not of a car
             models["carried over"] = calibrated(
@@ -334,12 +336,10 @@ def scored(car: Car, runner: Runner, root: str, shipped: Estimator) -> list[Erro
 def under_change(car: Car, runner: Runner, root: str) -> list[str]:
     """Lines on drives without a reference: numbers that are found from the priors, the median band and the share that is not valid."""
     _, shipped, trust = open_model(SELF_CALIBRATING, runner.output, print)
-    model, rows = (
-        with_settings(
-            shipped, {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle}
-        ),
-        [],
+    model = with_settings(
+        shipped, {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle}
     )
+    rows = []
     labelled = {"its labelled drives": list(drives_of(car, runner, root))}
     for title, drives in (
         labelled | {drive.id: [drive] for drive in unlabelled_of(car, runner, root)}
@@ -393,7 +393,8 @@ def ratio_interval(
         ]
         return np.array([part.sum() for part in parts])
 
-    own, shipped = sums(name), sums("shipped")
+    own = sums(name)
+    shipped = sums("shipped")
     drawn = np.random.default_rng(0).integers(0, len(own), (rounds, len(own)))
     low, high = np.quantile(np.sqrt(own[drawn].sum(1) / shipped[drawn].sum(1)), [0.025, 0.975])
     return float(low), float(high)
@@ -417,7 +418,8 @@ def open_cars(cars: Sequence[str], note: str) -> None:
         raise SystemExit(
             f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars"
         )
-    file, commit = TARGET / "openings.csv", git("rev-parse", "HEAD")
+    file = TARGET / "openings.csv"
+    commit = git("rev-parse", "HEAD")
     rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
     changed = (
         git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
@@ -458,26 +460,28 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
         if car.title in SHIPS_ON
     }
     ships = len(limits) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
-    rows, drives_below, by_time, ablated = [], [], [], []
+    rows = []
+    drives_below = []
+    by_time = []
+    ablated = []
     worse: list[tuple[str, float, float, float, float]] = []
     for car, drives in found.items():
-        title, shares = f"{car.title} ({car.origin})", [fvu(drive, "cold") for drive in drives]
+        title = f"{car.title} ({car.origin})"
+        shares = [fvu(drive, "cold") for drive in drives]
         drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
-        over, errors = (
-            "–",
-            [
-                rmse(drives, name)
-                for name in (
-                    "v = 0",
-                    "data sheet",
-                    "shipped",
-                    "cold",
-                    "carried over",
-                    "smoothed",
-                    "map",
-                )
-            ],
-        )
+        over = "–"
+        errors = [
+            rmse(drives, name)
+            for name in (
+                "v = 0",
+                "data sheet",
+                "shipped",
+                "cold",
+                "carried over",
+                "smoothed",
+                "map",
+            )
+        ]
         if car in ratios:
             over = f"{fixed(errors[3] / errors[2], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
         figures = [fixed(error, 2) if np.isfinite(error) else "–" for error in errors]
@@ -573,17 +577,16 @@ def main() -> None:
         default="",
         help="what else was chosen since the cars were last opened, and on what",
     )
-    given, root = parser.parse_args(), os.environ.get("VEHEST_DATA", "")
+    given = parser.parse_args()
+    root = os.environ.get("VEHEST_DATA", "")
     if not root:
         raise SystemExit("set VEHEST_DATA to the folder of the recordings")
     cars = [car for car in CARS if car.development or not given.development]
     if not given.development:
         TARGET.mkdir(parents=True, exist_ok=True)
         open_cars([car.title for car in cars if not car.development], given.note)
-    runner, (_, shipped, _) = (
-        Runner(given.output, Messages(), StopSignals()),
-        open_model("pretrained", given.output, print),
-    )
+    runner = Runner(given.output, Messages(), StopSignals())
+    (_, shipped, _) = open_model("pretrained", given.output, print)
     found: dict[Car, list[Errors]] = {}
     changed: list[str] = []
     for car in cars:

@@ -54,12 +54,11 @@ from vehest.trust.health import reason_in_words
 ORDER = ("leakage", "rear_axle", "grip", "compliance")
 SETS = {"κ": ORDER[:1], "κ, b": ORDER[:2], "κ, b, a_max": ORDER[:3], "κ, b, a_max, C": ORDER}
 SHIFTS = np.arange(-0.12, 0.121, 0.03)  # s, of yaw rate
-SETTLED, STEP = 2.0, 0.01  # s before the first sample, and between commands
-SHAPE, EXPONENT, COMPARED = (
-    1.4,
-    0.25,
-    0.8,
-)  # of the tyres' curve, of the filter's; share of the tyres' limit where they have the same slip
+SETTLED = 2.0
+STEP = 0.01  # s before the first sample, and between commands
+SHAPE = 1.4
+EXPONENT = 0.25
+COMPARED = 0.8  # of the tyres' curve, of the filter's; share of the tyres' limit where they have the same slip
 PAGE = """# A car's record
 
 What `vehest identify` finds on drives of one car and on cars whose numbers are known, and what `vehest estimate --car` makes of it. What is
@@ -145,11 +144,9 @@ def started(
 
 def judged(model: Estimator, drive: Recording, slowest: float) -> tuple[float, float]:
     """RMSE(β) where the car moves [deg], and the share of v within its band of 90 %."""
-    speed, truth, estimate = (
-        drive["vx"],
-        drive["vy_ref"],
-        model.estimate([drive.select(model.channels)])[0],
-    )
+    speed = drive["vx"]
+    truth = drive["vy_ref"]
+    estimate = model.estimate([drive.select(model.channels)])[0]
     moving = (speed > slowest) & np.isfinite(truth) & (np.arange(len(speed)) >= WARM_UP)
     angle = np.degrees(np.arctan2(estimate["vy"], speed) - np.arctan2(truth, speed))[moving]
     deviation = np.sqrt(
@@ -170,14 +167,10 @@ def carried_over(runner: Runner, root: str) -> tuple[pd.DataFrame, pd.DataFrame]
     pairs: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     for car in (car for car in CARS if car.development):
-        drives, apart = (
-            list(drives_of(car, runner, root)),
-            list(ingested(runner, root, *car.unlabelled)) if car.unlabelled else [],
-        )
-        model, found = (
-            filter_of(car, RATE, measured_ax=all("ax" in one for one in drives)),
-            identified_on(car, apart or drives),
-        )
+        drives = list(drives_of(car, runner, root))
+        apart = list(ingested(runner, root, *car.unlabelled)) if car.unlabelled else []
+        model = filter_of(car, RATE, measured_ax=all("ax" in one for one in drives))
+        found = identified_on(car, apart or drives)
         for name, (one, other) in product(LIMITS if apart else (), combinations(found, 2)):
             (a, of_a), (b, of_b) = (
                 without_prior(prior_of(model)[name], found[drive][name]) for drive in (one, other)
@@ -200,10 +193,8 @@ def carried_over(runner: Runner, root: str) -> tuple[pd.DataFrame, pd.DataFrame]
         for drive in drives:
             others = {name: own for name, own in found.items() if name not in (drive.id, HELD_BACK)}
             if others:
-                record, errors = (
-                    record_of(model, others),
-                    {"cold": judged(model, drive, car.slowest)[0]},
-                )
+                record = record_of(model, others)
+                errors = {"cold": judged(model, drive, car.slowest)[0]}
                 for title, by in product(SETS, (1.0, WIDENING, 3.0)):
                     errors[f"{title}; {by:g}"] = judged(
                         started(model, record, SETS[title], by), drive, car.slowest
@@ -237,10 +228,8 @@ def lateness(runner: Runner, root: str) -> pd.DataFrame:
     for car in (car for car in CARS if car.development):
         for drive in drives_of(car, runner, root):
             model = filter_of(car, RATE, measured_ax="ax" in drive)
-            found, known = (
-                lateness_of(model, drive),
-                lateral_lateness(motion_of(drive, ~standstill(drive))),
-            )
+            found = lateness_of(model, drive)
+            known = lateral_lateness(motion_of(drive, ~standstill(drive)))
             row: dict[str, Any] = {
                 "drive": f"{car.title}, {drive.id}",
                 "by the filter": 1e3 * found,
@@ -277,10 +266,8 @@ def limit_of(car: PlanarCar) -> float:
 
 def planted(car: PlanarCar, levels: SensorLevels) -> dict[str, float]:
     """What the numbers mean on the plant, as the report defines them."""
-    roll, share = (
-        GRAVITY * car.roll_gradient * levels.tilt.roll_share,
-        np.linspace(0.01, 0.98, 1000),
-    )  # of the limit of the filter's curve
+    roll = GRAVITY * car.roll_gradient * levels.tilt.roll_share
+    share = np.linspace(0.01, 0.98, 1000)  # of the limit of the filter's curve
     slip = (1.0 - (1.0 - share) ** EXPONENT) / EXPONENT / share  # over that of a linear axle
     of_tyres = math.tan(math.asin(COMPARED) / SHAPE) * SHAPE / COMPARED
     own = {"leakage": roll / (1.0 + roll), "rear_axle": car.cg_to_rear_axle + levels.imu.lever_x}
@@ -361,18 +348,19 @@ def driven(
 
     ``bank`` is positive with the road's left side higher; ``pull`` is of a trailer 1.2 m behind the rear axle, over the car's mass [m/s²].
     """
-    plant, times = PlanarPlant(car), np.arange(-SETTLED, seconds, STEP)
+    plant = PlanarPlant(car)
+    times = np.arange(-SETTLED, seconds, STEP)
     understeer = (1.0 / car.stiffness_factor_front - 1.0 / car.stiffness_factor_rear) / (
         GRAVITY * car.friction * SHAPE
     )
-    across, state, error = (
-        np.array([pull - GRAVITY * math.sin(bank(time)) for time in times]),
-        plant.initial_state(speed(-SETTLED)),
-        0.0,
-    )
-    kept, acting = [], []
+    across = np.array([pull - GRAVITY * math.sin(bank(time)) for time in times])
+    state = plant.initial_state(speed(-SETTLED))
+    error = 0.0
+    kept = []
+    acting = []
     for time, push in zip(times, across, strict=True):
-        u, wanted = max(float(state[VX]), 3.0), lateral(time)
+        u = max(float(state[VX]), 3.0)
+        wanted = lateral(time)
         error += STEP * (wanted / u - float(state[YAW_RATE]))
         angle = (
             steer(time)
@@ -444,18 +432,14 @@ def drawn(rng: np.random.Generator, seed: int) -> tuple[PlanarCar, SensorLevels,
         tilt=Tilt(roll_share=rng.uniform(-0.5, 1.0)),
         reference=Reference(),
     )
-    speeds, knots = (
-        rng.uniform(10.0, 33.0, 14),
-        np.repeat(np.cumsum(rng.uniform(2.5, 6.0, 50)), 2) + np.tile([0.0, 0.5], 50),
-    )
+    speeds = rng.uniform(10.0, 33.0, 14)
+    knots = np.repeat(np.cumsum(rng.uniform(2.5, 6.0, 50)), 2) + np.tile([0.0, 0.5], 50)
     bends = np.repeat(
         rng.uniform(-0.75, 0.75, 51) * (rng.random(51) > 0.25) * car.friction * GRAVITY, 2
     )[1:-1]
-    size, rate, rate_hz = (
-        rng.uniform(0.0, 2.0),
-        math.tau * rng.uniform(0.2, 0.8),
-        float(rng.choice([20, 25, 50, 100])),
-    )
+    size = rng.uniform(0.0, 2.0)
+    rate = math.tau * rng.uniform(0.2, 0.8)
+    rate_hz = float(rng.choice([20, 25, 50, 100]))
 
     def lateral(time: float) -> float:
         return (float(np.interp(time, knots, bends)) + size * math.sin(rate * time)) * (time > 0.0)
@@ -519,10 +503,8 @@ def weave(time: float) -> float:
     return 0.15 * math.sin(0.5 * time) + 0.1 * math.sin(1.3 * time)
 
 
-SALOON, PRODUCTION = (
-    a_car(rear=0.54, compliance=0.0036),
-    replace(SensorLevels(), reference=Reference()),
-)
+SALOON = a_car(rear=0.54, compliance=0.0036)
+PRODUCTION = replace(SensorLevels(), reference=Reference())
 
 
 def scenes() -> dict[str, Recording]:
@@ -575,18 +557,14 @@ def offset_of(model: SelfCalibrating, drive: Recording) -> float:
 
 def admitted(name: str, drive: Recording, shipped: Estimator, trust: Any) -> dict[str, Any]:
     """Errors, bands and health of `vehest estimate` in a scene; β counts above 3 m/s, v everywhere."""
-    estimate, truth = (
-        estimate_recording(shipped, drive.select(shipped.channels), trust),
-        resampled(drive, shipped.rate_hz, PLAIN),
-    )
+    estimate = estimate_recording(shipped, drive.select(shipped.channels), trust)
+    truth = resampled(drive, shipped.rate_hz, PLAIN)
     n = min(len(truth), len(estimate))
     own = {name: values[:n] for name, values in estimate.channels.items()}
-    angle, vy, moving, bad = (
-        angle_of(truth)[:n],
-        truth["vy_ref"][:n],
-        truth["vx_ref"][:n] > 3.0,
-        own["health"] > 0,
-    )
+    angle = angle_of(truth)[:n]
+    vy = truth["vy_ref"][:n]
+    moving = truth["vx_ref"][:n] > 3.0
+    bad = own["health"] > 0
     reasons, counts = np.unique(own["health_reason"][bad], return_counts=True)
     band = np.degrees(own["band_sideslip"])
     return {
@@ -656,7 +634,8 @@ def report(
     )
     cells: dict[str, dict[str, str]] = {}
     for number in (*LIMITS, "offset_ay", "offset_ax"):
-        error, used = cars[number] - cars[f"{number}_planted"], cars[f"{number}_identified"] > 0
+        error = cars[number] - cars[f"{number}_planted"]
+        used = cars[f"{number}_identified"] > 0
         sure = (error.abs() < 1.645 * cars[f"{number}_deviation"])[used & (cars["delay"] == 0.0)]
         cells[number] = {
             "identified": f"{used.sum()}",
@@ -669,7 +648,8 @@ def report(
             )
     apart = pairs[pairs["z"].abs() > 1.645]["number"]
     excess = seen["RMSE(β)"] - seen["RMSE(β), v = 0"]
-    beyond, worse = seen[excess > seen["band of β, median"]]["scene"], seen[excess > 0.0]["scene"]
+    beyond = seen[excess > seen["band of β, median"]]["scene"]
+    worse = seen[excess > 0.0]["scene"]
     missed = 1e3 * (cars["delay_found"] - cars["delay"])
     return PAGE.format(
         late=round(1e3 * LATENESS),
@@ -704,10 +684,8 @@ def report(
 
 def main() -> None:
     """Command line."""
-    output, root_folder = (
-        Path(os.environ.get("VEHEST_OUTPUT", "outputs")),
-        os.environ["VEHEST_DATA"],
-    )
+    output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
+    root_folder = os.environ["VEHEST_DATA"]
     _, shipped, trust = open_model(SELF_CALIBRATING, output, print)
     runner = Runner(output, Messages(), StopSignals())
     pairs, rows = carried_over(runner, root_folder)

@@ -27,7 +27,8 @@ def browser(profile):
     )
     from selenium.webdriver.chrome.service import Service
 
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    chromium = shutil.which("chromium")
+    driver = shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip(
             "no chromium with its chromedriver here: apt-get install chromium chromium-driver"

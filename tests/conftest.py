@@ -32,7 +32,8 @@ def _composed_once():
     """
     from vehest.run import config
 
-    compose, composed = config.compose, {}
+    compose = config.compose
+    composed = {}
 
     def kept(command, overrides):
         *local, packaged, _ = config.conf_folders()
@@ -42,7 +43,8 @@ def _composed_once():
             for file in sorted(folder.rglob("*.yaml"))
             if file.is_file()
         }
-        all_count, words = any(b"defaults" in text for text in found.values()), " ".join(overrides)
+        all_count = any(b"defaults" in text for text in found.values())
+        words = " ".join(overrides)
         counts = [
             file
             for file in found
@@ -94,7 +96,8 @@ def planar_drive(seconds=60.0, rate_hz=20.0, seed=0, noise=0.0, name="drive"):
     vx_dot = 0.8 * np.cos(0.2 * time + phases[2])
     vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + phases[3])
     vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + phases[3])
-    ay, ax = vy_dot + vx * yaw_rate, vx_dot - vy * yaw_rate
+    ay = vy_dot + vx * yaw_rate
+    ax = vx_dot - vy * yaw_rate
     measured = {"vx": vx, "yaw_rate": yaw_rate, "ay": ay, "ax": ax}
     noisy = {
         key: values + noise * generator.standard_normal(len(time))

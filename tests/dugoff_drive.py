@@ -7,7 +7,8 @@ from vehest.data.recording import Recording
 from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
 
-FRONT, REAR = DugoffAxle(1.2e5, 1.0, 0.005), DugoffAxle(1.7e5, 1.05, 0.004)
+FRONT = DugoffAxle(1.2e5, 1.0, 0.005)
+REAR = DugoffAxle(1.7e5, 1.05, 0.004)
 TYRES = {
     f"{name}_{axle}": value
     for axle, own in (("front", FRONT), ("rear", REAR))
@@ -22,7 +23,8 @@ def dugoff_track(tyres="plain"):
 
 def driven(inputs):
     """What the track does at 100 Hz from rest under speed, steering angle and ax, (T, 3): its two states and what is measured of them."""
-    track, states = CompiledDugoffTrack(dugoff_track()), np.zeros((len(inputs), 1, 2))
+    track = CompiledDugoffTrack(dugoff_track())
+    states = np.zeros((len(inputs), 1, 2))
     for k in range(len(inputs) - 1):
         states[k + 1] = called(track, 0, states[k : k + 1], inputs[k : k + 1], 2)[0]
     return (*states[:, 0].T, *called(track, 1, states, inputs, 4)[:, 0].T)

@@ -38,7 +38,8 @@ CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurren
         "curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
     },
 }
-ONCE, GIVEN = PhaseSettings(max_epochs=1), IdentificationSettings(method="data")
+ONCE = PhaseSettings(max_epochs=1)
+GIVEN = IdentificationSettings(method="data")
 SAMPLED = {
     SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
     EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),

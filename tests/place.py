@@ -127,7 +127,8 @@ def write_steered(folder, names):
 
 def run_vehest(capsys, *arguments):
     """Exit code, standard output and standard error of a command."""
-    former, code = sys.argv, 0
+    former = sys.argv
+    code = 0
     sys.argv = ["vehest", *arguments]
     try:
         main()
@@ -147,7 +148,8 @@ class Place:
     """A working folder with data, configuration and a pipeline of its own."""
 
     def __init__(self, folder, capsys):
-        self.folder, self._capsys = folder, capsys
+        self.folder = folder
+        self._capsys = capsys
         write_drives(folder)
         self.change("conf/dataset/mine.yaml", **DATASET)
         self.change("conf/split/mine.yaml", **SPLIT)
@@ -195,7 +197,8 @@ class Place:
             ),
         )
         if key not in _DONE:
-            said, kept = self.done(*arguments), Path(_KEPT.name) / str(len(_DONE))
+            said = self.done(*arguments)
+            kept = Path(_KEPT.name) / str(len(_DONE))
             _DONE[key] = said, shutil.copytree(self.folder, kept)
         else:
             shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)

@@ -9,9 +9,13 @@ from vehest.filters.unscented_steps import room
 def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     """What an entry writes for points (B, S, n) and inputs (B, p): (B, S, size)."""
     out = room((points.shape[1], size, len(points)), points.dtype)
-    given, learnt, x, u = [], [], _beside(points), _beside(inputs)
+    given = []
+    learnt = []
+    x = _beside(points)
+    u = _beside(inputs)
     if upstream is not None:
-        given, learnt = [_beside(upstream)], [model.learnt(gradients)]
+        given = [_beside(upstream)]
+        learnt = [model.learnt(gradients)]
         u = _beside(np.pad(inputs, ((0, 0), (0, model.kept * points.shape[1]))))
         model.entries[entry - 2](
             x, u, model.car, np.empty_like(given[0]), 0, len(points)

@@ -65,7 +65,9 @@ class Striking:
     """A function that sends its process a signal once it is through for the n-th time; keeps its arguments."""
 
     def __init__(self, function, call=0, number=0):
-        self.function, self.call, self.number = function, call, number
+        self.function = function
+        self.call = call
+        self.number = number
         self.calls = []
 
     def __call__(self, *arguments, **options):
@@ -82,13 +84,15 @@ class ForkedReader:
     def __init__(self):
         order, stdin = os.pipe()
         stdout, answers = os.pipe()
-        self.pid, self._code = os.fork(), None
+        self.pid = os.fork()
+        self._code = None
         if self.pid == 0:
             os.closerange(stdin, stdin + 1)
             _read_order(order, answers)
         os.close(order)
         os.close(answers)
-        self.stdin, self.stdout = os.fdopen(stdin, "wb"), os.fdopen(stdout, "rb")
+        self.stdin = os.fdopen(stdin, "wb")
+        self.stdout = os.fdopen(stdout, "rb")
 
     def __enter__(self):
         return self

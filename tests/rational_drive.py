@@ -18,7 +18,8 @@ def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20
     phases = generator.uniform(0, 6, 3)
     speed = 28.0 + 8.0 * np.sin(0.11 * time + phases[0])
     steer = 0.045 * np.sin(0.7 * time + phases[1]) + 0.02 * np.sin(2.3 * time + phases[2])
-    sideslip, yaw_rate = 0.0, 0.0
+    sideslip = 0.0
+    yaw_rate = 0.0
     rows = np.empty((len(time), 3))
     step = 1.0 / (rate_hz * FINER)
     for k, (u, angle) in enumerate(zip(speed.tolist(), steer.tolist(), strict=True)):
@@ -40,7 +41,9 @@ def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20
         yaw_rate += (
             step * (CAR.cg_to_front_axle * front - CAR.cg_to_rear_axle * rear) / CAR.yaw_inertia
         )
-    rows, speed, steer = rows[::FINER], speed[::FINER], steer[::FINER]
+    rows = rows[::FINER]
+    speed = speed[::FINER]
+    steer = steer[::FINER]
     channels = {
         "vx": speed,
         "yaw_rate": rows[:, 1] + NOISE["yaw_rate"] * generator.standard_normal(len(rows)),

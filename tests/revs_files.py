@@ -13,7 +13,9 @@ import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
 
-CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
+CSV_RATE_HZ = 1000
+INS_RATE_HZ = 100
+GPS_RATE_HZ = 10
 PREAMBLE = (
     *(
         "Event: 2014 Targa 66",
@@ -115,7 +117,8 @@ def smooth_drive(seconds, start_time=0.0, decimals=None):
     time = np.arange(round(seconds * CSV_RATE_HZ)) / CSV_RATE_HZ
     yaw_rate = 0.35 * np.sin(0.5 * time + 0.3) + 0.15 * np.sin(1.3 * time + 1.1)
     yaw_rate_dot = 0.175 * np.cos(0.5 * time + 0.3) + 0.195 * np.cos(1.3 * time + 1.1)
-    vx, vx_dot = 30.0 + 8.0 * np.sin(0.2 * time), 1.6 * np.cos(0.2 * time)
+    vx = 30.0 + 8.0 * np.sin(0.2 * time)
+    vx_dot = 1.6 * np.cos(0.2 * time)
     vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + 2.0)
     vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + 2.0)
     truth = {

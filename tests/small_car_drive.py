@@ -9,7 +9,10 @@ from vehest.data.recording import Recording
 
 RATE = 100.0
 WHEEL_RADIUS = 0.05
-MASS, TO_FRONT, TO_REAR, INERTIA = 5.1, 0.175, 0.155, 0.15
+MASS = 5.1
+TO_FRONT = 0.175
+TO_REAR = 0.155
+INERTIA = 0.15
 NOISE = {"ax": 0.4, "ay": 0.4, "yaw_rate": 0.02, "motor_speed": 0.4}
 
 
@@ -21,7 +24,9 @@ def small_car_drive(seconds=4.0, seed=0, noise=1.0):
     phase = generator.uniform(0.0, 2.0 * np.pi, 4)
     steer = 0.15 * np.sin(2.1 * time + phase[0]) + 0.06 * np.sin(5.3 * time + phase[1])
     current = 1.7 + 1.5 * np.sin(0.9 * time + phase[2]) + 0.8 * np.sin(2.9 * time + phase[3])
-    state, states, accelerations = (3.0, 0.0, 0.0, 3.0), [], []
+    state = (3.0, 0.0, 0.0, 3.0)
+    states = []
+    accelerations = []
     for delta, ampere in zip(steer.tolist(), current.tolist(), strict=True):
         states.append(state)
         accelerations.append(_motion(state, delta, ampere)[1])

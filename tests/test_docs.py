@@ -207,7 +207,8 @@ def taken_apart(line):
             return None
         assert words[0] in command.commands, f"vehest has no command {words[0]}"
         path.append(words[0])
-        command, words = command.commands[path[-1]], words[1:]
+        command = command.commands[path[-1]]
+        words = words[1:]
     options = {
         option: parameter
         for parameter in command.params
@@ -341,7 +342,9 @@ def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers()
 
 
 def test_pages_know_every_name():
-    data, evaluation, cli = page("docs/data.md"), page("docs/evaluation.md"), page("docs/cli.md")
+    data = page("docs/data.md")
+    evaluation = page("docs/evaluation.md")
+    cli = page("docs/cli.md")
     overview = page("docs/estimators.md")
     families = "".join(
         page(f"docs/estimators/{name}.md")

@@ -91,7 +91,8 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
     assert {"bands", "guard", "health"} <= {
         key for key, value in yaml.safe_load(trust.read_text()).items() if value
     }
-    model, again = vehest.load_model(folder), vehest.load_model(folder)
+    model = vehest.load_model(folder)
+    again = vehest.load_model(folder)
     drive = (
         linear_drive(8.0, seed=7)[0]
         if "steer" in model.channels
@@ -134,12 +135,11 @@ def test_example_that_was_trained_is_not_trained_again_unless_a_setting_changes(
 
 
 def test_saturating_axles_are_linearised_by_their_slope(examples):
-    example, car, inputs = (
-        import_module("saturating_ekf"),
-        (1500.0, 2500.0, 1.2, 1.4, 9e4, 1.1e5, 0.9, 0.02),
-        np.array([20.0, 0.1]),
-    )
-    state, step = np.array([-0.8, 0.4]), 1e-5
+    example = import_module("saturating_ekf")
+    car = (1500.0, 2500.0, 1.2, 1.4, 9e4, 1.1e5, 0.9, 0.02)
+    inputs = np.array([20.0, 0.1])
+    state = np.array([-0.8, 0.4])
+    step = 1e-5
     value, slope = example.linearised(state, inputs, car)
     around = [
         [example.model(state + side * step * axis, inputs, car) for side in (1, -1)]
@@ -164,7 +164,9 @@ def test_smallest_estimator_on_the_page_integrates_and_runs_online():
     namespace = {"__name__": "smallest"}
     exec(compile(block_with("class Leaky"), "smallest", "exec", dont_inherit=True), namespace)
     model = namespace["Leaky"].from_config({"rate_hz": 20.0, "kept": 0.9})
-    drive, expected, stepper = planar_drive(5.0), 0.0, model.online()
+    drive = planar_drive(5.0)
+    expected = 0.0
+    stepper = model.online()
     (batch,) = model.estimate([drive.without_references()])
     for k in range(len(drive)):
         expected = 0.9 * expected + (drive["ay"][k] - drive["vx"][k] * drive["yaw_rate"][k]) / 20.0
@@ -274,7 +276,8 @@ def test_ekf_goes_on_where_nothing_was_measured(examples):
     )
     model = estimator_class("saturating_ekf").from_config({})
     model.values = {"variance_vy": 1e-4, "variance_yaw_rate": 1e-5}
-    (batch,), stepper = model.estimate([drive.without_references()]), model.online()
+    (batch,) = model.estimate([drive.without_references()])
+    stepper = model.online()
     steps = [
         stepper.step({channel: drive[channel][k] for channel in model.channels})["vy"]
         for k in range(len(drive))

@@ -13,11 +13,10 @@ def test_figures_are_those_that_were_measured():
     text = " ".join((ROOT / "docs" / "many_machines.md").read_text(encoding="utf-8").split())
     local, ray = (measured["launchers"][name] for name in ("local", "ray"))
     plain, tracked = (measured["sweep"][name] for name in ("none", "mlflow"))
-    million, pays = measured["million_trainings_on_1000_cores"], measured["second_node_pays_from_s"]
-    per_second, combination = (
-        measured["scheduler"]["empty_tasks_a_second"],
-        measured["planning"]["seconds_a_combination"],
-    )
+    million = measured["million_trainings_on_1000_cores"]
+    pays = measured["second_node_pays_from_s"]
+    per_second = measured["scheduler"]["empty_tasks_a_second"]
+    combination = measured["planning"]["seconds_a_combination"]
     quoted = (
         f"| until the first group begins | {local['start_s']:.1f} s | {ray['start_s']:.1f} s |",
         f"| added to a task beside the group's own time | {1000 * local['added_s']:.0f} ms | {1000 * ray['added_s']:.0f} ms |",

@@ -40,7 +40,9 @@ def test_settings_and_rates_have_upper_limits():
 
 def test_a_time_that_is_no_number_counts_as_unknown():
     model = fitted("luenberger")
-    drive, timed, untimed = drive_for(model), GuardedStepper(model), GuardedStepper(model)
+    drive = drive_for(model)
+    timed = GuardedStepper(model)
+    untimed = GuardedStepper(model)
     for k in range(5):
         row = {name: float(drive[name][k]) for name in model.channels}
         assert timed.step(row, time="x") == untimed.step(row)

@@ -24,15 +24,16 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 def model(state, inputs, p):
     """(v, ω) one sample later, and a_y and ω now, (4,), at (v, ω), real or complex, and (u, δ); see `SaturatingEkf.parameters`."""
     mass, inertia, front_arm, rear_arm, front_stiffness, rear_stiffness, friction, step = p
-    speed, load = max(inputs[0], 3.0), friction * mass * GRAVITY / (front_arm + rear_arm)
+    speed = max(inputs[0], 3.0)
+    load = friction * mass * GRAVITY / (front_arm + rear_arm)
     front_slip = inputs[1] - np.arctan((state[0] + front_arm * state[1]) / speed)
     rear_slip = -np.arctan((state[0] - rear_arm * state[1]) / speed)
-    front, rear = load * rear_arm, load * front_arm  # the most that each axle can bear
-    front, rear = (
-        front * np.tanh(front_stiffness * front_slip / front),
-        rear * np.tanh(rear_stiffness * rear_slip / rear),
-    )
-    ay, angular = (front + rear) / mass, (front_arm * front - rear_arm * rear) / inertia
+    front = load * rear_arm
+    rear = load * front_arm  # the most that each axle can bear
+    front = front * np.tanh(front_stiffness * front_slip / front)
+    rear = rear * np.tanh(rear_stiffness * rear_slip / rear)
+    ay = (front + rear) / mass
+    angular = (front_arm * front - rear_arm * rear) / inertia
     return np.array(
         [state[0] + step * (ay - inputs[0] * state[1]), state[1] + step * angular, ay, state[1]]
     )
@@ -53,15 +54,19 @@ def scan(rows, p, Q, R, mean, covariance, means):
     for k in range(len(rows)):
         if k > 0:
             value, slope = linearised(mean, rows[k - 1, :2], p)
-            mean, covariance = value[:2], slope[:2] @ covariance @ slope[:2].T + Q
+            mean = value[:2]
+            covariance = slope[:2] @ covariance @ slope[:2].T + Q
         value, slope = linearised(mean, rows[k, :2], p)
-        error, C = rows[k, 2:] - value[2:], slope[2:]
+        error = rows[k, 2:] - value[2:]
+        C = slope[2:]
         for i in range(2):
             if np.isnan(error[i]):
-                error[i], C[i] = 0.0, 0.0
+                error[i] = 0.0
+                C[i] = 0.0
         gain = covariance @ C.T @ np.linalg.inv(C @ covariance @ C.T + R)
         kept = np.eye(2) - gain @ C
-        mean, covariance = mean + gain @ error, kept @ covariance @ kept.T + gain @ R @ gain.T
+        mean = mean + gain @ error
+        covariance = kept @ covariance @ kept.T + gain @ R @ gain.T
         means[k] = mean
     return mean, covariance
 
@@ -69,8 +74,10 @@ def scan(rows, p, Q, R, mean, covariance, means):
 class SaturatingEkf(Recursive):
     """Process noise is what the model leaves unexplained of the training recordings' motion from one sample to the next."""
 
-    name, title = "saturating_ekf", "EKF with saturating axles"
-    channels, skippable = ("vx", "steer", "ay", "yaw_rate"), ("ay", "yaw_rate")
+    name = "saturating_ekf"
+    title = "EKF with saturating axles"
+    channels = ("vx", "steer", "ay", "yaw_rate")
+    skippable = ("ay", "yaw_rate")
     variance_vy: float = fitted("variance of a step of the lateral velocity", unit="m²/s²")
     variance_yaw_rate: float = fitted("variance of a step of the yaw rate", unit="rad²/s²")
     car: SingleTrackParameters = setting(FERRARI_250LM, "the car")
@@ -95,10 +102,8 @@ class SaturatingEkf(Recursive):
     def run(self, samples, state):
         """Filter on from the state at the last sample, whose measurements are part of it already."""
         rows = np.vstack([state[0], samples])
-        means, noises = (
-            np.empty((len(rows), 2)),
-            (np.diag(list(self.values.values())), np.diag(np.square(self.deviations))),
-        )
+        means = np.empty((len(rows), 2))
+        noises = (np.diag(list(self.values.values())), np.diag(np.square(self.deviations)))
         last = scan(rows, self.parameters, *noises, *state[1:], means)
         vy, yaw_rate = means[-len(samples) :].T
         return {"vy": vy, "yaw_rate": yaw_rate}, (rows[-1:] * [1.0, 1.0, np.nan, np.nan], *last)

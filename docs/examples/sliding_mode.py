@@ -19,8 +19,10 @@ from vehest.training.search import DirectSearchSettings
 class SlidingMode(Recursive):
     """λ and ω_th with the smallest mean squared error of vy on the training recordings, unless they are given."""
 
-    name, title = "sliding_mode", "Sliding-mode observer"
-    channels, states = ("yaw_rate", "vx", "ay", "ax"), ("vy", "vx")
+    name = "sliding_mode"
+    title = "Sliding-mode observer"
+    channels = ("yaw_rate", "vx", "ay", "ax")
+    states = ("vy", "vx")
     training_type = DirectSearchSettings
     template = "sliding_mode"
     gain: float = fitted("correction gain λ", start=(1.0, 10.0), box=(0.0, 20.0))
@@ -44,7 +46,8 @@ class SlidingMode(Recursive):
     @compiled
     def step(numbers, state, sample):
         """(v, u) after a sample."""
-        (v, u), (yaw_rate, vx, ay, ax) = state, sample
+        (v, u) = state
+        (yaw_rate, vx, ay, ax) = sample
         if abs(yaw_rate) < numbers.threshold:
             return 0.0, vx
         s = numbers.injection * min(max((vx - u) / numbers.layer, -1.0), 1.0)

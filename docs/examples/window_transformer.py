@@ -17,7 +17,9 @@ class TransformerNetwork(StandardisedNetwork):
 
     def __init__(self, settings, n_channels: int) -> None:
         super().__init__(n_channels)
-        width, heads, dropout = settings.width, settings.heads, settings.dropout
+        width = settings.width
+        heads = settings.heads
+        dropout = settings.dropout
         self.embed = nn.Linear(n_channels, width)
         self.position = nn.Parameter(0.02 * torch.randn(settings.window, width))
         self.encoder = nn.Sequential(
@@ -37,7 +39,8 @@ class TransformerNetwork(StandardisedNetwork):
 class WindowTransformer(WindowedEstimator):
     """The network as an estimator; training, members, estimating, running online and saving come with `WindowedEstimator`."""
 
-    name, title = "window_transformer", "Transformer"
+    name = "window_transformer"
+    title = "Transformer"
     width: int = setting(16, "of the encoding of a sample", least=1)
     heads: int = setting(2, "of the attention; width is a multiple of it", least=1)
     layers: int = setting(1, "encoder layers", least=1)

@@ -90,7 +90,8 @@ def train(
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
     config = compose_config("train", [f"estimator={estimator}", *overrides])
-    model, training = new_estimator(config["estimator"]), config["training"]
+    model = new_estimator(config["estimator"])
+    training = config["training"]
     if training.get("start_from") is not None:
         training["start_from"] = str(
             find_model(str(training["start_from"]), Path(config["output"]), warnings.warn)

@@ -1113,7 +1113,8 @@ def _run_study(
         from vehest.run.study_run import run_study
 
         ran = run_study(name, overrides, options, cache, sweep=sweep, only_report=only_report)
-    page, summary = ran.folder / ran.summary.page, ran.summary
+    page = ran.folder / ran.summary.page
+    summary = ran.summary
     own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:
         own = {"report": str(page), "published": str(ran.published) if ran.published else None}

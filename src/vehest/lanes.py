@@ -27,7 +27,9 @@ class Lanes(types.Type):  # type: ignore[misc]
 
     def __init__(self, dtype: Any, count: int, fused: bool = True) -> None:
         super().__init__(f"lanes({dtype}, {count}, {fused})")
-        self.dtype, self.count, self.fused = dtype, count, fused
+        self.dtype = dtype
+        self.count = count
+        self.fused = fused
 
 
 @register_model(Lanes)
@@ -48,7 +50,8 @@ def width(array: Any) -> int:
 
 def load(array: Any, at: int) -> Any:
     """The vector that begins at index ``at`` of a contiguous array, (N,), or of one of more dimensions as if it were flat."""
-    vector, there = np.zeros(width(array), array.dtype), array.reshape(-1)[at : at + width(array)]
+    vector = np.zeros(width(array), array.dtype)
+    there = array.reshape(-1)[at : at + width(array)]
     vector[: len(there)] = there
     return vector
 
@@ -249,7 +252,8 @@ def _width(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 def _load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    array, vector = sig.args[0], sig.return_type
+    array = sig.args[0]
+    vector = sig.return_type
     return builder.load(
         _pointer(context, builder, array, args, vector), align=array.dtype.bitwidth // 8
     )
@@ -261,7 +265,8 @@ _compiled(load_unfused, lambda array, at: _of(array, False)(array, types.intp))(
 
 @_compiled(store, lambda array, at, vector: types.none(array, types.intp, vector))
 def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    array, own = sig.args[0], _of(sig.args[0])
+    array = sig.args[0]
+    own = _of(sig.args[0])
     value = _vector(context, builder, args[2], sig.args[2], own)
     builder.store(
         value, _pointer(context, builder, array, args, own), align=array.dtype.bitwidth // 8
@@ -274,11 +279,9 @@ def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 )
 def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     array, _, vector, _ = sig.args
-    place, lane, lanes = (
-        _pointer(context, builder, array, args, _of(array)),
-        ir.IntType(64),
-        vector.count,
-    )
+    place = _pointer(context, builder, array, args, _of(array))
+    lane = ir.IntType(64)
+    lanes = vector.count
     splat = builder.insert_element(
         ir.Constant(ir.VectorType(lane, lanes), ir.Undefined),
         args[3],
@@ -329,7 +332,8 @@ def _each(typing: Any, function: Any, vector: Any) -> Any:
     own = typing.resolve_function_type(function, (vector.dtype,), {})
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        compute, result = context.get_function(function, own), args[1]
+        compute = context.get_function(function, own)
+        result = args[1]
         for lane in range(vector.count):
             at = ir.Constant(ir.IntType(32), lane)
             result = builder.insert_element(

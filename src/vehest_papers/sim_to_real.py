@@ -463,10 +463,8 @@ def _why(steps: Sequence[Step]) -> str:
     of = {step.part: step for step in steps if step.models[0].variant == size}
     if not {"wide", "fast", "rough", "more", "level"} <= set(of):
         return ""
-    errors, real = (
-        pd.DataFrame([step.errors for step in steps]),
-        pd.Series([step.fvu for step in steps]),
-    )
+    errors = pd.DataFrame([step.errors for step in steps])
+    real = pd.Series([step.fvu for step in steps])
     ranks = [
         fixed(float(errors[place].rank().corr(real.where(errors[place].notna()).rank())), 2)
         for place in errors
@@ -496,7 +494,8 @@ def _moves(of: Mapping[str, Step], before: str, after: str, choice: int | None =
 
 
 def _traces(choice: Choice) -> Figure:
-    model, artefacts = choice.model, choice.step.artefacts
+    model = choice.model
+    artefacts = choice.step.artefacts
     (scored,) = artefacts.scored(model, _real(artefacts))
     reference = figures.Traces(
         "measured", REFERENCE, scored.vy_ref, np.degrees(scored.sideslip_ref)

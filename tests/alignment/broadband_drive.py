@@ -13,7 +13,10 @@ class Wave:
     """A sum of sines that can be taken at any time, derived, delayed and sent through a first-order low-pass."""
 
     def __init__(self, amplitudes, omegas, phases, level=0.0):
-        self.amplitudes, self.omegas, self.phases, self.level = amplitudes, omegas, phases, level
+        self.amplitudes = amplitudes
+        self.omegas = omegas
+        self.phases = phases
+        self.level = level
         self._known = {}  # by uniform clock and order
 
     @classmethod
@@ -94,7 +97,8 @@ def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
 def _waves(seed):
     """Waves of yaw rate, v and speed, and the generator's state after them."""
     generator = np.random.default_rng(seed)
-    turn, slide = Wave.random(generator, 0.3, 0.05, 4.0), Wave.random(generator, 0.25, 0.05, 4.0)
+    turn = Wave.random(generator, 0.3, 0.05, 4.0)
+    slide = Wave.random(generator, 0.25, 0.05, 4.0)
     speed = Wave.random(generator, 6.0, 0.01, 1.5, level=20.0, corner=0.15)
     return turn, slide, speed, generator.bit_generator.state
 

@@ -58,7 +58,9 @@ def motion():
     """150 s of a multi-body car that weaves between 12 and 28 m/s: its steering is three sines, its speed another."""
     vehicle = vehicle_from_configuration(yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8")))
     plant = MultiBodyPlant(vehicle)
-    state, states, inputs = plant.initial_state(0.0, 0.0, 0.0, 20.0), [], []
+    state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    states = []
+    inputs = []
     for time in 0.01 * np.arange(15_000):
         ay = sum(
             size * math.sin(2.0 * math.pi * f * time)
@@ -67,10 +69,8 @@ def motion():
         steer = (
             plant.wheelbase / state.vx**2 + 0.002
         ) * ay  # [rad], with understeer as such cars have
-        pace, period = (
-            20.0 + 8.0 * math.sin(2.0 * math.pi * time / 19.0),
-            8.0 * 2.0 * math.pi / 19.0,
-        )
+        pace = 20.0 + 8.0 * math.sin(2.0 * math.pi * time / 19.0)
+        period = 8.0 * 2.0 * math.pi / 19.0
         acceleration = period * math.cos(2.0 * math.pi * time / 19.0) + 1.5 * (pace - state.vx)
         states.append(state)
         inputs.append(
@@ -261,7 +261,8 @@ def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
         )
 
     at = time - PLANTED["delay"]
-    r, lever = turn(at), PLANTED["lever_x"] + 1j * PLANTED["lever_y"]
+    r = turn(at)
+    lever = PLANTED["lever_x"] + 1j * PLANTED["lever_y"]
     force = velocity(at, 1) + 1j * r * velocity(at) + (1j * turn(at, 1) - r**2) * lever
     force = np.exp(-1j * PLANTED["yaw"]) * force + PLANTED["offset_ax"] + 1j * PLANTED["offset_ay"]
 
@@ -328,7 +329,8 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
         DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"
     ):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
-    ours, other = weaving(0), weaving(1)
+    ours = weaving(0)
+    other = weaving(1)
     mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
     with pytest.raises(DataError, match=r"correlate by .* at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
@@ -341,7 +343,8 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_low_pass_differentiates_and_keeps_the_right_samples(order):
-    time, omega = np.arange(3001) / 100.0, 2.0 * np.pi * 0.8
+    time = np.arange(3001) / 100.0
+    omega = 2.0 * np.pi * 0.8
     smoothing = smoothing_of(Recording("sine", "car", 100.0, 0.0, {"ay": time}), 2.0)
     out = smoothing(np.sin(omega * time), order, margin=50)
     gain = 2.0 ** (-0.5 * (0.8 / 2.0) ** 2)  # a Gaussian, -3 dB at 2 Hz
@@ -403,7 +406,13 @@ def test_settings_that_make_no_sense_are_refused(arguments, what):
         AlignmentSettings(**arguments)
 
 
-WHEELBASE, LF, LR, MASS, INERTIA, FRONT, REAR = 2.6, 1.2, 1.4, 1500.0, 2500.0, 1.0e5, 1.3e5
+WHEELBASE = 2.6
+LF = 1.2
+LR = 1.4
+MASS = 1500.0
+INERTIA = 2500.0
+FRONT = 1.0e5
+REAR = 1.3e5
 """A linear single-track car; stiffnesses of the axles [N/rad]."""
 GRADIENT = (
     MASS * (LR * REAR - LF * FRONT) / (WHEELBASE * FRONT * REAR)
@@ -412,13 +421,15 @@ GRADIENT = (
 
 def single_track(ratio, offset, seed=0):
     """Calm country-road driving of the linear single-track model, integrated with its lags, seen by noisy sensors."""
-    generator, step = np.random.default_rng(seed), 0.01
+    generator = np.random.default_rng(seed)
+    step = 0.01
     time = np.arange(20000) * step
     speed = 20.0 + 8.0 * np.sin(2.0 * np.pi * 0.013 * time)
     steer = (
         0.02 * np.sin(2.0 * np.pi * 0.04 * time) + 0.008 * np.sin(2.0 * np.pi * 0.11 * time + 1.0)
     ) * (20.0 / speed)
-    side, rate = np.zeros(len(time)), np.zeros(len(time))
+    side = np.zeros(len(time))
+    rate = np.zeros(len(time))
     for k in range(len(time) - 1):
         front = FRONT * (steer[k] - (side[k] + LF * rate[k]) / speed[k])
         rear = -REAR * (side[k] - LR * rate[k]) / speed[k]

@@ -25,7 +25,8 @@ def found_by(check, recording):
 @pytest.mark.parametrize("late", [0.0, 0.05])
 def test_delay_and_time_constant_are_told_apart(time_constant, late):
     generator = np.random.default_rng(1)
-    wave, clock = Wave.random(generator, 1.0, 0.05, 4.0), np.arange(12000) / 100.0
+    wave = Wave.random(generator, 1.0, 0.05, 4.0)
+    clock = np.arange(12000) / 100.0
     signals = {"source": wave(clock), "follower": wave.low_passed(time_constant)(clock - late)}
     noisy = {
         name: samples + 0.2 * samples.std() * generator.standard_normal(len(clock))

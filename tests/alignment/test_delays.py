@@ -116,7 +116,8 @@ def test_intervals_hold_the_truth_as_often_as_they_promise():
     inside = 0
     for seed in range(60):
         generator = np.random.default_rng(seed)
-        wave, clock = Wave.random(generator, 1.0, 0.05, 4.0), np.arange(1500) / 25.0
+        wave = Wave.random(generator, 1.0, 0.05, 4.0)
+        clock = np.arange(1500) / 25.0
         signals = {"source": wave(clock), "follower": wave(clock - 0.03)}
         noisy = {
             name: samples + 0.3 * samples.std() * generator.standard_normal(len(clock))

@@ -43,7 +43,8 @@ def signs(recording):
 
 @pytest.mark.parametrize("rate_hz", [5.5, 20.0, 125.0, 1000.0])
 def test_the_band_of_the_checks_is_butterworths(rate_hz):
-    samples, band = 30.0 + np.cumsum(np.random.default_rng(0).normal(size=3000)), KINEMATIC_BAND_HZ
+    samples = 30.0 + np.cumsum(np.random.default_rng(0).normal(size=3000))
+    band = KINEMATIC_BAND_HZ
     expected = signal.sosfiltfilt(
         signal.butter(2, band, btype="bandpass", fs=rate_hz, output="sos"), samples
     )
@@ -189,10 +190,8 @@ def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():
 @pytest.mark.parametrize("seed", range(25))
 def test_no_recording_raises_or_warns(seed):
     generator = np.random.default_rng(seed)
-    length, rate = (
-        int(generator.choice([1, 2, 3, 50, 400, 4000])),
-        float(generator.choice([0.01, 5.0, 25.0, 100.0, 1e5])),
-    )
+    length = int(generator.choice([1, 2, 3, 50, 400, 4000]))
+    rate = float(generator.choice([0.01, 5.0, 25.0, 100.0, 1e5]))
     walk = 0.02 * np.cumsum(generator.standard_normal(length))
     kinds = [
         np.zeros(length),
@@ -205,7 +204,8 @@ def test_no_recording_raises_or_warns(seed):
         -walk,
         20.0 + walk,
     ]
-    channels, gappy = {}, set()
+    channels = {}
+    gappy = set()
     for name in (
         "vx",
         "yaw_rate",

@@ -9,7 +9,8 @@ from can_drive import SIGNALS, write_log
 from vehest.api import estimate, load_model
 from vehest.run.replay import replay_log
 
-JITTER, LOST = 0.001, 0.01
+JITTER = 0.001
+LOST = 0.01
 SETTLED = 2.0  # s after the first estimate of both
 FERRARI = (550.0, 700.0)  # s, the test range of its drive
 MINUS = {1: "", -1: "-"}

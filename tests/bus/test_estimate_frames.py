@@ -34,10 +34,8 @@ def decoded(said, first_id=1776):
 
 
 def test_cantools_reads_back_what_was_sent_within_half_a_step():
-    rng, most = (
-        np.random.default_rng(0),
-        {"vy": 60, "sideslip": math.pi, "yaw_rate": 4, "band_vy": 100, "band_sideslip": math.pi},
-    )
+    rng = np.random.default_rng(0)
+    most = {"vy": 60, "sideslip": math.pi, "yaw_rate": 4, "band_vy": 100, "band_sideslip": math.pi}
     for _ in range(200):
         said = {name: rng.uniform(0 if "band" in name else -own, own) for name, own in most.items()}
         said |= {"health": float(rng.integers(3)), "health_reason": 10000.0 * NO_ESTIMATE}
@@ -77,7 +75,8 @@ def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signa
 
 
 def test_the_alive_counter_counts_estimates_modulo_16_in_both_frames():
-    database, frames = cantools.database.load_string(dbc_text(), "dbc"), EstimateFrames()
+    database = cantools.database.load_string(dbc_text(), "dbc")
+    frames = EstimateFrames()
     for k in range(40):
         first, second = frames(
             {"vy": 0.0, "sideslip": 0.0, "health": 0.0, "health_reason": 0.0}, 0.0

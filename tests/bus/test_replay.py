@@ -59,7 +59,8 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
     table = pd.read_csv(tmp_path / "out.csv")
     values = by_cantools(written)
     stepper = vehest.online(vehest.load_model(), RATE)
-    expected, last = [], stepper.last
+    expected = []
+    last = stepper.last
     for k in range(len(values["vx"])):
         said = stepper.step({name: values[name][k] for name in CHANNELS})
         if said is not last:
@@ -71,7 +72,8 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
         table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9
     )
     replayed(write_log(drive(), tmp_path), out=tmp_path / "out.csv")
-    table, ahead = pd.read_csv(tmp_path / "out.csv"), stepper.horizon_steps / 20.0 - stepper.delay
+    table = pd.read_csv(tmp_path / "out.csv")
+    ahead = stepper.horizon_steps / 20.0 - stepper.delay
     # frames come at whole cycles, 0 and 0.4 ms behind them; samples in the middle of the rest
     np.testing.assert_allclose(table["sampled"] % 0.01, 0.0052, atol=2e-5)
     assert np.abs(table["time"] - (table["sampled"] + ahead - 0.0050)).max() < 3e-4
@@ -79,7 +81,8 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
 
 def test_lost_frames_are_missing_samples(tmp_path):
     written = write_log(drive(30.0), tmp_path, jitter=0.001, lost=0.02)
-    figures, lost = replayed(written), written.lost
+    figures = replayed(written)
+    lost = written.lost
     assert figures["missing"] == {
         "vx": len(lost["Speed"]),
         **dict.fromkeys(("yaw_rate", "ay", "ax"), len(lost["IMU"])),

@@ -106,7 +106,8 @@ def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_
     )
     assert (code, err) == (0, "")
     bus.done("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
-    online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")
+    online = pd.read_csv("online.csv")
+    offline = pd.read_csv("offline.csv")
     assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
     assert bus.refused("replay", "raw/bus/nothing.asc", "--dataset", "bus")[0] == 4
     assert bus.refused("replay", "raw/bus/drive.asc")[0] == 2

@@ -81,7 +81,10 @@ def through(types, message):
 def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path, node, types):
     drive = planar_drive(20.0, 100.0)
     stepper, bare = (vehest.online(vehest.load_model(), 100.0) for _ in range(2))
-    samples, sent, expected, last = node.Samples(), [], [], stepper.last
+    samples = node.Samples()
+    sent = []
+    expected = []
+    last = stepper.last
     for k in range(len(drive)):
         samples.speed(through(types, speed(types, k / 100, drive["vx"][k])))
         time, sample = samples.imu(

@@ -20,7 +20,8 @@ def arrivals(n=2000, phase=0.003, jitter=0.0, period=CYCLE, seed=0):
 
 
 def run(timing, frames, until):
-    sampler, found = Sampler(timing), []
+    sampler = Sampler(timing)
+    found = []
     for stamp, values in sorted(frames, key=lambda frame: frame[0]):
         while sampler.next_time < stamp:
             sample = sampler.sample()
@@ -89,7 +90,8 @@ def test_lost_frames_are_missing_samples_and_a_late_one_is_superseded_at_the_nex
 
 
 def test_slower_messages_hold_for_their_own_period_and_no_longer():
-    fast, slow = arrivals(), arrivals(n=400, phase=0.0031, period=0.05)
+    fast = arrivals()
+    slow = arrivals(n=400, phase=0.0031, period=0.05)
     timing = timing_of({"ay": fast, "vx": slow})
     frames = [(stamp, {"ay": 1.0}) for stamp in fast] + [
         (stamp, {"vx": 2.0}) for k, stamp in enumerate(slow) if k != 200

@@ -49,7 +49,8 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(
     queue,
     tmp_path,
 ):
-    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
+    output = with_recordings(alone["longer"], tmp_path / "out")
+    environment = install(queue)
     driver = Driver(
         folder,
         output,
@@ -73,7 +74,8 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(
 
 
 def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
-    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
+    output = with_recordings(alone["longer"], tmp_path / "out")
+    environment = install(queue)
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     driver.sees(lambda: with_a_checkpoint(output))
     driver.process.send_signal(signal.SIGINT)
@@ -88,7 +90,8 @@ def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes
     queue,
     tmp_path,
 ):
-    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
+    output = with_recordings(alone["longer"], tmp_path / "out")
+    environment = install(queue)
     sbatch = queue / "bin" / "sbatch"
     takes_jobs = sbatch.read_text()
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)

@@ -36,8 +36,10 @@ def recorded(samples, rate_hz, start_time=0.0):
 @pytest.mark.parametrize("length", [1, 7, 40, 12_000])
 def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
     ratio = Fraction(new_rate / rate).limit_denominator(1000)
-    up, down = ratio.numerator, ratio.denominator
-    samples, half = np.cumsum(np.random.default_rng(length).normal(size=length)), 16 * max(up, down)
+    up = ratio.numerator
+    down = ratio.denominator
+    samples = np.cumsum(np.random.default_rng(length).normal(size=length))
+    half = 16 * max(up, down)
     sinc, window = windowed_sinc(half, 0.86 / max(up, down), 7.0)
     np.testing.assert_array_equal(window, signal.windows.kaiser(2 * half + 1, 7.0))
     np.testing.assert_array_equal(

@@ -154,10 +154,8 @@ def test_every_split_that_is_shipped_is_one(file):
             if about["source"] == "simulated"
             else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
         )
-        speed, lap = (
-            np.full(20_000, 20.0),
-            2.0 * np.pi * np.arange(20_000) / 2000.0,
-        )  # a lap of 100 s
+        speed = np.full(20_000, 20.0)
+        lap = 2.0 * np.pi * np.arange(20_000) / 2000.0  # a lap of 100 s
         long = {
             "ay": np.full(20_000, 3.0),
             "vx": speed,
@@ -274,7 +272,8 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
 
 
 def test_all_channels_of_a_condition_must_meet_it_within_the_range():
-    ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
+    ay = [0.0] * 50 + [9.0] * 50 + [0.0] * 100
+    vx = [10.0] * 150 + [4.0] * 50
     keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
     spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
@@ -377,7 +376,8 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
 
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
     """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
-    straight, radii = 200.0, (60.0, 30.0)
+    straight = 200.0
+    radii = (60.0, 30.0)
     bends = [np.pi * radius for radius in radii]
     length = 2.0 * straight + sum(bends) + 300.0
     time = np.arange(int(laps * length / 20.0 * rate_hz)) / rate_hz
@@ -488,7 +488,8 @@ def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     assert tested[-1][1] == recording.end_time
     assert all(one[1] == other[0] for one, other in pairwise(tested))
     for split, after in zip(splits, [*splits[1:], splits[0]], strict=True):
-        (tested_span,), (stopped_on,) = split.tests["test"], after.tests["test"]
+        (tested_span,) = split.tests["test"]
+        (stopped_on,) = after.tests["test"]
         assert (
             stopped_on.start
             <= split.validation[0].start
@@ -710,9 +711,11 @@ def test_simulated_sets_last_as_long_as_the_papers(dataset):
 @pytest.mark.parametrize("seed", range(3))
 def test_runs_are_those_of_a_count_sample_by_sample(length, seed):
     samples = np.random.default_rng(seed).integers(0, 2, length)
-    counted, place = [], 0
+    counted = []
+    place = 0
     for value, group in groupby(samples.tolist()):
-        begin, place = place, place + len(list(group))
+        begin = place
+        place = place + len(list(group))
         counted.append((value, [begin, place]))
     assert equal_runs(samples).tolist() == [run for _, run in counted]
     assert true_runs(samples == 1).tolist() == [run for value, run in counted if value == 1]

@@ -102,7 +102,9 @@ def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length):
 
 def test_reference_lever_brings_velocities_to_the_centre_of_gravity():
     """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
-    yaw_rate, vx, vy = np.array([0.0, 0.4, -0.3]), np.full(3, 15.0), np.array([0.0, -0.2, 0.4])
+    yaw_rate = np.array([0.0, 0.4, -0.3])
+    vx = np.full(3, 15.0)
+    vy = np.array([0.0, -0.2, 0.4])
     at_sensor = {"vx_ref": vx - yaw_rate * 0.5, "vy_ref": vy + yaw_rate * 2.0, "yaw_rate": yaw_rate}
     moved = ReferenceLever(2.0, 0.5)(recorded(**at_sensor, sideslip_ref=np.zeros(3)))
     np.testing.assert_allclose(moved["vx_ref"], vx)
@@ -158,7 +160,8 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length, h
 @pytest.mark.parametrize("beside", [0.0, 0.03])
 def test_a_few_impossible_samples_are_bridged_by_lines_and_many_stay(beside):
     line = np.linspace(-5.0, 5.0, 400)
-    spoilt, reach = line.copy(), round(beside * RATE)
+    spoilt = line.copy()
+    reach = round(beside * RATE)
     spoilt[[100, 101]] = 9e3
     spoilt[100 - reach : 100] = spoilt[102 : 102 + reach] = (
         70.0  # of a slower signal that was interpolated
@@ -173,8 +176,10 @@ def rigid_body(lever_x, lever_y, yaw):
 
     The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
     """
-    time, step = np.arange(800) / RATE, 2e-4
-    lever, turn = complex(lever_x, lever_y), np.exp(1j * yaw)  # the plane as complex numbers
+    time = np.arange(800) / RATE
+    step = 2e-4
+    lever = complex(lever_x, lever_y)
+    turn = np.exp(1j * yaw)  # the plane as complex numbers
 
     def heading(at):
         return 0.4 * at + 0.5 * np.sin(1.5 * at)
@@ -193,7 +198,8 @@ def rigid_body(lever_x, lever_y, yaw):
             * np.exp(-1j * heading(time))
         )
 
-    truth, measured = acceleration(centre), acceleration(sensor) / turn
+    truth = acceleration(centre)
+    measured = acceleration(sensor) / turn
     channels = {
         "ax": measured.real,
         "ay": measured.imag,
@@ -291,7 +297,8 @@ def rolling(**shown):
     """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
     time = np.arange(2000) / RATE
     u = 8.0 + 3.0 * np.sin(0.7 * time)
-    yaw_rate, steer = 0.3 * np.sin(0.9 * time), 0.2 * np.sin(0.9 * time)
+    yaw_rate = 0.3 * np.sin(0.9 * time)
+    steer = 0.2 * np.sin(0.9 * time)
     sides = {"fl": 1.05, "fr": -1.05, "rl": 1.0, "rr": -1.0}
     wheels = {f"wheel_speed_{place}": (u - yaw_rate * side) / 0.48 for place, side in sides.items()}
     for place in ("fl", "fr"):
@@ -357,7 +364,8 @@ def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels):
 
 
 def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all():
-    frequency, rate = 0.5, 100.0
+    frequency = 0.5
+    rate = 100.0
     time = np.arange(3000) / rate
     drive = Recording(
         "lap", "car", rate, 0.0, {"vx": 20.0 + 3.0 * np.sin(2 * np.pi * frequency * time)}
@@ -399,7 +407,9 @@ def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
 def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
     """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of smooth signals."""
     time = np.arange(4000) / 100.0
-    vx, vy, yaw_rate = 3.0 + 0.5 * np.sin(time), 0.4 * np.sin(1.3 * time), 2.0 * np.sin(0.8 * time)
+    vx = 3.0 + 0.5 * np.sin(time)
+    vy = 0.4 * np.sin(1.3 * time)
+    yaw_rate = 2.0 * np.sin(0.8 * time)
     ay = 0.4 * 1.3 * np.cos(1.3 * time) + vx * yaw_rate
     small = Recording(
         "lap",

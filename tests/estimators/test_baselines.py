@@ -83,7 +83,8 @@ def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_consta
         )  # held from the sample before
 
     start = estimate["vy"][0]
-    solved, times = [start], drive.time - drive.time[0]
+    solved = [start]
+    times = drive.time - drive.time[0]
     for begin, end in itertools.pairwise(times):
         solved.append(
             solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[

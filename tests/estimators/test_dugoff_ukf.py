@@ -102,7 +102,8 @@ def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_wi
 @pytest.mark.parametrize("inputs", ["full", "imu"])
 def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     drive = dugoff_drive(6.0, 7)
-    gap, slow = drive["ay"].copy(), drive["vx"].copy()
+    gap = drive["ay"].copy()
+    slow = drive["vx"].copy()
     gap[150:220] = np.nan
     slow[300:380] = np.linspace(20.0, -1.0, 80)
     slow[380:420] = np.linspace(-1.0, 15.0, 40)
@@ -163,7 +164,8 @@ def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
 
 
 def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_scored():
-    drive, still = dugoff_drive(12.0, straight=4.0), np.arange(1200) >= 700
+    drive = dugoff_drive(12.0, straight=4.0)
+    still = np.arange(1200) >= 700
     quiet = {
         "ay": np.where(still, 0.0, drive["ay"]),
         "vx": np.where(still, 0.0, drive["vx"]),
@@ -177,7 +179,8 @@ def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_
     assert "recording 'drive': channel 'ax' has gaps" in refusal(
         lambda: DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
     )
-    drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
+    drive = dugoff_drive(3.0)
+    data = IdentificationSettings(method="data")
     other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
     losses = [
         given().fit(FitData([], [own]), data).metrics["best_validation_loss"]

@@ -52,10 +52,8 @@ def test_parameter_counts_are_those_of_the_paper():
 def test_configuration_file_states_the_defaults(name):
     """What the pages' tables of settings say, from the class, is what `vehest train` takes."""
     needed = {"wheelbase": 2.7} if name == "data_sheet" else {}
-    family, given = (
-        estimator_class(name),
-        compose_config("train", [f"estimator={name}"])["estimator"],
-    )
+    family = estimator_class(name)
+    given = compose_config("train", [f"estimator={name}"])["estimator"]
     assert family.from_config({**given, **needed}).settings == family.from_config(needed).settings
 
 
@@ -102,7 +100,8 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
     save_model(estimator, tmp_path, {"seed": 0})
     loaded = load_model(tmp_path)
     drive = drive_for(estimator)
-    one, other = estimator.estimate([drive])[0], loaded.estimate([drive])[0]
+    one = estimator.estimate([drive])[0]
+    other = loaded.estimate([drive])[0]
     assert np.array_equal(one["vy"], other["vy"], equal_nan=True)
     assert loaded.settings == estimator.settings
     assert sorted(file.name for file in tmp_path.iterdir()) == ["model.safetensors", "model.yaml"]

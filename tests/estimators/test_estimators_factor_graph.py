@@ -34,7 +34,8 @@ def least_squares(estimator, drive, first, last, start, deviation):
     """States first … last by sparse least squares over the equations that factors stand for, (last - first + 1, 2)."""
     noise = estimator.settings.noise
     A, B, C, D = estimator.sampled_model(drive["vx"])
-    entries, right = [], []
+    entries = []
+    right = []
 
     def equation(coefficients, value, sigma):
         """Coefficients of state i of sample k."""
@@ -79,18 +80,22 @@ def states_of(estimate):
 
 
 def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_long_one():
-    estimator, drive = factor_graph(), drive_with_gaps(12.0)
+    estimator = factor_graph()
+    drive = drive_with_gaps(12.0)
     expected = least_squares(estimator, drive, 0, len(drive) - 1, np.zeros(2), 100.0)
     estimate = estimator.estimate([drive])[0]
     assert np.abs(states_of(estimate) - expected).max() < 1e-9
     assert estimate.mode == "offline"
-    estimator, drive = factor_graph(window=5.0), drive_with_gaps(1.0)
+    estimator = factor_graph(window=5.0)
+    drive = drive_with_gaps(1.0)
     estimate = estimator.estimate([drive])[0]
     assert np.abs(states_of(estimate) - filtered(estimator, drive).filtered.mean).max() < 1e-9
     assert estimate.mode == "causal"
     # Its first state hangs on what the window before made of that state.
-    estimator, drive = factor_graph(window=0.05), drive_with_gaps(0.8)
-    expected, second = np.zeros((len(drive), 2)), np.zeros(2)
+    estimator = factor_graph(window=0.05)
+    drive = drive_with_gaps(0.8)
+    expected = np.zeros((len(drive), 2))
+    second = np.zeros(2)
     for k in range(len(drive)):
         first = max(k - 5, 0)
         start, deviation = (second, 1.0) if first > 0 else (np.zeros(2), 100.0)
@@ -101,7 +106,8 @@ def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_
 
 
 def test_online_skips_gaps_as_batch_does_and_believes_a_state_handed_over():
-    estimator, drive = factor_graph(window=0.1), drive_with_gaps()
+    estimator = factor_graph(window=0.1)
+    drive = drive_with_gaps()
     stepper = estimator.online()
     online = np.array(
         [

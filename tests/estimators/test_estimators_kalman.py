@@ -35,9 +35,11 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
         "kalman",
     )
     drive = linear_drive(30.0, seed=3)[0].without_references()
-    own, trained = kalman(noise={"read_from": "recording"}), kalman()
+    own = kalman(noise={"read_from": "recording"})
+    trained = kalman()
     trained.fit(FitData([drive], []), NoTraining())
-    one, other = own.estimate([drive])[0], trained.estimate([drive])[0]
+    one = own.estimate([drive])[0]
+    other = trained.estimate([drive])[0]
     assert np.array_equal(one["vy"], other["vy"])
     assert (one.mode, other.mode) == ("offline", "causal")
     assert (own.learns, own.n_parameters, own.variant) == (False, 0, "kalman_own_noise")
@@ -151,9 +153,11 @@ def augmented(drive, ay, steer, seconds):
     """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
     A, B, C, D = kalman(**GIVEN).sampled_model(drive["vx"])
     kept = np.exp(-0.01 / seconds)
-    mean, covariance = np.zeros(4), np.diag([1e4, 1e4, ay**2, steer**2])
+    mean = np.zeros(4)
+    covariance = np.diag([1e4, 1e4, ay**2, steer**2])
     R = np.diag([NOISE["ay"] ** 2, NOISE["yaw_rate"] ** 2])
-    means, covariances = [], []
+    means = []
+    covariances = []
     for k in range(len(drive)):
         if k > 0:
             F = np.block(
@@ -195,7 +199,8 @@ def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     estimator = kalman(**GIVEN, offsets=OFFSETS, gate=5.0)
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
     drive, _ = with_planted_offsets(1, 0.6, 0.01)
-    stepper, batch = estimator.online(), estimator.estimate([drive])[0]
+    stepper = estimator.online()
+    batch = estimator.estimate([drive])[0]
     online = [
         stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
         for k in range(len(drive))

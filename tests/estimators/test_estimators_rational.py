@@ -70,12 +70,14 @@ def test_slopes_and_peak_of_the_rational_tyre_are_those_of_differentiation_and_c
 def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
     """One prediction of a covariance without noise is A P Aᵀ, that of a known state Δt σ² B Bᵀ."""
     estimator = rational(tyres)
-    track, n = estimator.track(), 4 + len(estimator.adapted)
+    track = estimator.track()
+    n = 4 + len(estimator.adapted)
     generator = np.random.default_rng(0)
     for sample in (np.array([np.nan, 22.0, np.nan, 0.11]), np.array([np.nan, 9.0, np.nan, -0.3])):
         root = 0.01 * generator.standard_normal((n, n))
         mean = 0.1 * generator.standard_normal(n)
-        state, inputs = torch.as_tensor(mean), torch.as_tensor(sample[[1, 3]])
+        state = torch.as_tensor(mean)
+        inputs = torch.as_tensor(sample[[1, 3]])
         slope = torch.func.jacrev(track.transition)(state, inputs).numpy()
         steering = torch.func.jacrev(track.transition, 1)(state, inputs)[:, 1].numpy()
         wander = np.diag([0.0] * 4 + [0.05**2] * (n - 4))
@@ -107,8 +109,10 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     estimator = rational("rational", curves=curves)
     count = round(15.0 * estimator.settings.rate_hz)
     samples = np.full((count, 4), np.nan)
-    samples[:, 1], samples[:, 3] = 25.0, 0.02
-    ours, theirs = estimator.filter_samples(samples), readable(estimator, samples).filtered
+    samples[:, 1] = 25.0
+    samples[:, 3] = 0.02
+    ours = estimator.filter_samples(samples)
+    theirs = readable(estimator, samples).filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
     assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
     unscented = rational("rational", curves=curves, filter="unscented").filter_samples(samples)
@@ -121,9 +125,11 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
 @pytest.mark.parametrize("tyres", KINDS)
 def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_forms(tyres, drive):
     """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
-    estimator, short = rational(tyres, largest_sideslip=np.radians(1.5)), drive.cut(0.0, 8.0)
+    estimator = rational(tyres, largest_sideslip=np.radians(1.5))
+    short = drive.cut(0.0, 8.0)
     samples = short.stack(estimator.channels)
-    ours, theirs = estimator.filter_samples(samples), readable(estimator, samples).filtered
+    ours = estimator.filter_samples(samples)
+    theirs = readable(estimator, samples).filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
     assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
     free = rational(tyres).filter_samples(samples).mean
@@ -165,7 +171,8 @@ def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncerta
 def test_changed_tyres_and_friction_are_found_and_help():
     """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and half the error of fixed tyres."""
     worn = rational_drive(120.0, seed=2, stiffness=0.85)
-    adaptive, fixed = rational().estimate([worn])[0], rational("rational").estimate([worn])[0]
+    adaptive = rational().estimate([worn])[0]
+    fixed = rational("rational").estimate([worn])[0]
     for axle in ("front", "rear"):
         late = adaptive[f"cornering_stiffness_{axle}"][-600:]
         assert late.mean() == pytest.approx(0.85 * CURVES[f"c2_{axle}"], rel=0.05)
@@ -188,7 +195,8 @@ def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(d
     """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
     estimator = rational(adapt_above=2.0)
     filtered = estimator.filter_samples(drive.stack(estimator.channels))
-    before, after = filtered.mean[:-1, 4:], filtered.mean[1:, 4:]
+    before = filtered.mean[:-1, 4:]
+    after = filtered.mean[1:, 4:]
     held = (before == after).all(axis=1)
     bend = np.abs(drive["vx"] * filtered.mean[:, 1])[1:]
     assert held[bend < 1.5].all()
@@ -217,7 +225,8 @@ def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_th
         assert np.abs(states).max() == pytest.approx(np.log(1.5)), "the bound is reached"
         assert (np.abs(states) <= np.log(1.5)).all()
     # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations.
-    wide, narrow = rational(curves={**CURVES, "deviation": 0.5}), rational()
+    wide = rational(curves={**CURVES, "deviation": 0.5})
+    narrow = rational()
     assert wide.bounds()[4:] == pytest.approx([1.5] * 4)
     assert narrow.bounds()[4:] == pytest.approx([np.log(3.0)] * 4)
 
@@ -237,7 +246,8 @@ def test_a_car_that_stands_or_reverses_rolls_without_slip_and_its_tyres_are_held
 
 
 def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected():
-    train, held_out = rational_drive(60.0, seed=4), rational_drive(40.0, seed=5)
+    train = rational_drive(60.0, seed=4)
+    held_out = rational_drive(40.0, seed=5)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
     assert "has no axle curves yet; fit or load it first" in refusal(
@@ -294,7 +304,8 @@ def test_levels_of_the_unscented_filter_are_found_through_the_extended_one_withi
 
 def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(drive):
     """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
-    train, worn = rational_drive(60.0, seed=4), rational_drive(60.0, seed=7, stiffness=0.85)
+    train = rational_drive(60.0, seed=4)
+    worn = rational_drive(60.0, seed=7, stiffness=0.85)
     alone, both = (
         estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}})
         for spread in (None, 0.2)

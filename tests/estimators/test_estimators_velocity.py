@@ -176,11 +176,13 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
         PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1
     )
     estimator = _estimator(name)
-    network, drive = estimator.network, _drive(0.6, 1)
+    network = estimator.network
+    drive = _drive(0.6, 1)
     phase = _phase(estimator, training, [drive], DATA.validation)
     whole = _drives(estimator, [drive]).padded(torch.tensor([[0, 60]]), 0)
     parts = [whole.stretch(0, 30), whole.stretch(30, 60)]
-    together, apart = phase.loss(whole).detach(), [phase.loss(part) for part in parts]
+    together = phase.loss(whole).detach()
+    apart = [phase.loss(part) for part in parts]
     assert float(together) == pytest.approx(
         float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4
     )
@@ -248,7 +250,8 @@ def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     w = estimator.weights()
     drive = _drive(0.3, seed=5).without_references()
-    h, c = np.zeros(6), np.zeros(6)
+    h = np.zeros(6)
+    c = np.zeros(6)
     start = np.array([drive["vx"][0], 0.0, drive["yaw_rate"][0]])
     y = (start - w["output_mean"]) / w["output_scale"]
     expected = []

@@ -18,7 +18,8 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.registry import estimator_class, estimator_names
 
-SPIKE, JUMP = 6.0, 8.0  # s
+SPIKE = 6.0
+JUMP = 8.0  # s
 DUGOFF = {
     "inputs": "imu",
     "tyres": TYRES,
@@ -93,9 +94,11 @@ def vy(made, recording):
 )  # whose network sees the spike, too
 @pytest.mark.parametrize("size", [1e6, -1e3])
 def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
-    gated, free = estimator(name, 6.0), estimator(name)
+    gated = estimator(name, 6.0)
+    free = estimator(name)
     at = round(SPIKE * drive(name).rate_hz)
-    clean, spike = vy(gated, drive(name)), vy(gated, spoilt(name, size))
+    clean = vy(gated, drive(name))
+    spike = vy(gated, spoilt(name, size))
     harm = np.abs(spike - clean)[at : at + 20].max()
     assert harm < 0.2
     believed = np.abs(vy(free, spoilt(name, size)) - vy(free, drive(name)))[at : at + 20]
@@ -104,7 +107,8 @@ def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
 
 def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
     made = estimator("cnn_ukf", 6.0)
-    own, at = made.pseudo_of, round(SPIKE * 100.0)
+    own = made.pseudo_of
+    at = round(SPIKE * 100.0)
     sure = lambda inputs: own(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
     monkeypatch.setattr(made, "pseudo_of", sure)
     clean = vy(made, drive("cnn_ukf"))
@@ -123,7 +127,8 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
 
 @EVERY
 def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name):
-    gated, free = vy(estimator(name, 6.0), drive(name)), vy(estimator(name), drive(name))
+    gated = vy(estimator(name, 6.0), drive(name))
+    free = vy(estimator(name), drive(name))
     back = round((JUMP + 3.0) * drive(name).rate_hz)
     size = np.sqrt(np.mean(free[back:] ** 2))
     assert np.sqrt(np.mean((gated - free)[back:] ** 2)) < 0.02 * max(size, 1.0)
@@ -147,8 +152,10 @@ def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_
 
 @EVERY
 def test_online_with_a_gate_is_batch_with_a_gate(name):
-    recording, made = spoilt(name, 1e4), estimator(name, 4.0)
-    batch, stepper = vy(made, recording), made.online()
+    recording = spoilt(name, 1e4)
+    made = estimator(name, 4.0)
+    batch = vy(made, recording)
+    stepper = made.online()
     online = [
         stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"]
         for k in range(len(recording))
@@ -227,8 +234,10 @@ def motion(steps):
     ],  # others take an infinite value
 )
 def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
-    made, samples = ready(name), rows(name)
-    calm, disturbed = made.online(), made.online()
+    made = ready(name)
+    samples = rows(name)
+    calm = made.online()
+    disturbed = made.online()
     expected = motion([calm.step(row) for row in samples])
     found = []
     for k, row in enumerate(samples):

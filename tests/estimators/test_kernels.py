@@ -60,11 +60,10 @@ def _problem(estimator, dtype, members=3, batch=70):
 @pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
 def test_compiled_recursion_equals_plain_one(estimator, dtype, tolerance):
     value_and_gradient = _problem(estimator, dtype)
-    (value, gradient), (plain_value, plain_gradient) = (
-        value_and_gradient(True),
-        value_and_gradient(False),
-    )
-    scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
+    (value, gradient) = value_and_gradient(True)
+    (plain_value, plain_gradient) = value_and_gradient(False)
+    scale = plain_value.abs().max()
+    gradient_scale = plain_gradient.abs().max()
     assert (value - plain_value).abs().max() <= tolerance * scale
     assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
 
@@ -89,7 +88,8 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
     try:
         for threads, members in ((1, 1), (1, 5), (2, 1), (2, 64), (3, 5), (4, 2)):
             torch.set_num_threads(threads)
-            times, workers = np.zeros(members, int), set()
+            times = np.zeros(members, int)
+            workers = set()
 
             def work(first, end, times=times, workers=workers):
                 times[first:end] += 1
@@ -120,9 +120,11 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
     series[:, 0] = torch.tensor([0.0, 0.1, -0.2, 0.3, 0.05, -0.15, 0.29, 0.5, -0.7])[
         torch.arange(len(series)) % 9
     ]
-    layout, starts = FlatParameters(network), torch.arange(65).unsqueeze(0)
+    layout = FlatParameters(network)
+    starts = torch.arange(65).unsqueeze(0)
     flat = layout.pack([network]).requires_grad_()
-    values, gradients = [], []
+    values = []
+    gradients = []
     for compiled in (True, False):
         values.append(
             predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled)
@@ -173,12 +175,14 @@ def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones()
 
     def apply(x, above, angle):
         for i in range(x.size):
-            above[i], angle[i] = softplus(x[i]), arctan(x[i])
+            above[i] = softplus(x[i])
+            angle[i] = arctan(x[i])
 
     x = np.concatenate([np.linspace(-80.0, 80.0, 20001), np.linspace(-2.0, 2.0, 20001)]).astype(
         np.float32
     )
-    above, angle = np.empty_like(x), np.empty_like(x)
+    above = np.empty_like(x)
+    angle = np.empty_like(x)
     apply(x, above, angle)
     exact = x.astype(np.float64)
     assert (np.abs(above / np.logaddexp(0.0, exact) - 1.0) <= 6e-8 * (4.0 + np.abs(exact))).all(), (
@@ -190,7 +194,8 @@ def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones()
 def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshold():
     drive = planar_drive(20.0, 100.0, noise=0.02)
     measurements = drive.stack(("yaw_rate", "vx", "ay", "ax"))
-    vy, vx = np.empty(len(drive)), np.empty(len(drive))
+    vy = np.empty(len(drive))
+    vx = np.empty(len(drive))
     implicit_euler_observer(measurements, 6.0, 0.1, 0.01, 0.0, np.nan, vy, vx)
     compiled_vy, compiled_vx = observe(measurements, 6.0, 0.1, 0.01)
     assert np.array_equal(vy, compiled_vy)

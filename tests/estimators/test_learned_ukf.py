@@ -161,7 +161,9 @@ def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
 
 
 def test_members_that_differ_in_the_start_of_friction_share_their_training():
-    one, other, third = estimator(), estimator(start_friction=0.4), estimator(repair=False)
+    one = estimator()
+    other = estimator(start_friction=0.4)
+    third = estimator(repair=False)
     assert (
         one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
     )
@@ -241,7 +243,8 @@ variant_of = partial(estimator, LearnedUkfVariant)
 
 
 def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
-    one, other = estimator(), variant_of()
+    one = estimator()
+    other = variant_of()
     for made in (one, other):
         made.fit(data(), quick(one_step=3))
     assert other.variant == "nntf_uh"
@@ -256,7 +259,8 @@ def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
 
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])
 def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
-    full, made = estimator(noise=noise), variant_of(noise=noise, correlated_noise=False)
+    full = estimator(noise=noise)
+    made = variant_of(noise=noise, correlated_noise=False)
     for own in (full, made):
         own.fit(data(), quick(3, one_step=3))
     assert made.variant == f"{full.variant}_diagonal"
@@ -303,9 +307,11 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
 
 def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
     plain = {"dynamics": "pacejka", "noise": "constant", "through_filter": False}
-    one, other = estimator(**plain), variant_of(curvature=True, **plain)
+    one = estimator(**plain)
+    other = variant_of(curvature=True, **plain)
     assert other.n_parameters == one.n_parameters + 3
-    state, inputs = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]]), torch.tensor([[0.1, 8.0]])
+    state = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]])
+    inputs = torch.tensor([[0.1, 8.0]])
     with torch.no_grad():
         torch.testing.assert_close(
             other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6

@@ -85,7 +85,8 @@ def gradients_of(estimator, loss):
 
 
 def test_a_word_counts_as_much_as_its_variance_says():
-    estimator, drive = estimator_of("ensemble_ukf"), DATA.train[0]
+    estimator = estimator_of("ensemble_ukf")
+    drive = DATA.train[0]
     wrong = drive["sideslip_ref"] + 0.02
 
     def filtered(variance):
@@ -147,7 +148,8 @@ def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_wher
     samples = estimator.network.samples(
         *learnt_samples(DATA.train, estimator.network_inputs, estimator.name)
     )
-    levels, rows = torch.tensor([2e-3, 3e-3], dtype=torch.float64), torch.tensor([[3, 500, 1000]])
+    levels = torch.tensor([2e-3, 3e-3], dtype=torch.float64)
+    rows = torch.tensor([[3, 500, 1000]])
     phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
     outputs = estimator.network(samples.inputs[rows])[0]
     unit = float(estimator.network.unit)
@@ -201,7 +203,8 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation():
     track = estimator.track()
     expected_filter = TrackFilter(track)
     expected_filter.model = TorchModel(track.transition, track.observation)
-    ours, training.filter = training.filter, expected_filter
+    ours = training.filter
+    training.filter = expected_filter
     expected = training.loss(batch)
     assert found.item() == pytest.approx(expected.item(), rel=1e-10)
     for own, other in zip(
@@ -328,7 +331,8 @@ def test_a_loss_in_degrees_is_the_same_in_another_unit():
 
 
 def test_one_recording_decides_less_where_recordings_count():
-    quiet, wild = (0.01 * 100, 100), (4.0 * 100, 100)
+    quiet = (0.01 * 100, 100)
+    wild = (4.0 * 100, 100)
     assert error_over([quiet] * 9 + [wild], "samples") == pytest.approx(0.409)
     assert error_over([quiet] * 9 + [wild], "recordings") == pytest.approx(0.29**2)
     assert error_over([quiet, (0.0, 0)], "recordings") == pytest.approx(0.01)

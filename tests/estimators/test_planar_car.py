@@ -56,7 +56,8 @@ def driven(count):
 
 def through_the_filter(car, compiled, dtype):
     """Means of 25 sequences, more than a block of points holds, and the gradients of a random sum of them."""
-    sequences, steps = 25, 12
+    sequences = 25
+    steps = 12
     _, inputs = driven(sequences * steps)
     measurements = drawn(sequences, steps, 4) + torch.tensor([0.0, 0.0, 1.0, 3.0])
     measurements[1, 4, 0] = torch.nan
@@ -68,7 +69,8 @@ def through_the_filter(car, compiled, dtype):
         for noise in ([1e-3, 1e-3, 1e-2, 1e-2, 1e-4], [50.0, 50.0, 0.1, 0.1])
     ]
     model = CompiledPlanarCar(car, STEP, LOWER, dtype) if compiled else readable(car)
-    y, u = measurements.to(dtype), inputs.reshape(sequences, steps, 2).to(dtype)
+    y = measurements.to(dtype)
+    u = inputs.reshape(sequences, steps, 2).to(dtype)
     outcome = unscented_scan(
         model,
         y,

@@ -32,10 +32,8 @@ def loaded_drive(seconds=8.0, seed=0, name="drive"):
     drive = dugoff_drive(seconds, seed, name=name)
     channels = dict(drive.channels)
     for corner in ("fl", "fr", "rl", "rr"):
-        channels[f"fx_{corner}"], channels[f"fz_{corner}"] = (
-            492.5 * drive["ax"],
-            np.full(len(drive), 4831.0),
-        )
+        channels[f"fx_{corner}"] = 492.5 * drive["ax"]
+        channels[f"fz_{corner}"] = np.full(len(drive), 4831.0)
     return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, drive.kind)
 
 
@@ -68,7 +66,8 @@ def kept(seed, layer, shape, dropout):
 
 def readable(inputs, parameters, member, dropout):
     """One member's outputs in torch, with the masks that its seed stands for."""
-    hidden, scale = inputs, 256.0 / (256.0 - round(256 * dropout))
+    hidden = inputs
+    scale = 256.0 / (256.0 - round(256 * dropout))
     for layer in (0, 1):
         hidden = torch.relu(
             hidden @ parameters[2 * layer][member] + parameters[2 * layer + 1][member]
@@ -115,10 +114,8 @@ def test_losses_and_their_gradients_are_those_of_the_formulas():
         parameters = list(network(outputs).parameters())
         expected = []
         for member in range(3):
-            said, wanted = (
-                readable(table[rows[member]], parameters, member, 0.2),
-                targets[rows[member]],
-            )
+            said = readable(table[rows[member]], parameters, member, 0.2)
+            wanted = targets[rows[member]]
             if outputs == 1:
                 expected.append((said[:, 0] - wanted).square().mean())
             else:

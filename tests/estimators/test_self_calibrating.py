@@ -28,8 +28,10 @@ def drive(
     angle=1.0,
 ):
     """A car whose rear axle is as the filter assumes, below the limit, at a changing speed: samples (T, 4) and vy (T,)."""
-    fine, rng = 10, np.random.default_rng(seed)
-    dt, t = 1.0 / (RATE * fine), np.arange(round(seconds * RATE * fine)) / (RATE * fine)
+    fine = 10
+    rng = np.random.default_rng(seed)
+    dt = 1.0 / (RATE * fine)
+    t = np.arange(round(seconds * RATE * fine)) / (RATE * fine)
     speed = 22.0 + 6.0 * np.sin(2.0 * np.pi * t / 37.0)
     force = angle * (
         4.0 * np.sin(2.0 * np.pi * t / 7.0) + 2.0 * np.sin(2.0 * np.pi * t / 3.1 + seed)
@@ -38,13 +40,15 @@ def drive(
     slip = np.vectorize(lambda a: np.sign(a) * 14.0 * (1.0 - (1.0 - abs(a) / 14.0) ** 0.25) / 0.25)(
         force
     )
-    v, yaw_rate = np.zeros(len(t)), np.zeros(len(t))
+    v = np.zeros(len(t))
+    yaw_rate = np.zeros(len(t))
     for k in range(1, len(t)):  # a_r = v' + ω u - b ω', v = b ω - C u φ: solved for ω
         v_rear = -compliance * speed[k] * slip[k]
         before = v[k - 1] - rear * yaw_rate[k - 1]
         yaw_rate[k] = (force[k] - (v_rear - before) / dt) / speed[k]
         v[k] = rear * yaw_rate[k] + v_rear
-    ay, ax = np.gradient(v, dt) + yaw_rate * speed, np.gradient(speed, dt) - yaw_rate * v
+    ay = np.gradient(v, dt) + yaw_rate * speed
+    ax = np.gradient(speed, dt) - yaw_rate * v
     measured = np.column_stack([yaw_rate, speed, (ay + offset) / (1.0 - leakage), ax + 0.05])
     measured = np.column_stack(
         [np.convolve(one, np.ones(fine) / fine, mode="same") for one in measured.T]
@@ -60,9 +64,12 @@ def plain_filter(model, samples, network=None):
 
     With v of the network at each sample, (T,), that is the filter whose axle slips as the network has it.
     """
-    n, (mean, deviation) = model.numbers(), model.prior
-    grip, of_network = model.grips[0], 0.0
-    x, p = mean.copy(), np.diag(deviation**2)
+    n = model.numbers()
+    (mean, deviation) = model.prior
+    grip = model.grips[0]
+    of_network = 0.0
+    x = mean.copy()
+    p = np.diag(deviation**2)
     x[1] = samples[0, 1]
     times = np.array(
         [
@@ -76,13 +83,12 @@ def plain_filter(model, samples, network=None):
             model.axle_error_time,
         ]
     )
-    decay, g = np.exp(-n.dt / times), 1.0 - np.exp(-n.dt / n.axle_lag)
-    smooth, sums, last, found = (
-        samples[0].copy(),
-        np.zeros(3),
-        samples[0],
-        np.empty((len(samples), 8)),
-    )
+    decay = np.exp(-n.dt / times)
+    g = 1.0 - np.exp(-n.dt / n.axle_lag)
+    smooth = samples[0].copy()
+    sums = np.zeros(3)
+    last = samples[0]
+    found = np.empty((len(samples), 8))
 
     def curve(force):
         if network is not None:
@@ -98,7 +104,8 @@ def plain_filter(model, samples, network=None):
         smooth = smooth + g * (sample - smooth)
         turning = (smooth[0] - before) / n.dt
         r, ay, ax = ((last + sample) / 2.0)[[0, 2, 3]]
-        turn, speed = (last[0] * last[1] + sample[0] * sample[1]) / 2.0, sample[1]
+        turn = (last[0] * last[1] + sample[0] * sample[1]) / 2.0
+        speed = sample[1]
         sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
         if network is not None:
             of_network += g * (
@@ -112,10 +119,16 @@ def plain_filter(model, samples, network=None):
         )
         size = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
         a = np.eye(8)
-        a[0, 2], a[0, 4], a[1, 0], a[1, 3] = -n.dt, -n.dt * ay, n.dt * r, -n.dt
-        x, p = a @ x + np.array([n.dt * (ay - turn), n.dt * ax, *np.zeros(6)]), a @ p @ a.T
-        f, q = np.diag(decay), deviation**2 * (1.0 - decay**2)
-        x, p = mean * (1.0 - decay) + f @ x, f @ p @ f + np.diag(q)
+        a[0, 2] = -n.dt
+        a[0, 4] = -n.dt * ay
+        a[1, 0] = n.dt * r
+        a[1, 3] = -n.dt
+        x = a @ x + np.array([n.dt * (ay - turn), n.dt * ax, *np.zeros(6)])
+        p = a @ p @ a.T
+        f = np.diag(decay)
+        q = deviation**2 * (1.0 - decay**2)
+        x = mean * (1.0 - decay) + f @ x
+        p = f @ p @ f + np.diag(q)
         p += np.diag(
             [
                 n.dt * (n.noise_vy**2 + (n.noise_delay * turning * speed) ** 2),
@@ -141,11 +154,14 @@ def plain_filter(model, samples, network=None):
             (0.0, axle, variance),
         ):
             row = np.array([(modelled(x + d) - modelled(x - d)) / 2e-6 for d in np.eye(8) * 1e-6])
-            residual, s = measured - modelled(x), row @ p @ row + r_
+            residual = measured - modelled(x)
+            s = row @ p @ row + r_
             residual *= min(1.0, n.gate * np.sqrt(s) / max(abs(residual), 1e-300))
             gain = p @ row / s
-            x, p = x + gain * residual, p - np.outer(gain, row @ p)
-        found[t], last = x, sample
+            x = x + gain * residual
+            p = p - np.outer(gain, row @ p)
+        found[t] = x
+        last = sample
     return found
 
 
@@ -165,11 +181,9 @@ def test_filter_of_one_grip_limit_matches_plain_matrices():
 def test_filter_with_the_networks_axle_matches_plain_matrices():
     samples, _ = drive(20.0)
     model = model_of(grips=[300.0], network_start=1e12)  # so that the other filter has no weight
-    state, network, states = (
-        model.first_state(samples[0], {}),
-        np.empty(len(samples)),
-        np.empty((len(samples), 8)),
-    )
+    state = model.first_state(samples[0], {})
+    network = np.empty(len(samples))
+    states = np.empty((len(samples), 8))
     for k in range(len(samples)):
         network[k] = state.lags[kernel.PREDICTED]
         _, _, state = model.trace(samples[k : k + 1], state)
@@ -201,7 +215,8 @@ def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing(
 
 def test_filters_do_not_depend_on_their_lanes():
     samples, _ = drive(20.0)
-    grips, order = np.linspace(4.0, 25.0, 12), np.random.default_rng(0).permutation(12)
+    grips = np.linspace(4.0, 25.0, 12)
+    order = np.random.default_rng(0).permutation(12)
     models = [model_of(grips=own.tolist()) for own in (grips, grips[order])]
     (found, states, last), (other, of_other, permuted) = (
         model.trace(samples, model.first_state(samples[0], {})) for model in models
@@ -219,7 +234,9 @@ def test_tanh_of_vectors():
 
 
 def test_finds_the_rear_axle_and_tells_how_well():
-    z_scores, shares, of_priors = [], [], []
+    z_scores = []
+    shares = []
+    of_priors = []
     for seed in range(6):
         truth = {
             "compliance": 0.004 + 0.0008 * seed,
@@ -229,7 +246,8 @@ def test_finds_the_rear_axle_and_tells_how_well():
         samples, vy = drive(90.0, seed, **truth)
         model = model_of()
         _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
-        last, late = states[-1], slice(round(30.0 * RATE), None)
+        last = states[-1]
+        late = slice(round(30.0 * RATE), None)
         known = {kernel.COMPLIANCE: truth["compliance"], kernel.LEAKAGE: truth["leakage"]}
         z_scores += [
             (last[state] - value) / np.sqrt(last[8 + state]) for state, value in known.items()
@@ -297,11 +315,9 @@ def test_compiled_code_is_found_again_in_the_next_process():
 
 
 def test_smoother_matches_joint_least_squares_of_a_rolling_car():
-    rng, model = (
-        np.random.default_rng(2),
-        model_of(
-            smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0
-        ),
+    rng = np.random.default_rng(2)
+    model = model_of(
+        smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0
     )
     samples = np.column_stack(
         [
@@ -311,9 +327,13 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
             0.2 * rng.normal(size=25),
         ]
     )
-    n, deviation, steps = model.numbers(), model.prior[1], len(samples)
-    step, decay = np.eye(4), model.decay[:4]  # of v, u and the offsets of ay and ax
-    step[0, 2], step[1, 3] = -n.dt, -n.dt
+    n = model.numbers()
+    deviation = model.prior[1]
+    steps = len(samples)
+    step = np.eye(4)
+    decay = model.decay[:4]  # of v, u and the offsets of ay and ax
+    step[0, 2] = -n.dt
+    step[1, 3] = -n.dt
     step *= decay[:, None]
     noise = np.array(
         [
@@ -323,27 +343,25 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
         ]
     )
     middle = (np.vstack([samples[:1], samples[:-1]]) + samples) / 2.0
-    rows, values = (
-        [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]],
-        [np.array([0.0, samples[0, 1], 0, 0])],
-    )
+    rows = [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]]
+    values = [np.array([0.0, samples[0, 1], 0, 0])]
     values[0] /= deviation[:4]
     for k in range(steps):
         moved = np.zeros((4, 4 * (steps + 1)))
-        moved[:, 4 * k : 4 * k + 4], moved[:, 4 * k + 4 : 4 * k + 8] = -step, np.eye(4)
+        moved[:, 4 * k : 4 * k + 4] = -step
+        moved[:, 4 * k + 4 : 4 * k + 8] = np.eye(4)
         rows.append(moved / np.sqrt(noise)[:, None])
         values.append(
             np.array([n.dt * middle[k, 2], n.dt * middle[k, 3], 0.0, 0.0]) / np.sqrt(noise)
         )
         measured = np.zeros((2, 4 * (steps + 1)))
-        measured[0, 4 * k + 5], measured[1, 4 * k + 4] = 1.0 / n.noise_speed, 1.0 / kernel.ROLLING
+        measured[0, 4 * k + 5] = 1.0 / n.noise_speed
+        measured[1, 4 * k + 4] = 1.0 / kernel.ROLLING
         rows.append(measured)
         values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
     stacked = np.vstack(rows)
-    expected, covariance = (
-        np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0],
-        np.linalg.inv(stacked.T @ stacked),
-    )
+    expected = np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0]
+    covariance = np.linalg.inv(stacked.T @ stacked)
     estimate, _ = model.run(samples, model.first_state(samples[0], {}))
     np.testing.assert_allclose(estimate["vy"], expected[4::4], rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(
@@ -364,7 +382,9 @@ def test_at_the_end_of_a_drive_smoother_and_filter_agree():
 
 
 def test_smoothed_estimates_err_less_within_their_bands():
-    causal, smooth, within = [], [], []
+    causal = []
+    smooth = []
+    within = []
     for seed in range(4):
         samples, vy = drive(40.0, seed, compliance=0.004 + 0.001 * seed)
         for errors, model in ((causal, model_of()), (smooth, model_of(smoothed=True))):

@@ -28,8 +28,11 @@ def car(kind, seconds, rate_hz, size):
     speed = 12.0 + 4.0 * np.sin(0.11 * time)
     angle = size * (0.10 * np.sin(0.5 * time) + 0.06 * np.sin(0.83 * time))
     curves = CURVES[kind].tolist()
-    front_arm, rear_arm = TRUCK.cg_to_front_axle, TRUCK.cg_to_rear_axle
-    beta, r, rows = 0.0, 0.0, []
+    front_arm = TRUCK.cg_to_front_axle
+    rear_arm = TRUCK.cg_to_rear_axle
+    beta = 0.0
+    r = 0.0
+    rows = []
     for u, steer in zip(speed.tolist(), angle.tolist(), strict=True):
         front = axle_force(kind, curves[0], steer - beta - front_arm * r / u)
         rear = axle_force(kind, curves[1], rear_arm * r / u - beta)
@@ -105,7 +108,8 @@ def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands
     assert (
         np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]
     ).all()
-    found, interval = np.array([fit.front[0], fit.rear[0]]), fit.interval[:, 0]
+    found = np.array([fit.front[0], fit.rear[0]])
+    interval = fit.interval[:, 0]
     np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
     np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
 
@@ -125,8 +129,10 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     both = fit_motion(axle_motion([drive(seed=1), drive(seed=2)], TRUCK))
     assert both.slip.shape[1] == 2 * fit_motion(axle_motion([drive(seed=1)], TRUCK)).slip.shape[1]
     own = drive()
-    slow, unknown = np.array(own["vx"]), np.array(own["ay"])
-    slow[:500], unknown[1000:1100] = 1.0, np.nan
+    slow = np.array(own["vx"])
+    unknown = np.array(own["ay"])
+    slow[:500] = 1.0
+    unknown[1000:1100] = np.nan
     motion = axle_motion(
         [
             replace(

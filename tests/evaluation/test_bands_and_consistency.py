@@ -40,7 +40,8 @@ BANDS = Bands(("car",), ("mine",), (), ("two (all)",), "turn", 9, 100.0, ("vx",)
 def part_of(rng, seconds=100.0, deviation=0.1):
     """White Gaussian errors of v at 20 m/s, and true 90 % bands."""
     n = round(20.0 * seconds)
-    vy, vx = rng.standard_normal(n), np.full(n, 20.0)
+    vy = rng.standard_normal(n)
+    vx = np.full(n, 20.0)
     error = deviation * rng.standard_normal(n)
     half = np.full(n, deviation * GAUSSIAN[2])
     angles = np.arctan2(vy + error, vx), np.arctan2(vy, vx)
@@ -97,7 +98,8 @@ def test_intraclass_correlation_of_planted_variances():
 
 def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
     """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
-    rng, held = np.random.default_rng(3), 0
+    rng = np.random.default_rng(3)
+    held = 0
     for _ in range(2000):
         sizes = rng.integers(50, 150, 12).astype(float)
         sums = rng.binomial(sizes.astype(int), rng.beta(4.5, 0.5, 12)).astype(float)
@@ -110,7 +112,8 @@ def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count
     low, high = proportion_interval(np.full(10, 50.0), np.full(10, 50.0))
     assert low == pytest.approx(0.025 ** (1.0 / 10.0))  # Clopper & Pearson for 10 of 10
     assert high == 1.0
-    nis, dof = np.array([0.0, 3.0, 1.0]), np.array([0.0, 4.0, 2.0])
+    nis = np.array([0.0, 3.0, 1.0])
+    dof = np.array([0.0, 4.0, 2.0])
     assert normalised_innovation_squared(nis, dof) == pytest.approx((0.75 + 0.5) / 2)
     assert math.isnan(normalised_innovation_squared(nis[:1], dof[:1]))
     assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75
@@ -187,7 +190,8 @@ def figures_of_kalman(factor):
 
 
 def test_a_kalman_filter_is_consistent_on_its_own_model_and_not_with_half_the_noise():
-    right, sure = figures_of_kalman(1.0), figures_of_kalman(0.5)
+    right = figures_of_kalman(1.0)
+    sure = figures_of_kalman(0.5)
     assert right["nees"] == pytest.approx(1.0, abs=0.1)
     assert right["nis"] == pytest.approx(1.0, abs=0.05)
     assert right["coverage_1sigma"] == pytest.approx(COVERAGE[1], abs=0.05)

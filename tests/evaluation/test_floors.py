@@ -91,7 +91,8 @@ def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent_and_a_perfect_
     for sigma in (0.003, 0.02, 0.1):
         floor = reference_floor([drive_of(noisy_reference(sigma), Span("d", "drive"), PROTOCOL)])
         assert floor.vy == pytest.approx(sigma, rel=0.04)
-    noisy, drive = noisy_reference(0.05), planar_drive(400.0)
+    noisy = noisy_reference(0.05)
+    drive = planar_drive(400.0)
     floor = reference_floor([drive_of(noisy, Span("d", "drive"), Protocol(RATE, 0.0, 0.0))])
     error = np.degrees(
         np.arctan2(drive["vy_ref"], drive["vx"]) - np.arctan2(noisy["vy_ref"], noisy["vx"])
@@ -102,7 +103,9 @@ def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent_and_a_perfect_
 def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
     """Swings at 2 Hz have third differences like noise; ay and yaw rate tell that they were driven."""
     time = np.arange(4000) / RATE
-    v, r, u = 0.2 * np.sin(4 * np.pi * time), 0.1 * np.cos(4 * np.pi * time), np.full(4000, 20.0)
+    v = 0.2 * np.sin(4 * np.pi * time)
+    r = 0.1 * np.cos(4 * np.pi * time)
+    u = np.full(4000, 20.0)
     ay = 0.8 * np.pi * np.cos(4 * np.pi * time) + u * r
     generator = np.random.default_rng(0)
     swings = Recording(
@@ -152,17 +155,16 @@ def test_bound_is_that_of_tichavsky_and_others():
     """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
     model, prior = random_model(200)
     bound = posterior_bound(model, prior)
-    inverse_Q, inverse_R = (
-        np.linalg.inv(model.process_noise),
-        np.diag(1.0 / model.observation_noise),
-    )
+    inverse_Q = np.linalg.inv(model.process_noise)
+    inverse_R = np.diag(1.0 / model.observation_noise)
     told = [C.T @ inverse_R @ C for C in model.observation]
     information = np.linalg.inv(prior) + told[0]
     for k in range(200):
         assert np.allclose(bound[k], np.linalg.inv(information), rtol=1e-8)
         if k < 199:
             A = model.transition[k]
-            D11, D12 = A.T @ inverse_Q @ A, -A.T @ inverse_Q
+            D11 = A.T @ inverse_Q @ A
+            D12 = -A.T @ inverse_Q
             information = inverse_Q + told[k + 1] - D12.T @ np.linalg.solve(information + D11, D12)
 
 
@@ -178,8 +180,10 @@ def test_long_drives_are_bounded_in_chunks_of_the_same_outcome_and_gaps_and_stan
         pytest.approx(whole.sideslip, rel=1e-9),
     )
     drive = single_track_drive(60.0)
-    vx, ay = drive["vx"].copy(), drive["ay"].copy()
-    vx[400:600], ay[700:720] = 0.0, np.nan
+    vx = drive["vx"].copy()
+    ay = drive["ay"].copy()
+    vx[400:600] = 0.0
+    ay[700:720] = np.nan
     gappy = Recording(
         "d", "car", RATE, 0.0, {**drive.channels, "vx": vx, "ay": ay}, gappy=frozenset({"ay"})
     )
@@ -235,8 +239,12 @@ def test_kinematics_tell_v_by_accelerations_in_bends_alone():
 
 def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
     """Drives drawn from v⁺ = φ v + ξ, ay = dv/dt + uω + offset + noise: an optimal filter's error is the bound's, to a few per cent."""
-    generator, n, step = np.random.default_rng(7), 6000, 1.0 / RATE
-    v, offset, white = markov(generator, n + 1, 0.8, 3.0), markov(generator, n, 0.15, 10.0), 0.3
+    generator = np.random.default_rng(7)
+    n = 6000
+    step = 1.0 / RATE
+    v = markov(generator, n + 1, 0.8, 3.0)
+    offset = markov(generator, n, 0.15, 10.0)
+    white = 0.3
     ay = np.diff(v) * RATE - offset - white * generator.standard_normal(n)
     channels = {"vx": np.full(n, 20.0), "yaw_rate": np.zeros(n), "ay": ay, "vy_ref": v[:-1]}
     drives = [
@@ -244,12 +252,15 @@ def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
             Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), Protocol(RATE, 0.0, 0.0)
         )
     ]
-    decay, slow = math.exp(-step / 3.0), math.exp(-step / 10.0)
+    decay = math.exp(-step / 3.0)
+    slow = math.exp(-step / 10.0)
     own = KalmanFilter(dim_x=3, dim_z=1)  # v, v a sample earlier, offset
-    own.x, own.P = np.zeros((3, 1)), np.diag([0.8**2, 0.8**2, 0.15**2])
+    own.x = np.zeros((3, 1))
+    own.P = np.diag([0.8**2, 0.8**2, 0.15**2])
     own.F = np.array([[decay, 0, 0], [1, 0, 0], [0, 0, slow]])
     own.Q = np.diag([0.8**2 * (1 - decay**2), 0.0, 0.15**2 * (1 - slow**2)])
-    own.H, own.R = np.array([[RATE, -RATE, -1.0]]), np.array([[white**2]])
+    own.H = np.array([[RATE, -RATE, -1.0]])
+    own.R = np.array([[white**2]])
     errors = []
     for k in range(n):
         own.predict()

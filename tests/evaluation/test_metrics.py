@@ -130,8 +130,10 @@ def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
 
 def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
     """Half a second at 0.0003 m/s: 0.1 m/s of v would be a sideslip of 90 degrees there."""
-    vx, vy = drive["vx"].copy(), drive["vy_ref"].copy()
-    vx[500:510], vy[500:510] = 0.0003, 0.0
+    vx = drive["vx"].copy()
+    vy = drive["vy_ref"].copy()
+    vx[500:510] = 0.0003
+    vy[500:510] = 0.0
     own = replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
     estimate = _estimate(own.time, vy + np.where(vx < 1.0, 0.1, 0.0), 20.0, 0.0)
     counted, without = (
@@ -172,7 +174,8 @@ def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(driv
     assert segments_of([part], 20.0).squared_error_vy.sum() == pytest.approx(0.01 * len(part.time))
 
 
-RATE, N = 20.0, 400
+RATE = 20.0
+N = 400
 PROTOCOL = Protocol(rate_hz=RATE, skip_seconds=1.5)
 
 
@@ -191,7 +194,8 @@ def drive(point="unknown"):
 def scored(recording, vy):
     cut = recording.cut(PROTOCOL.skip_seconds, recording.end_time)
     vy = vy[-len(cut) :]
-    sideslip, reference = np.arctan2(vy, cut["vx"]), np.arctan2(cut["vy_ref"], cut["vx"])
+    sideslip = np.arctan2(vy, cut["vx"])
+    reference = np.arctan2(cut["vy_ref"], cut["vx"])
     return Scored(cut.time, vy, cut["vy_ref"], sideslip, reference, np.full(len(cut), np.nan))
 
 
@@ -244,7 +248,8 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
 
 
 def driven_by(errors_deg, ay):
-    zero, error = np.zeros(len(ay)), np.radians(errors_deg)
+    zero = np.zeros(len(ay))
+    error = np.radians(errors_deg)
     return Scored(np.arange(len(ay)) * 0.01, 20.0 * np.tan(error), zero, error, zero, np.array(ay))
 
 

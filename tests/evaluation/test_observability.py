@@ -41,10 +41,8 @@ def test_singular_values_of_a_linear_model_in_closed_form_with_units_and_blindne
     assert (blind.rank == 1).all()
     assert np.isinf(blind.deviation[:, 0]).all()
     np.testing.assert_allclose(blind.deviation[:, 1], np.sqrt(0.5))
-    plain, scaled = (
-        along(lambda x, u: x[:1]),
-        along(lambda x, u: x[:1], sizes=(2.0, 2.0), noise=(0.5,)),
-    )
+    plain = along(lambda x, u: x[:1])
+    scaled = along(lambda x, u: x[:1], sizes=(2.0, 2.0), noise=(0.5,))
     np.testing.assert_allclose(scaled.smallest, 4.0 * plain.smallest)
     np.testing.assert_allclose(scaled.deviation, plain.deviation / 4.0)
 

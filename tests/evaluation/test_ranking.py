@@ -30,7 +30,8 @@ def scored(error, vy_ref=None):
     """A range whose lateral velocity is off by ``error`` [m/s] at 20 m/s."""
     reference = np.zeros_like(error) if vy_ref is None else vy_ref
     time = np.arange(len(error)) / RATE
-    beta, beta_ref = np.arctan2(reference + error, 20.0), np.arctan2(reference, 20.0)
+    beta = np.arctan2(reference + error, 20.0)
+    beta_ref = np.arctan2(reference, 20.0)
     return Scored(time, reference + error, reference, beta, beta_ref, np.zeros_like(error))
 
 

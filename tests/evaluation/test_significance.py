@@ -14,7 +14,8 @@ from vehest.evaluation.significance import (
 )
 from vehest_papers.kit.paired import paired_difference, sequence_labels
 
-N_SEQUENCES, LENGTH = 16, 100
+N_SEQUENCES = 16
+LENGTH = 100
 LABELS = sequence_labels([LENGTH] * N_SEQUENCES)
 
 
@@ -50,7 +51,8 @@ def test_a_shift_is_found_although_sequences_differ_more_and_one_lucky_training_
     assert result.mean.p_value < 1e-3
     assert result.median.high < 0.0
     generator = np.random.default_rng(4)
-    first, second = losses(generator, 3) * 0.01, losses(generator, 1) * 0.01
+    first = losses(generator, 3) * 0.01
+    second = losses(generator, 1) * 0.01
     first[0] -= 1.0
     assert compared(first, second).mean.p_value > 0.2
     assert compared(first[:1], second).mean.p_value < 0.01, (
@@ -113,7 +115,8 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
 
 def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone():
     """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
-    sizes, even = np.ones(40), np.full((3, 40), 0.0)
+    sizes = np.ones(40)
+    even = np.full((3, 40), 0.0)
     seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]
     assert _degrees_of_freedom([even, even], sizes, seeds) == pytest.approx(4.0)
     blocks = np.tile(np.tile([-1.0, 1.0], 20), (3, 1))
@@ -122,7 +125,8 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides
     )
     generator = np.random.default_rng(1)
     sizes, own, other = generator.uniform(0.5, 1.5, 40), *generator.standard_normal((2, 40))
-    a, b = float(np.var((own - other) / sizes.mean(), ddof=1)) / 40.0, 1.0 / 3.0
+    a = float(np.var((own - other) / sizes.mean(), ddof=1)) / 40.0
+    b = 1.0 / 3.0
     found = _degrees_of_freedom(
         [np.tile(2.0 * sizes + own, (3, 1)), np.tile(other, (3, 1))],
         sizes,

@@ -38,7 +38,8 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
     assert own.power == pytest.approx(1.5**2 / 2, rel=1e-6)
     assert own.density[np.abs(own.frequency - hz) > 2.5 / 25.6].max() < 1e-6 * own.density.max()
     generator = np.random.default_rng(2)
-    long, short = generator.standard_normal(512 * 4), 3.0 * generator.standard_normal(512)
+    long = generator.standard_normal(512 * 4)
+    short = 3.0 * generator.standard_normal(512)
     apart = [periodogram([samples], RATE) for samples in (long, short)]
     together = periodogram([long, short], RATE)
     assert [own.n_segments for own in (*apart, together)] == [7, 1, 8]
@@ -48,7 +49,8 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
 
 
 def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
-    hz, time = 1.0, drive.time
+    hz = 1.0
+    time = drive.time
     waving = replace(drive, channels={**drive.channels, "vy_ref": np.sin(2 * np.pi * hz * time)})
     shrunk = np.sin(2 * np.pi * hz / RATE) / (2 * np.pi * hz / RATE)
     np.testing.assert_allclose(

@@ -53,7 +53,8 @@ class Library:
         """Outputs (T, 4) in the order of `OUTPUTS` and whether each step went well (T,); a lost method starts anew."""
         dtype = np.float64 if self.precision == "double" else np.float32
         rows = np.ascontiguousarray(rows, dtype)
-        out, fine = np.empty((len(rows), 4), dtype), np.zeros(len(rows), np.int8)
+        out = np.empty((len(rows), 4), dtype)
+        fine = np.zeros(len(rows), np.int8)
         self.library.state_bytes.restype = ctypes.c_size_t
         state = ctypes.create_string_buffer(self.library.state_bytes())
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (rows, out, fine)]

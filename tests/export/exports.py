@@ -76,7 +76,8 @@ def drive(estimator, seed, seconds=40.0):
 def trust(name):
     """Limits and health learnt on two drives, bands set by hand."""
     estimator = model(name)
-    drives, rate = [drive(estimator, seed) for seed in (1, 2)], estimator.settings.rate_hz
+    drives = [drive(estimator, seed) for seed in (1, 2)]
+    rate = estimator.settings.rate_hz
     own = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
     about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
     bands = Bands(
@@ -88,13 +89,15 @@ def trust(name):
 
 def faulted(estimator, rate_hz, seconds=30.0, seed=0):
     """A drive with a fault of any kind in any channel every few seconds, at a rate."""
-    plain, generator = drive(estimator, seed + 3, seconds), np.random.default_rng(seed)
+    plain = drive(estimator, seed + 3, seconds)
+    generator = np.random.default_rng(seed)
     times = np.arange(0.0, seconds - 0.1, 1.0 / rate_hz)
     samples = {
         name: np.interp(times, np.arange(len(plain)) / plain.rate_hz, plain[name])
         for name in estimator.channels
     }
-    at, number = 2.0, 0
+    at = 2.0
+    number = 0
     while at < seconds - 2.0:
         channel = str(generator.choice(estimator.channels))
         kind = str(generator.choice([kind for kind in KINDS if applies(kind, channel)]))
@@ -106,11 +109,9 @@ def faulted(estimator, rate_hz, seconds=30.0, seed=0):
             generator.uniform(0.2, 1.5),
             number,
         )
-        samples, at, number = (
-            inject(samples, rate_hz, fault),
-            at + generator.uniform(0.8, 3.0),
-            number + 1,
-        )
+        samples = inject(samples, rate_hz, fault)
+        at = at + generator.uniform(0.8, 3.0)
+        number = number + 1
     return samples
 
 

@@ -97,7 +97,8 @@ def _sections(said: str) -> tuple[int, int, int]:
     for words in (line.split() for line in said.splitlines()):
         if len(words) < 3 or not words[1].isdigit():
             continue
-        name, size = words[0], int(words[1])
+        name = words[0]
+        size = int(words[1])
         if name.startswith(".text"):
             code += size
         elif name.startswith((".rodata", ".data.rel.ro")):
@@ -109,7 +110,9 @@ def _sections(said: str) -> tuple[int, int, int]:
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
     """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``; functions that are called and absent."""
-    own, calls, known = {}, {}, set()
+    own = {}
+    calls = {}
+    known = set()
     for graph in graphs:
         for title, label in _NODE.findall(graph):
             known.add(title)

@@ -104,7 +104,8 @@ def sources():
 
 def differences(text, golden):
     """Where a text is another than the golden one; numbers may differ in their last digits, as they do between machines."""
-    ours, theirs = text.splitlines(), golden.splitlines()
+    ours = text.splitlines()
+    theirs = golden.splitlines()
     if len(ours) != len(theirs):
         return [f"{len(ours)} lines instead of {len(theirs)}"]
     return [

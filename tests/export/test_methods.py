@@ -26,7 +26,8 @@ from vehest.export.program import exportable, method_files
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings
 
-DOUBLE, FLOAT = 1e-9, 1e-4  # m/s
+DOUBLE = 1e-9
+FLOAT = 1e-4  # m/s
 LEVELS = {"process_vy": 0.01, "process_yaw_rate": 0.003, "ay": 0.06, "yaw_rate": 0.002}
 WITH_FORCES = {**LEVELS, "force_factor": 3.0, "fy_front": 100.0, "fy_rear": 100.0}
 ON_DUGOFF = ("dugoff_ukf", "ensemble_ukf", "cnn_ukf")
@@ -115,7 +116,8 @@ def of_dugoff(name, config):
 @cache
 def dugoff_channels():
     """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
-    generator, time = np.random.default_rng(1), np.arange(1200) / 100.0
+    generator = np.random.default_rng(1)
+    time = np.arange(1200) / 100.0
     n = len(time)
     vx = 13.0 - 12.0 * np.cos(2.0 * np.pi * time / 10.0)
     ax = 2.4 * np.pi * np.sin(2.0 * np.pi * time / 10.0)
@@ -148,7 +150,8 @@ def widened(estimator):
 
 def disturbed(estimator, rows):
     """One in twenty samples missing of what may be, and values on which a method without memory of them has to start anew."""
-    rows, generator = rows.copy(), np.random.default_rng(0)
+    rows = rows.copy()
+    generator = np.random.default_rng(0)
     for name in estimator.skippable:
         if name in estimator.channels:
             rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
@@ -167,16 +170,15 @@ def disturbed(estimator, rows):
 
 def stepped(estimator, rows):
     """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
-    out, fine, stepper = (
-        np.full((len(rows), len(OUTPUTS)), np.nan),
-        np.ones(len(rows), bool),
-        estimator.online(),
-    )
+    out = np.full((len(rows), len(OUTPUTS)), np.nan)
+    fine = np.ones(len(rows), bool)
+    stepper = estimator.online()
     for k, row in enumerate(rows):
         try:
             found = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
         except DataError:
-            fine[k], stepper = False, estimator.online()
+            fine[k] = False
+            stepper = estimator.online()
             continue
         out[k] = [found.get(name, np.nan) for name in OUTPUTS]
     return out, fine
@@ -302,16 +304,17 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
         hard.filter.observation_noise.factor.mul_(0.002)
     rows = disturbed(hard, drive_for(hard).stack(hard.channels))[:200].copy()
     rows[:, 1:5] *= 3.0
-    stepper, wanted, repaired, lifted = widened(hard).online(), [], 0, 0
+    stepper = widened(hard).online()
+    wanted = []
+    repaired = 0
+    lifted = 0
     for row in rows:
         wanted.append(
             list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3]
         )
         tape = stepper._filter._tape
-        repaired, lifted = (
-            repaired + bool(tape.repaired[0, 0]),
-            lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0),
-        )
+        repaired = repaired + bool(tape.repaired[0, 0])
+        lifted = lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
     assert repaired > 20
     assert lifted > 0
     said, _ = built(hard, "double", tmp_path)(rows)
@@ -408,11 +411,10 @@ def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(
     Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in Python and in C alike; the median
     hardly moves. So both are compared over nine such drives.
     """
-    case, generator = small_car(data_root, dynamics), np.random.default_rng(0)
-    library, exact = (
-        built(case.estimator, "float", tmp_path),
-        stepped(case.in_float64, case.rows)[0][:, 0],
-    )
+    case = small_car(data_root, dynamics)
+    generator = np.random.default_rng(0)
+    library = built(case.estimator, "float", tmp_path)
+    exact = stepped(case.in_float64, case.rows)[0][:, 0]
     drives = [
         case.rows,
         *(

@@ -99,10 +99,8 @@ def test_the_stack_is_bounded_and_nothing_is_allocated(tmp_path, family, precisi
 
 
 def test_the_deepest_chain_of_calls_counts_and_recursion_is_refused():
-    node, edge = (
-        'node: {{ title: "{0}" label: "{0}\\nx.c:1:1\\n{1} bytes (static)" }}',
-        'edge: {{ sourcename: "{0}" targetname: "{1}" }}',
-    )
+    node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:1\\n{1} bytes (static)" }}'
+    edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" }}'
     nodes = [
         node.format(*own) for own in (("main", 16), ("left", 100), ("right", 40), ("leaf", 70))
     ]
@@ -140,7 +138,8 @@ def test_a_cortex_m4f_without_an_operating_system_finds_the_same(tmp_path, place
 
 def run_on_board(export, board):
     """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was said."""
-    compiler, emulator = tool("arm-none-eabi-gcc"), tool(BOARD[0])
+    compiler = tool("arm-none-eabi-gcc")
+    emulator = tool(BOARD[0])
     options = [*STRICT, *ARM, "-I."]
     command([compiler, *options, "-c", *export.sources], export.folder)
     command([compiler, *options, "-include", str(board / "count.h"), "-c", "main.c"], export.folder)

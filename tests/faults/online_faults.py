@@ -35,7 +35,10 @@ from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.watch import STARTED
 
-SETTLE, LASTS, COMES_BACK, RECOVERS = 4.0, 4.0, 8.0, 3.0  # s
+SETTLE = 4.0
+LASTS = 4.0
+COMES_BACK = 8.0
+RECOVERS = 3.0  # s
 TIMES_USUAL = 2.0
 
 HEADER = [
@@ -123,7 +126,8 @@ def grounds():
         bmw,
     )
     if os.environ.get("VEHEST_DATA"):
-        day, hoons = "20140222_01_01_03_250lm", "iros_hoons_1_with_friction_run_"
+        day = "20140222_01_01_03_250lm"
+        hoons = "iros_hoons_1_with_friction_run_"
         yield Ground("ferrari_250lm", "real", (day, 0, 300), (day, 300, 400), (day, 450.0), FERRARI)
         yield Ground(
             "f1tenth",
@@ -166,8 +170,11 @@ def walk(estimator, limits, samples):
         dict(zip(samples, row, strict=True))
         for row in zip(*(values.tolist() for values in samples.values()), strict=True)
     ]
-    said, exceptions, starts = np.full(len(rows), np.nan), 0, 0
-    fastest, bounded = 1.0, True
+    said = np.full(len(rows), np.nan)
+    exceptions = 0
+    starts = 0
+    fastest = 1.0
+    bounded = True
     for k, row in enumerate(rows):
         try:
             said[k] = stepper.step(row)["vy"]
@@ -199,7 +206,8 @@ def try_family(ground, name):
     estimator = vehest.train(name, [train], [validation], ground.families[name])
     rate = estimator.settings.rate_hz
     limits = learn_limits([at_rate(train, estimator)], estimator.channels, rate)
-    drive, start = at_rate(recording(ground.data, ground.trial[0]), estimator), ground.trial[1]
+    drive = at_rate(recording(ground.data, ground.trial[0]), estimator)
+    start = ground.trial[1]
     drive = stretch(drive, start, start + SETTLE + LASTS + COMES_BACK)
     samples = {channel: drive[channel].copy() for channel in estimator.channels}
     speed = drive["vx_ref"] if "vx_ref" in drive else drive["vx"]
@@ -215,7 +223,8 @@ def try_family(ground, name):
 
     nominal = walk(estimator, limits, samples)[0]
     settled = np.arange(len(drive)) >= max(warm, round(2.0 * rate))
-    after, during = seconds >= back, (seconds >= SETTLE) & (seconds < SETTLE + LASTS)
+    after = seconds >= back
+    during = (seconds >= SETTLE) & (seconds < SETTLE + LASTS)
     usual = max(error(nominal, settled), error(nominal, after))
     measured = [channel for channel, values in samples.items() if not np.isnan(values).all()]
     rows = []
@@ -225,7 +234,8 @@ def try_family(ground, name):
         vy, exceptions, starts, bounded = walk(
             estimator, limits, inject(samples, rate, Fault(kind, channel, severity, SETTLE, LASTS))
         )
-        finite, vy = bool(np.isfinite(vy[warm:]).all()), np.nan_to_num(vy, nan=1e9)
+        finite = bool(np.isfinite(vy[warm:]).all())
+        vy = np.nan_to_num(vy, nan=1e9)
         row = (
             ground.data,
             ground.kind,
@@ -262,7 +272,8 @@ def main():
     ]
     cases = [case for case in cases if asked.only in (None, case[1])]
     cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
-    started, tables = time.monotonic(), {}
+    started = time.monotonic()
+    tables = {}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
         for (ground, name), rows in zip(

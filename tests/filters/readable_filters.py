@@ -100,7 +100,8 @@ def unscented_filter(model, measurements, inputs, initial, rule):
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1 with the points drawn again.
     """
     if measurements.dim() == 3:
-        several, n = len(measurements), initial.mean.shape[-1]
+        several = len(measurements)
+        n = initial.mean.shape[-1]
         each = zip(
             measurements,
             inputs,
@@ -113,7 +114,9 @@ def unscented_filter(model, measurements, inputs, initial, rule):
         return NonlinearFiltered(
             filtered_of(rows), torch.stack([repaired for _, repaired in found])
         )
-    state, rows, repaired = initial, [], torch.zeros(len(measurements), dtype=torch.bool)
+    state = initial
+    rows = []
+    repaired = torch.zeros(len(measurements), dtype=torch.bool)
     for k, (y, u) in enumerate(zip(measurements, inputs, strict=True)):
         if k > 0:
             _, factor, repaired[k] = factorised(state.covariance)
@@ -143,7 +146,8 @@ def _updated(model, state, factor, y, u, rule):
     """The state given a measurement, of which NaN is skipped; innovation, its covariance, what was measured, whether it was repaired."""
     drawn = model.possible(sigma_points(rule, state.mean, factor))
     expected = model.observation(drawn, u[None])
-    mean, measured = mean_of(rule, expected), ~torch.isnan(y)
+    mean = mean_of(rule, expected)
+    measured = ~torch.isnan(y)
     spread = torch.where(measured, expected - mean, 0.0)
     noise = torch.where(
         measured[:, None] & measured,
@@ -162,7 +166,8 @@ def _updated(model, state, factor, y, u, rule):
 
     posterior, covariance, lost = conditioned(rule)
     if rule.centre_covariance < 0.0 and (lost or factorised(posterior.covariance)[2]):
-        (posterior, covariance, _), lost = conditioned(rule._replace(centre_covariance=0.0)), True
+        (posterior, covariance, _) = conditioned(rule._replace(centre_covariance=0.0))
+        lost = True
     return posterior, innovation, covariance, measured, lost
 
 
@@ -171,10 +176,12 @@ def extended_filter(model, measurements, inputs, initial):
 
     Source: Jazwinski 1970, Chapter 8; the update holds for any gain, also that of a consider state (Schmidt).
     """
-    state, rows = initial, []
+    state = initial
+    rows = []
     for k, (y, u) in enumerate(zip(measurements, inputs, strict=True)):
         if k > 0:
-            before, pushed = state.mean, inputs[k - 1]
+            before = state.mean
+            pushed = inputs[k - 1]
             slope = jacfwd(model.transition)(before, pushed)
             covariance = slope @ state.covariance @ slope.mT + model.process_noise(before, pushed)
             state = Gaussian(
@@ -189,7 +196,8 @@ def extended_filter(model, measurements, inputs, initial):
             torch.eye(len(y), dtype=y.dtype),
         )
         innovation = torch.where(measured, y - model.observation(state.mean, u), 0.0)
-        S, cross = H @ state.covariance @ H.mT + R, state.covariance @ H.mT
+        S = H @ state.covariance @ H.mT + R
+        cross = state.covariance @ H.mT
         gain = torch.linalg.solve(S, cross.mT).mT
         if model.free is not None:
             gain = torch.where(model.free(state.mean, u)[:, None], gain, 0.0)
@@ -204,8 +212,11 @@ def extended_filter(model, measurements, inputs, initial):
 
 def rational_model(estimator):
     """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
-    track, bound = estimator.track(), torch.as_tensor(estimator.bounds())
-    car, n_tyres, levels = estimator.car, len(estimator.adapted), estimator.values
+    track = estimator.track()
+    bound = torch.as_tensor(estimator.bounds())
+    car = estimator.car
+    n_tyres = len(estimator.adapted)
+    levels = estimator.values
     noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
 
     def adapts(yaw_rate, inputs):
@@ -241,7 +252,8 @@ def rational_model(estimator):
 
 def gated(run, measurements, gate):
     """What a filter without a gate, of one sequence (T, m), gives behind one: sample by sample, what is refused becomes NaN."""
-    y, refused = measurements.clone(), [0] * measurements.shape[-1]
+    y = measurements.clone()
+    refused = [0] * measurements.shape[-1]
     steps = run(y)
     for k in range(len(y)):
         left = y[k].clone()

@@ -11,7 +11,8 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel, smoothed_means
 from vehest.filters.kalman_scan import kalman_scan
 
-N, M = 3, 2
+N = 3
+M = 2
 
 
 def spread(generator, *shape):
@@ -56,13 +57,15 @@ def dense_posterior(model, measurements, initial, seen):
     A, b, Q, C, d, R = model
     steps = len(measurements)
     base = block_diag(initial.covariance, *Q[: steps - 1])
-    maps, offsets = [np.eye(N, N * steps)], [initial.mean]
+    maps = [np.eye(N, N * steps)]
+    offsets = [initial.mean]
     for k in range(steps - 1):
         enter = np.zeros((N, N * steps))
         enter[:, N * (k + 1) : N * (k + 2)] = np.eye(N)
         maps.append(A[k] @ maps[-1] + enter)
         offsets.append(A[k] @ offsets[-1] + b[k])
-    F, f = np.concatenate(maps), np.concatenate(offsets)
+    F = np.concatenate(maps)
+    f = np.concatenate(offsets)
     prior = F @ base @ F.T
     H = block_diag(*C)
     y_mean = H @ f + d.ravel()
@@ -70,7 +73,8 @@ def dense_posterior(model, measurements, initial, seen):
     known = ~np.isnan(measurements)
     known[seen:] = False
     rows = np.flatnonzero(known.ravel())
-    S, cross = y_cov[np.ix_(rows, rows)], (prior @ H.T)[:, rows]
+    S = y_cov[np.ix_(rows, rows)]
+    cross = (prior @ H.T)[:, rows]
     error = measurements.ravel()[rows] - y_mean[rows]
     mean = f + cross @ np.linalg.solve(S, error)
     covariance = prior - cross @ np.linalg.solve(S, cross.T)
@@ -123,7 +127,8 @@ def test_covariances_stay_symmetric_and_positive():
     result = kalman_scan(model, measurements, start).filtered.covariance
     assert np.array_equal(result, result.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(result).min() > 0
-    short, lowest = start.covariance, 0.0
+    short = start.covariance
+    lowest = 0.0
     for A, _, Q, C, _, R in zip(*model, strict=True):
         gain = short @ C.T @ np.linalg.inv(C @ short @ C.T + np.diag(R))
         short = (np.eye(N) - gain @ C) @ short

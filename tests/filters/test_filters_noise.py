@@ -17,7 +17,8 @@ from vehest.filters.noise_models import (
     with_entropy,
 )
 
-STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
+STATE = torch.randn(7, 5, generator=torch.Generator().manual_seed(0))
+INPUTS = torch.zeros(7, 2)
 START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
 
 
@@ -78,10 +79,8 @@ def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
     for own, value in zip(covariance, entropy(covariance), strict=True):
         assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
-    small, large = (
-        1e-4 * torch.eye(5, dtype=torch.float64),
-        10.0 * torch.eye(5, dtype=torch.float64),
-    )
+    small = 1e-4 * torch.eye(5, dtype=torch.float64)
+    large = 10.0 * torch.eye(5, dtype=torch.float64)
     small[0, 1] = small[1, 0] = 5e-5
     raised = with_entropy(torch.stack([small, large]), -9.0)
     assert float(entropy(raised[0])) == pytest.approx(-9.0)

@@ -92,10 +92,8 @@ def measured_pendulum(steps=40, sequences=1, seed=1):
 
 
 def test_rules_are_those_of_an_independent_library():
-    mean, covariance = (
-        np.array([0.3, -0.2, 0.7]),
-        np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]]),
-    )
+    mean = np.array([0.3, -0.2, 0.7])
+    covariance = np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])
     theirs = {
         "symmetric": filterpy.JulierSigmaPoints(3, 0.5),
         "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0),
@@ -115,8 +113,10 @@ def test_rules_are_those_of_an_independent_library():
 def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
     model, measurements, initial = example(30, missing=missing)
     known = kalman_scan(model, measurements, initial)
-    y, inputs = torch.from_numpy(measurements), torch.arange(30, dtype=torch.float64).unsqueeze(-1)
-    nonlinear, first = linear_as_nonlinear(tensors(model)), tensors(initial)
+    y = torch.from_numpy(measurements)
+    inputs = torch.arange(30, dtype=torch.float64).unsqueeze(-1)
+    nonlinear = linear_as_nonlinear(tensors(model))
+    first = tensors(initial)
     ours = (
         extended_filter(nonlinear, y, inputs, first)
         if name == "extended"
@@ -159,12 +159,11 @@ def test_unscented_filter_is_that_of_an_independent_library(rule, points):
     theirs = filterpy.UnscentedKalmanFilter(
         3, 2, STEP, as_numpy(model.observation), as_numpy(model.transition), drawn
     )
-    theirs.x, theirs.P = initial.mean.numpy().copy(), initial.covariance.numpy().copy()
+    theirs.x = initial.mean.numpy().copy()
+    theirs.P = initial.covariance.numpy().copy()
     none = torch.zeros(3, dtype=torch.float64)
-    theirs.Q, theirs.R = (
-        model.process_noise(none, none).numpy(),
-        model.observation_noise(none, none).numpy(),
-    )
+    theirs.Q = model.process_noise(none, none).numpy()
+    theirs.R = model.observation_noise(none, none).numpy()
     for k, y in enumerate(measurements[0].numpy()):
         if k > 0:
             theirs.predict(u=inputs[0, k - 1].numpy())

@@ -22,7 +22,8 @@ Learnt = namedtuple(
 
 
 def learnt(first):
-    model, nothing = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
+    model = pendulum_with_radar()
+    nothing = torch.zeros(3, dtype=torch.float64)
     parts = (
         model.process_noise(nothing, nothing),
         model.observation_noise(nothing, nothing),
@@ -50,7 +51,8 @@ def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
     least = torch.tensor(lower, dtype=torch.float64)
     pairs = []
     for way in (by_the_filter, by_the_scan):
-        parameters, measurements = learnt(first), measurements.detach().requires_grad_()
+        parameters = learnt(first)
+        measurements = measurements.detach().requires_grad_()
         filtered = way(parameters, rule, measurements, inputs, least, share)
         state = filtered.steps.filtered
         loss = (state.mean * weights[0]).sum() + (state.covariance * weights[1]).sum()
@@ -153,21 +155,17 @@ with a covariance that is not positive definite."""
 
 def squares(way, repair=True):
     """Sequences with these variances by the readable filter or the scan, and gradients of means in the first mean and covariance."""
-    eye, lone = (
-        torch.eye(3, dtype=torch.float64),
-        torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag(),
-    )
+    eye = torch.eye(3, dtype=torch.float64)
+    lone = torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag()
     mean = torch.tensor(
         [[0.5, 0.0, 0.1]] * 3 + [[0.0, 0.0, 0.0]] + [[0.5, 0.0, 0.1]] * 2, dtype=torch.float64
     )
     first = Gaussian(
         mean.requires_grad_(), torch.cat([eye.expand(5, 3, 3), lone[None]]).requires_grad_()
     )
-    y, u, rule = (
-        torch.full((6, 3, 2), 0.1, dtype=torch.float64),
-        VARIANCES[..., None],
-        symmetric_rule(3, -1.0),
-    )
+    y = torch.full((6, 3, 2), 0.1, dtype=torch.float64)
+    u = VARIANCES[..., None]
+    rule = symmetric_rule(3, -1.0)
     model = NonlinearModel(
         lambda x, _: 0.9 * x,
         lambda x, _: torch.stack([x.square().sum(-1), x[..., 0]], -1),
@@ -193,7 +191,8 @@ def squares(way, repair=True):
 
 
 def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
-    (filtered, slopes), (scanned, own) = squares("filter"), squares("scan")
+    (filtered, slopes) = squares("filter")
+    (scanned, own) = squares("scan")
     assert_equal(filtered, scanned)
     ways = [
         [False] * 3,
@@ -211,7 +210,8 @@ def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
 
 
 def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
-    (left, slopes), (tame, _) = squares("scan", repair=False), squares("scan")
+    (left, slopes) = squares("scan", repair=False)
+    (tame, _) = squares("scan")
     for sequence, first in enumerate((3, 0, 1, 0, 1, 0)):
         mean = left.steps.filtered.mean[sequence]
         assert torch.isfinite(mean[:first]).all(), sequence
@@ -245,8 +245,10 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
     def noise(base):
         return lambda x, u: base * (1.0 + x[..., :1, None] ** 2)
 
-    model, p = pendulum_with_radar(), learnt(first)
-    process, observation = noise(p.process.detach()), noise(p.observation.detach())
+    model = pendulum_with_radar()
+    p = learnt(first)
+    process = noise(p.process.detach())
+    observation = noise(p.observation.detach())
     readable = dataclasses.replace(model, process_noise=process, observation_noise=observation)
     filtered = unscented_filter(readable, measurements, inputs, first, RULES["symmetric"])
     start = Gaussian(first.mean.clone().requires_grad_(), first.covariance)
@@ -269,11 +271,10 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
 def test_one_sample_at_a_time_it_is_the_same_filter():
     measurements, inputs, first = measured_pendulum(20, 1)
     measurements[0, 4, 0] = measurements[0, 9] = torch.nan
-    model, p = pendulum_with_radar(), learnt(first)
-    points, noises = (
-        TorchModel(model.transition, model.observation),
-        [part.detach() for part in (p.process, p.observation)],
-    )
+    model = pendulum_with_radar()
+    p = learnt(first)
+    points = TorchModel(model.transition, model.observation)
+    noises = [part.detach() for part in (p.process, p.observation)]
     state = unscented_scan(
         points, measurements, inputs, first, *noises, RULES["symmetric"]
     ).steps.filtered

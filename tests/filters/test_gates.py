@@ -57,7 +57,8 @@ def test_gates_have_the_limit_of_the_chi_square_distribution_and_patience_in_sam
 
 
 def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
-    steps, generator = 50_000, np.random.default_rng(0)
+    steps = 50_000
+    generator = np.random.default_rng(0)
     model, first = walk(steps)
     truth = np.cumsum(0.1 * generator.standard_normal(steps))
     y = truth[:, None] + generator.standard_normal((steps, 2))
@@ -114,7 +115,9 @@ def test_a_gate_that_refuses_nothing_changes_no_bit():
 
 def outliers(steps, sequences):
     y, u, first = measured_pendulum(steps, sequences)
-    y[0, 5, 0], y[0, 9, 1], y[-1, 12] = 40.0, -40.0, 1e3
+    y[0, 5, 0] = 40.0
+    y[0, 9, 1] = -40.0
+    y[-1, 12] = 1e3
     y[0, 15:, 1] += 30.0  # longer than the gate is patient
     y[-1, 20, 0] = torch.nan
     return y, u, first
@@ -122,7 +125,8 @@ def outliers(steps, sequences):
 
 def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
     y, u, first = outliers(30, 3)
-    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
+    model = pendulum_with_radar()
+    gate = Gate(4.0, PATIENCE)
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
     for name, rule in RULES.items():
         scanned = unscented_scan(

@@ -17,7 +17,8 @@ from fuzz.case import template
 from place import DATASET, SPLIT, write_drives, write_steered, write_yaml
 from vehest.cli import main
 
-SECONDS, RATE_HZ = 30.0, 50.0
+SECONDS = 30.0
+RATE_HZ = 50.0
 SWEEPS = [
     [
         "estimator=luenberger",
@@ -152,7 +153,8 @@ def load_kernels():
 
     time = np.arange(1200) / 20.0
     yaw_rate = 0.3 * np.sin(0.7 * time) + 0.05 * np.sin(2.9 * time)
-    vy, vx = -2.0 * yaw_rate, 20.0 + np.sin(0.2 * time)
+    vy = -2.0 * yaw_rate
+    vx = 20.0 + np.sin(0.2 * time)
     channels = {
         "yaw_rate": yaw_rate,
         "vx": vx,

@@ -62,10 +62,8 @@ def spoil_bytes(content, rng):
         if not size:
             break
         near = size if where == "anywhere" else min(size, 500)
-        at, length = (
-            (size - near if where == "end" else 0) + rng.randrange(near),
-            rng.choice([1, 2, 4, 8, 16, 100, 1000]),
-        )
+        at = (size - near if where == "end" else 0) + rng.randrange(near)
+        length = rng.choice([1, 2, 4, 8, 16, 100, 1000])
         how = rng.randrange(7)
         if how == 0:
             data[at] ^= 1 << rng.randrange(8)
@@ -80,10 +78,8 @@ def spoil_bytes(content, rng):
         elif how == 5:
             data[at:at] = data[at : at + length] * rng.choice([1, 2, 50])
         else:
-            number, width = (
-                rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1]),
-                rng.choice([2, 4, 8]),
-            )
+            number = rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1])
+            width = rng.choice([2, 4, 8])
             data[at : at + width] = (number % 2 ** (8 * width)).to_bytes(
                 width, rng.choice(["little", "big"])
             )
@@ -222,7 +218,8 @@ def spoil_yaml(tree, rng, *, bombs=True):
 
 def spoil_json(content, rng):
     """A JSON file with a spoilt tree, spoilt text, or something too deep in it."""
-    how, tree = rng.random(), json.loads(content)
+    how = rng.random()
+    tree = json.loads(content)
     if how < 0.6:
         return json_of(spoil_tree(tree, rng)).encode("utf-8", "surrogatepass")
     return rng.choice(JSON).encode() if how < 0.7 else spoil_text(json_of(tree), rng)

@@ -39,7 +39,10 @@ class Fuzzer:
     """Everything that is imported and made once; all families but the planted ones, if none is named."""
 
     def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
-        self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
+        self.folder = folder.resolve()
+        self.seed = seed
+        self.keep = keep
+        self.seconds = seconds
         load_families()
         chosen = [
             one
@@ -69,7 +72,8 @@ class Fuzzer:
 
     def generator_of(self, index):
         """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
-        position, visit = index % len(self.turns), index // len(self.turns)
+        position = index % len(self.turns)
+        visit = index // len(self.turns)
         one = self.turns[position]
         turns_before = self.turns[:position].count(one)
         return one, visit * one.weight + turns_before, is_honest(one, position, visit)
@@ -112,10 +116,8 @@ class Fuzzer:
         if not self.keep:
             _remove(case.folder)
         error = last_line("\n".join(refusal_lines(outcome.stderr)))
-        shown, took = (
-            _shown(command, case),
-            (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb),
-        )
+        shown = _shown(command, case)
+        took = (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb)
         said = (
             printable(text.replace(str(case.folder), "…"))[:200]
             for text in (error, verdict, detail)
@@ -156,7 +158,8 @@ def _watch(case, command):
     child = os.fork()
     if child == 0:
         become(case, command)
-    process, events = os.pidfd_open(child), os.open(pipe, os.O_RDWR | os.O_NONBLOCK)
+    process = os.pidfd_open(child)
+    events = os.open(pipe, os.O_RDWR | os.O_NONBLOCK)
     readers = _Readers(child)
     while not select.select([process], [], [], POLL_SECONDS)[0]:
         readers.look()
@@ -273,10 +276,8 @@ def write_rows(rows, path):
 
 def described(row):
     """A row for people, on two lines."""
-    kind, took = (
-        " (honest)" if row.honest else "",
-        f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)",
-    )
+    kind = " (honest)" if row.honest else ""
+    took = f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
     return (
         f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest {row.command}\n"
         f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} {row.detail}"
@@ -292,7 +293,8 @@ def summary(rows):
             f"{number} {verdict}"
             for verdict, number in Counter(row.verdict for row in own).most_common()
         )
-        honest, done = sum(row.honest for row in own), sum(row.exit_code == 0 for row in own)
+        honest = sum(row.honest for row in own)
+        done = sum(row.exit_code == 0 for row in own)
         lines.append(
             f"{family:<14} {len(own):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}"
         )

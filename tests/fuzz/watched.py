@@ -68,8 +68,11 @@ class Watch:
     """
 
     def __init__(self, inside, report, *, reads=False):
-        self._inside, self._report, self._reads = os.path.realpath(inside), report, reads
-        self._armed, self._noted = False, 0
+        self._inside = os.path.realpath(inside)
+        self._report = report
+        self._reads = reads
+        self._armed = False
+        self._noted = 0
 
     def arm(self):
         """Begin; there is no end but that of the process."""

@@ -29,11 +29,9 @@ from vehest.trust.faults import is_fault
 
 FILE = Path(__file__).with_name("digests.json")
 DIGITS = 6
-LEARNT, SIMULATED, FIXED = (
-    1e-3,
-    1e-6,
-    1e-9,
-)  # tolerances elsewhere than on the machine that recorded, of an array's largest value
+LEARNT = 1e-3
+SIMULATED = 1e-6
+FIXED = 1e-9  # tolerances elsewhere than on the machine that recorded, of an array's largest value
 LIBRARIES = ("numpy", "scipy", "numba", "torch")
 VEHICLE = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 MODEL = "static_map"
@@ -80,10 +78,12 @@ def subjects():
             {f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make)
         )
     for stage, numbers in STAGES.items():
-        name, tolerance = stage.__name__.removeprefix("vehest.run."), FIXED
+        name = stage.__name__.removeprefix("vehest.run.")
+        tolerance = FIXED
         what = f"{name} in vehest.run.versions"
         if stage is not downsample:
-            what, tolerance = f"{what}, unless numbers of {MODEL} moved too,", LEARNT
+            what = f"{what}, unless numbers of {MODEL} moved too,"
+            tolerance = LEARNT
         found[f"stage {name}"] = Subject(
             {what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
         )
@@ -157,7 +157,8 @@ def _are_close(recorded, now, tolerance):
     if set(recorded) != set(now):
         return False
     for name, values in recorded.items():
-        then, today = np.array(values, float), np.array(now[name], float)
+        then = np.array(values, float)
+        today = np.array(now[name], float)
         if then.shape != today.shape or not np.allclose(
             then, today, rtol=0, atol=tolerance * then[0] if then.size else 0, equal_nan=True
         ):

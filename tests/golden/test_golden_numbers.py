@@ -32,10 +32,8 @@ def test_numbers_are_those_recorded(name):
 def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
     from vehest.estimators import luenberger
 
-    former, found = (
-        luenberger.Luenberger._estimate_one,
-        now("luenberger"),
-    )  # before its estimates are shifted: `now` keeps them
+    former = luenberger.Luenberger._estimate_one
+    found = now("luenberger")  # before its estimates are shifted: `now` keeps them
 
     def shifted(self, recording, state):
         estimate = former(self, recording, state)

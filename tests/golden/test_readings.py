@@ -15,7 +15,8 @@ def test_every_reading_is_recorded():
 
 @pytest.mark.parametrize("name", READINGS)
 def test_real_recordings_are_read_as_recorded(data_root, name):
-    recorded, now = RECORDED["readings"][name], read(name, str(data_root))
+    recorded = RECORDED["readings"][name]
+    now = read(name, str(data_root))
     assert list(now) == list(recorded)
     for recording, expected in recorded.items():
         if RECORDED["machine"] == this_machine():

@@ -54,7 +54,8 @@ EVENTS = {  # what there is once more when it happens
 }
 MAX_DELAY = 0.06  # s
 COUNTS = 3  # a moment is one of the first so many of its kind
-RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
+RUN_SECONDS = 1800.0
+LOOK_SECONDS = 0.002  # after the first a run hangs
 HEADER = (
     "number",
     "round",
@@ -104,17 +105,16 @@ def strays(leader, patience=20.0):
 
 def killed(output, stage, number, jobs, draw):
     """Start a run, kill it at a moment of a stage; none if it ended before."""
-    moment, count, delay = (
-        draw.choice(MOMENTS[stage]),
-        draw.randint(1, COUNTS),
-        draw.uniform(0.0, MAX_DELAY),
-    )
+    moment = draw.choice(MOMENTS[stage])
+    count = draw.randint(1, COUNTS)
+    delay = draw.uniform(0.0, MAX_DELAY)
     count = (
         1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
     )
     count = min(count, 2) if stage == "downsample" else count
     event = EVENTS[moment].format(stage=stage)
-    before, met = set(glob(event, root_dir=output)), set[str]()
+    before = set(glob(event, root_dir=output))
+    met = set[str]()
     process = started(output, jobs)
     while len(met) < count:
         met |= set(glob(event, root_dir=output)) - before
@@ -128,7 +128,8 @@ def killed(output, stage, number, jobs, draw):
         time.sleep(LOOK_SECONDS)
     time.sleep(delay)
     process.send_signal(number)
-    code, left = process.wait(RUN_SECONDS), strays(process.pid)
+    code = process.wait(RUN_SECONDS)
+    left = strays(process.pid)
     if code == 0:
         return None
     left += locks_held(output) + broken(output)
@@ -227,13 +228,16 @@ def one_round(position, wanted, output, reference, draw):
         kill for kill in (killed(output, *each, jobs, draw) for each in wanted) if kill is not None
     ]
     last = started(output, jobs)
-    code, left = last.wait(RUN_SECONDS), strays(last.pid)
+    code = last.wait(RUN_SECONDS)
+    left = strays(last.pid)
     failed = (
         [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
     )
-    metrics, tracking = [], []
+    metrics = []
+    tracking = []
     for of, differing in () if failed else ((content, metrics), (tracked, tracking)):
-        found, known = of(output), of(reference)
+        found = of(output)
+        known = of(reference)
         differing += [
             name for name in sorted({*found, *known}) if found.get(name) != known.get(name)
         ]
@@ -261,13 +265,17 @@ def one_round(position, wanted, output, reference, draw):
 def rounds(missing, draw, scratch, out):
     """Run rounds until every kill was made; how many were bad."""
     os.chdir(scratch)  # runs find the configuration that came with the package
-    begun, reference = time.monotonic(), scratch / "reference"
+    begun = time.monotonic()
+    reference = scratch / "reference"
     if started(reference, 1).wait(RUN_SECONDS) != 0:
         raise SystemExit(
             f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}"
         )
     print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
-    position, bad, number, limit = 0, 0, 1, 3 * missing.total()
+    position = 0
+    bad = 0
+    number = 1
+    limit = 3 * missing.total()
     with open(out, "w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(HEADER)
@@ -292,7 +300,8 @@ def rounds(missing, draw, scratch, out):
             writer.writerows([number + place, *row] for place, row in enumerate(rows))
             stream.flush()
             worse = sum(row[-1] != "good" for row in rows)
-            bad, number = bad + worse, number + len(rows)
+            bad = bad + worse
+            number = number + len(rows)
             print(
                 f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s",
                 flush=True,

@@ -32,20 +32,16 @@ def claimed(ranking, lower, higher):
 
 
 def test_orders_and_limits_are_judged_by_their_intervals(ranking):
-    right, wrong, open_ = (
-        claimed(ranking, "good", "other"),
-        claimed(ranking, "other", "good"),
-        claimed(ranking, "other", "like"),
-    )
+    right = claimed(ranking, "good", "other")
+    wrong = claimed(ranking, "other", "good")
+    open_ = claimed(ranking, "other", "like")
     assert [own.verdict for own in (right, wrong, open_)] == [
         "reproduced",
         "not reproduced",
         "undecided",
     ]
-    one, other = (
-        ranking.pairs[NAMES["good"], NAMES["other"]],
-        ranking.pairs[NAMES["other"], NAMES["good"]],
-    )
+    one = ranking.pairs[NAMES["good"], NAMES["other"]]
+    other = ranking.pairs[NAMES["other"], NAMES["good"]]
     assert (one.difference, one.low, one.high) == (-other.difference, -other.high, -other.low)
     assert one.high < 0 < other.low
     assert f"{one.difference:.3f}".replace("-", "−") in right.ours.replace("-", "−")

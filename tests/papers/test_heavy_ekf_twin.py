@@ -54,17 +54,18 @@ def dry():
 )
 def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditions):
     """Steered as it was: SciPy's Dormand and Prince at 1e-10, with slips and forces written out here."""
-    plant, own = (
-        Plant.of(payload=conditions.payload),
-        course(conditions, np.random.default_rng(3), 12.0),
-    )
+    plant = Plant.of(payload=conditions.payload)
+    own = course(conditions, np.random.default_rng(3), 12.0)
     states, steer, lateral = driven(plant, own)
-    car, step = plant.car, 1.0 / (RATE * FINER)
-    front_load, rear_load = plant.load_front, plant.load_rear
+    car = plant.car
+    step = 1.0 / (RATE * FINER)
+    front_load = plant.load_front
+    rear_load = plant.load_rear
 
     def slope(time, state, k):
         beta, r = state
-        u, mu = own.speed[k], own.friction[k]
+        u = own.speed[k]
+        mu = own.friction[k]
         slips = steer[k] - beta - car.cg_to_front_axle * r / u, -beta + car.cg_to_rear_axle * r / u
         front, rear = (
             c2 * mu * load * slip * c1 * (mu + 1.0) / (slip**2 + c1 * (mu + 1.0))
@@ -102,7 +103,8 @@ def test_axles_loads_and_curves_of_the_truck_are_the_papers():
     assert loads[0] * plant.car.cg_to_front_axle == pytest.approx(
         loads[1] * plant.car.cg_to_rear_axle
     )
-    plant, slip = Plant.of(payload=False), np.linspace(-0.2, 0.2, 41)
+    plant = Plant.of(payload=False)
+    slip = np.linspace(-0.2, 0.2, 41)
     c1, c2 = plant.curves(0.6)[:2]
     np.testing.assert_allclose(
         rational_axle(slip, c1, c2, 1.0).force,
@@ -120,10 +122,8 @@ def test_the_driver_reaches_the_slip_and_does_not_spin(slip):
 
 
 def test_seeds_decide_course_and_sensors_and_tuning_has_seeds_and_cells_of_its_own():
-    one, other = (
-        drive(Conditions(4.0), 5, SECONDS),
-        drive(Conditions(4.0, crossfall=True), 5, SECONDS),
-    )
+    one = drive(Conditions(4.0), 5, SECONDS)
+    other = drive(Conditions(4.0, crossfall=True), 5, SECONDS)
     np.testing.assert_array_equal(one.samples[:, 1], other.samples[:, 1])
     noise = [own.samples[:, 0] - own.yaw_rate for own in (one, other)]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
@@ -151,11 +151,11 @@ def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name,
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
 def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobians(name):
-    estimator, samples = (
-        estimator_of(name, LEVELS, mistaken(-0.2)),
-        drive(Conditions(5.0, crossfall=True), 1, 6.0).samples,
-    )
-    plain, extra, step = rational_model(estimator), torch.zeros(1).double(), 1.0 / RATE
+    estimator = estimator_of(name, LEVELS, mistaken(-0.2))
+    samples = drive(Conditions(5.0, crossfall=True), 1, 6.0).samples
+    plain = rational_model(estimator)
+    extra = torch.zeros(1).double()
+    step = 1.0 / RATE
 
     def transition(states, inputs):
         pull = torch.nn.functional.pad(
@@ -180,7 +180,8 @@ def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobi
         torch.cat([mean, extra]),
         torch.block_diag(covariance, (extra + crossfall_filter.DEVIATION).square()[None]),
     )
-    y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
+    y = torch.as_tensor(samples[:, [0, 2]])
+    u = torch.as_tensor(samples[:, [1, 3]])
     theirs = extended_filter(model, y, u, first).filtered.mean.numpy()
     np.testing.assert_allclose(crossfall_filter.filtered(estimator, samples), theirs, atol=1e-9)
 
@@ -230,16 +231,15 @@ def test_a_change_is_paired_over_seeds_and_corrected_for_the_tables_cells():
 def test_eigenvalues_have_the_papers_ratios_and_tracks_are_found_from_rolling_wheels():
     """1 above 6 m/s and at most about 1.3 below, with Table 1's stiffnesses."""
     stiff = replace(TRUCK, cornering_stiffness_front=CURVES[1], cornering_stiffness_rear=CURVES[3])
-    fast, slow = (
-        vehicle.ratios(stiff, np.array([6.5, 10.0, 30.0])),
-        vehicle.ratios(stiff, np.array([0.5, 2.0, 4.0])),
-    )
+    fast = vehicle.ratios(stiff, np.array([6.5, 10.0, 30.0]))
+    slow = vehicle.ratios(stiff, np.array([0.5, 2.0, 4.0]))
     np.testing.assert_allclose(fast, 1.0, atol=1e-9)
     assert 1.0 < slow.max() < 1.35
     from vehest.data.recording import Recording
 
     time = np.arange(2000) / 20.0
-    turn, u = 0.3 * np.sin(0.3 * time), np.full(2000, 20.0)
+    turn = 0.3 * np.sin(0.3 * time)
+    u = np.full(2000, 20.0)
     wheels = {
         f"wheel_speed_{name}": (u - side * turn) / vehicle.RADIUS
         for name, side in {"fl": 0.8, "fr": -0.8, "rl": 0.75, "rr": -0.75}.items()

@@ -31,13 +31,12 @@ def scheme(folder, *, bias=False):
     for seed, name in ((5, "f1"), (6, "f2")):
         drive = planar_drive(SECONDS, seed=seed, name=name)
         drives[name] = replace(drive, channels={**drive.channels, "ay": drive["ay"] - OFFSET})
-    network, zero = (
-        ksnn_with_weights(n_local=2, bias=bias),
-        estimator_class("zero").from_config({"rate_hz": 20.0}),
-    )
+    network = ksnn_with_weights(n_local=2, bias=bias)
+    zero = estimator_class("zero").from_config({"rate_hz": 20.0})
     spans = {name: (Span("cars", name),) for name in drives}
     split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})
-    models, rows = [], []
+    models = []
+    rows = []
     for estimator in (network, zero):
         at = folder / estimator.name
         at.mkdir()

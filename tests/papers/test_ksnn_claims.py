@@ -23,7 +23,8 @@ PUBLISHED = {
     "scheme_1": (paper.TABLE_IV, "c", "c2", "f2"),
     "scheme_2": (paper.TABLE_V, "f", "f2", "c2"),
 }
-SEGMENTS, SAMPLES = 600, 20
+SEGMENTS = 600
+SAMPLES = 20
 DEVIATION = {"c2": 0.49, "f2": 0.70}
 """Standard deviation of v on each test [m/s], about those of the paper's cars."""
 
@@ -49,7 +50,8 @@ def planted_segments(fvu, test, seed):
     common = np.random.default_rng(len(test) + ord(test[0]))
     hard = common.lognormal(0.0, 0.4, SEGMENTS)
     own = np.random.default_rng(seed).lognormal(0.0, 0.1, SEGMENTS)
-    variance, share = DEVIATION[test] ** 2, hard * own / np.mean(hard * own)
+    variance = DEVIATION[test] ** 2
+    share = hard * own / np.mean(hard * own)
     return Segments(
         piece=np.repeat([0.0, 1.0], SEGMENTS // 2),
         start=np.tile(np.arange(SEGMENTS // 2, dtype=float), 2),
@@ -64,7 +66,9 @@ def planted_segments(fvu, test, seed):
 
 def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2")):
     """A comparison whose candidates leave this FVU, category -> test set -> FVU, whose logarithm has a spread from seed to seed."""
-    generator, rows, models = np.random.default_rng(1), [], []
+    generator = np.random.default_rng(1)
+    rows = []
+    models = []
     other = "f" if train == "c" else "c"
     for category, by_test in fvus.items():
         estimator, variant = NAMES[category]
@@ -225,7 +229,8 @@ def test_figures_are_those_of_the_samples_and_infinite_errors_left_out():
 
 
 def test_intervals_hold_the_true_ratio_as_often_as_they_say():
-    generator, inside = np.random.default_rng(0), 0
+    generator = np.random.default_rng(0)
+    inside = 0
     for trial in range(150):
         scale = generator.lognormal(0.0, 0.3, 40)
         parts = {}
@@ -256,9 +261,11 @@ def _of_pieces(squares):
 def test_masked_segments_without_a_mask_are_the_evaluations_own():
     generator = np.random.default_rng(2)
     time = np.arange(90) / 20.0
-    vy, reference = generator.normal(size=90), generator.normal(size=90)
+    vy = generator.normal(size=90)
+    reference = generator.normal(size=90)
     part = Scored(time, vy, reference, vy / 20.0, reference / 20.0, np.zeros(90))
-    own, plain = masked_segments([part], [np.ones(90)], 20.0), segments_of([part], 20.0)
+    own = masked_segments([part], [np.ones(90)], 20.0)
+    plain = segments_of([part], 20.0)
     assert all(np.allclose(getattr(own, name), getattr(plain, name)) for name in vars(plain))
     half = masked_segments([part], [(time < 2.0).astype(float)], 20.0)
     assert half.samples.sum() == 40

@@ -30,7 +30,8 @@ def _constant_turn(yaw_rate, n_samples, seed=0):
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_local_models_have_the_activations_and_feedback_of_the_network(structure):
     estimator = ksnn_with_weights(*structure)
-    models, values = LocalModels.of(estimator), np.linspace(-1.0, 1.0, 41)
+    models = LocalModels.of(estimator)
+    values = np.linspace(-1.0, 1.0, 41)
     with torch.no_grad():
         np.testing.assert_allclose(
             models.activations(values),
@@ -60,7 +61,8 @@ def test_gains_are_those_of_the_nearest_models_and_linearisation_the_tangent():
         model.gains(0.5 * model.centres[1]).gamma, model.gamma[:2].mean(axis=0), rtol=1e-12
     )
     np.testing.assert_array_equal(model.gains(2.0).beta, model.beta[-1])
-    models, tiny = LocalModels.of(ksnn_with_weights(2, 2, True)), 1e-6
+    models = LocalModels.of(ksnn_with_weights(2, 2, True))
+    tiny = 1e-6
     for at in (0.0, -0.4):
         rise = (models.feedback(np.array(at + tiny)) - models.feedback(np.array(at - tiny))) / (
             2 * tiny
@@ -91,10 +93,8 @@ def test_gain_in_force_is_the_slope_of_the_chord_from_zero():
 def test_sub_models_add_up_to_the_network_along_a_drive(structure):
     estimator = ksnn_with_weights(*structure)
     drive = planar_drive(noise=0.2, seed=1)
-    parts, expected = (
-        decomposed_estimate(estimator, drive),
-        estimator.estimate([drive.without_references()])[0]["vy"],
-    )
+    parts = decomposed_estimate(estimator, drive)
+    expected = estimator.estimate([drive.without_references()])[0]["vy"]
     assert np.isnan(parts.total[:30]).all()
     np.testing.assert_allclose(parts.total[30:], expected[30:], rtol=0, atol=1e-9)
     share = [
@@ -109,8 +109,12 @@ def test_sub_models_add_up_to_the_network_along_a_drive(structure):
 def test_sub_models_at_constant_yaw_rate_are_the_terms_of_eq_11(yaw_rate):
     """Eqs. 11 and 12 filtered from rest, the bias as a step, and what the start at û = u_m adds to the second and third."""
     models = LocalModels.of(ksnn_with_weights(2, 0, True, window=200))
-    own, tau = models.linearised().gains(yaw_rate), models.step
-    (g1, g2), (b1, b2), (w1, w2), (bias_1, bias_2) = own.gamma, own.beta, own.weight, own.bias
+    own = models.linearised().gains(yaw_rate)
+    tau = models.step
+    (g1, g2) = own.gamma
+    (b1, b2) = own.beta
+    (w1, w2) = own.weight
+    (bias_1, bias_2) = own.bias
     measurements = _constant_turn(yaw_rate, 200)
     _, speed, ay, ax = measurements[0].T
     denominator = np.array([1.0, w2 - g1 - g2, w1 * b2 * tau * yaw_rate**2 - w2 * g1 + g1 * g2])
@@ -147,12 +151,14 @@ def test_recording_at_another_rate_or_too_short_is_refused():
 
 
 FREQUENCY = np.linspace(0.0, 10.0, 101)
-AY, AX = 2, 3
+AY = 2
+AX = 3
 
 
 def _luenberger(gain=7.0, threshold=0.05, rate_hz=100.0):
     estimator = Luenberger(Luenberger.settings_type(rate_hz=rate_hz))
-    estimator.gain, estimator.threshold = gain, threshold
+    estimator.gain = gain
+    estimator.threshold = threshold
     return estimator
 
 
@@ -211,7 +217,8 @@ def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_respon
     yaw_rate, rate_hz
 ):
     estimator = _luenberger(rate_hz=rate_hz)
-    closed, turn = luenberger_sensitivity(estimator, yaw_rate), _turn(yaw_rate, 3000)
+    closed = luenberger_sensitivity(estimator, yaw_rate)
+    turn = _turn(yaw_rate, 3000)
     still = observe(turn, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0]
     for channel, response in zip((AY, AX), closed.response(FREQUENCY), strict=True):
         struck = turn.copy()

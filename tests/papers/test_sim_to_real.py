@@ -104,7 +104,8 @@ def part(folder, name):
         "other_simulator": Span("sim", recording.id, 45.0, 60.0),
         "ferrari": Span("ferrari", recording.id),
     }
-    models, rows = [], []
+    models = []
+    rows = []
     for seed, sizes in enumerate([*ERRORS[name], *([None] if name == "level" else [])]):
         home = folder / name / str(seed)
         model = EvaluatedModel(
@@ -136,10 +137,8 @@ def part(folder, name):
         if test != "validation" and (name, test) != ("one", "other_simulator")
     }
     split = Split(name, (Span("sim", f"{name}_lap"),), (spans["validation"],), tests)
-    kinds, references = (
-        {"sim": "simulated", "ferrari": "real"},
-        {(dataset, recording.id): file for dataset in ("sim", "ferrari")},
-    )
+    kinds = {"sim": "simulated", "ferrari": "real"}
+    references = {(dataset, recording.id): file for dataset in ("sim", "ferrari")}
     return part_of(
         split,
         PROTOCOL,

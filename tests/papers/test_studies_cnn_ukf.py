@@ -114,7 +114,8 @@ def everything(tmp_path_factory):
     recordings = {
         name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)
     }
-    models, rows = [], []
+    models = []
+    rows = []
     fitted = fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]]))
     for number, (candidate, (estimator, seeds)) in enumerate(fitted.items()):
         for seed in seeds:
@@ -154,11 +155,9 @@ def everything(tmp_path_factory):
                 rows += metric_rows(
                     models[-1], test, figures | {"n_parameters": 9.0, "epochs": 2.0}
                 )
-    kinds, titles, references = (
-        {"car": "simulated"},
-        {"car": "A car"},
-        stored(folder, "car", recordings),
-    )
+    kinds = {"car": "simulated"}
+    titles = {"car": "A car"}
+    references = stored(folder, "car", recordings)
     return part_of(
         SPLIT,
         PROTOCOL,
@@ -321,14 +320,13 @@ def test_validation_chooses_the_seed_and_a_filter_that_does_not_listen_is_called
     one = made_run(paper.MODEL, [np.full(10, 1.0)], 0, validation=np.full(10, 2.0))
     other = made_run(paper.MODEL, [np.full(10, 2.0)], 1, validation=np.full(10, 1.0))
     assert chosen([one, other]).model.seed == 1
-    quiet, wild = made_run("a", [WAVE] * 9 + [4.0 * WAVE], 0), made_run("a", [1.35 * WAVE] * 10, 1)
+    quiet = made_run("a", [WAVE] * 9 + [4.0 * WAVE], 0)
+    wild = made_run("a", [1.35 * WAVE] * 10, 1)
     assert quiet.kpis.mse > wild.kpis.mse
     assert chosen([quiet, wild]).model.seed == 0
     errors = noisy(1.0, np.random.default_rng(0), 40)
-    same, other = (
-        [made_run(paper.SMOOTH, errors)],
-        [made_run(paper.CNN, [0.5 * own for own in errors])],
-    )
+    same = [made_run(paper.SMOOTH, errors)]
+    other = [made_run(paper.CNN, [0.5 * own for own in errors])]
     assert claims.is_own_filter(
         ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9
     )
@@ -392,10 +390,8 @@ def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(
 def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, runs):
     for name in ("dugoff_ukf", "cnn_ukf"):
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
-        changed, heavy = (
-            perturbed.with_stiffness(fitted, 0.1, -0.1),
-            perturbed.with_body(fitted, 1.1, 0.9),
-        )
+        changed = perturbed.with_stiffness(fitted, 0.1, -0.1)
+        heavy = perturbed.with_body(fitted, 1.1, 0.9)
         before, after, other = (
             (own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy)
         )

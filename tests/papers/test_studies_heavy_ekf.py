@@ -22,7 +22,8 @@ def short_drive(seconds=60.0):
     """A truck that weaves, by steady-state gains, with wheels that roll."""
     time = np.arange(round(seconds * RATE)) / RATE
     generator = np.random.default_rng(0)
-    u, steer = np.full(len(time), 10.0), 0.05 * np.sin(0.4 * time)
+    u = np.full(len(time), 10.0)
+    steer = 0.05 * np.sin(0.4 * time)
     yaw_rate = u * steer / 3.5
     clean = {
         "vx": u,
@@ -69,7 +70,8 @@ def test_every_fault_leaves_the_filter_finite_and_the_monitor_sees_another_sign(
     sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
     limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))
     assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
-    nis, dof = np.repeat([2.0, 6.0, 0.0], 200), np.repeat([2.0, 1.0, 0.0], 200)
+    nis = np.repeat([2.0, 6.0, 0.0], 200)
+    dof = np.repeat([2.0, 1.0, 0.0], 200)
     np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
 
 

@@ -152,7 +152,8 @@ def test_what_cannot_be_interpreted_is_refused_and_parts_of_what_there_is_shown(
 
 def _luenberger(gain=7.0, threshold=0.02):
     estimator = Luenberger(Luenberger.settings_type(rate_hz=20.0))
-    estimator.gain, estimator.threshold = gain, threshold
+    estimator.gain = gain
+    estimator.threshold = threshold
     return estimator
 
 

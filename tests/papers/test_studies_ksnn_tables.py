@@ -45,7 +45,8 @@ FIGURES = {
 
 
 def part(figures=FIGURES, drop=""):
-    rows, models = [], []
+    rows = []
+    models = []
     for (estimator, variant, seed), (validation, *fvus) in figures.items():
         values = {("validation", "rmse_vy"): validation, ("validation", "fvu"): validation**2}
         for test, fvu in zip(("c2", "f2"), fvus, strict=True):
@@ -149,7 +150,8 @@ def test_stopping_and_candidates_count_what_was_trained():
 
 
 def test_the_scatter_shows_ours_filled_and_the_papers_hollow():
-    one, two = (("c2", "f2", paper.TABLE_IV), ("f2", "c2", paper.TABLE_V))
+    one = ("c2", "f2", paper.TABLE_IV)
+    two = ("f2", "c2", paper.TABLE_V)
     schemes = [Scheme("scheme_1", "One", part(), *one), Scheme("scheme_2", "Two", part(), *two)]
     figure = scatter.two_tests(schemes, "caption").static
     assert len(figure.axes) == 4

@@ -94,11 +94,9 @@ CANDIDATES = {
 def recording(name, seconds=3.2, seed=0):
     """A drive of smooth motion that no model explains."""
     time = np.arange(round(100 * seconds)) / 100.0
-    vx, vy, yaw_rate = (
-        2.5 + 0.4 * np.sin(1.3 * time + seed),
-        0.3 * np.sin(2.0 * time + seed),
-        1.2 * np.cos(1.1 * time + seed),
-    )
+    vx = 2.5 + 0.4 * np.sin(1.3 * time + seed)
+    vy = 0.3 * np.sin(2.0 * time + seed)
+    yaw_rate = 1.2 * np.cos(1.1 * time + seed)
     noise = np.random.default_rng(seed).normal(0.0, 0.05, (4, len(time)))
     measured = {"vx": vx, "motor_speed": 20.0 * vx + noise[0], "yaw_rate": yaw_rate + noise[1]}
     measured |= {
@@ -129,7 +127,8 @@ def part(tmp_path_factory):
     """Five filters and a network, two seeds each, on two sets of three sequences."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: recording(name, seed=number) for number, name in enumerate(SPANS)}
-    models, rows = [], []
+    models = []
+    rows = []
     for candidate in (*CANDIDATES, "GRU"):
         for seed in (0, 1):
             home = folder / f"{candidate.strip('*')}{candidate.count('*')}-{seed}"
@@ -180,11 +179,9 @@ def part(tmp_path_factory):
                 )
                 history.to_csv(home / "history.csv", index=False)
     facts = ["Recordings are made", "learned_ukf: through_filter"]
-    kinds, titles, references = (
-        {"car": "simulated"},
-        {"car": "A car"},
-        stored(folder, "car", recordings),
-    )
+    kinds = {"car": "simulated"}
+    titles = {"car": "A car"}
+    references = stored(folder, "car", recordings)
     return part_of(
         SPLIT,
         PROTOCOL,
@@ -467,7 +464,8 @@ def test_ratios_percentiles_and_seeds_that_are_planted_get_their_verdicts():
     errors.squared["NNTF_UH"] = errors.squared["NNTF_UH"] * seeds
     errors.squared["NNTF_UH*"] = 0.99 * errors.squared["NNTF_UH"]
     errors.squared["GRU"] = 0.99 * errors.squared["NNTF_UH"]
-    paired, free = errors.of_pair("NNTF_UH*", "NNTF_UH"), errors.of_pair("GRU", "NNTF_UH")
+    paired = errors.of_pair("NNTF_UH*", "NNTF_UH")
+    free = errors.of_pair("GRU", "NNTF_UH")
     assert paired.value == pytest.approx(free.value)
     assert paired.error < 0.2 * free.error
 
@@ -495,7 +493,9 @@ def test_instability_and_several_states_need_all_of_them():
         claims.instability_claims({"NNT": [(1, 9), (0, 9), (0, 9)]}, "real")[0].verdict
         == "undecided"
     )
-    lower, level, higher = interval(-2.0, -1.0), interval(-1.0, 1.0), interval(1.0, 2.0)
+    lower = interval(-2.0, -1.0)
+    level = interval(-1.0, 1.0)
+    higher = interval(1.0, 2.0)
 
     def verdict(*states):
         return claims.states_claim(
@@ -651,7 +651,8 @@ def planted(**levels):
     ],
 )
 def test_added_claims_on_two_tyres_need_both_and_shared_seeds_are_paired(level, shared, verdict):
-    one, other = planted(tyre_a=level[0], tyre_d=level[1]), planted(tyre_a=1.0, tyre_d=1.0)
+    one = planted(tyre_a=level[0], tyre_d=level[1])
+    other = planted(tyre_a=1.0, tyre_d=1.0)
     comparisons = [Comparison(one, other, "c", "p", shared=shared)]
     (claim,) = comparison_claims(comparisons, corrected(comparisons), "real")
     assert claim.verdict == verdict
@@ -680,7 +681,8 @@ def test_local_minima_are_counted_on_validation(losses, verdict):
 
 
 def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand_calculation():
-    first, second = paper.TABLE_I, paper.TABLE_II
+    first = paper.TABLE_I
+    second = paper.TABLE_II
     for name, gain in (("mse", 17), ("mae", 6), ("ae99", 33)):
         assert (
             round(100 * (1 - getattr(first["NNTF_UH"], name) / getattr(first["GRU"], name))) == gain

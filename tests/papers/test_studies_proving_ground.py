@@ -136,8 +136,11 @@ def test_statistics_of_many_recordings_are_those_of_all_samples_together():
 
 
 def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_papers_bins():
-    first, second, both = Tally(), Tally(), Tally()
-    one, two = _simulated(_drive("a", 1), spun=True), _drive("b", 2)
+    first = Tally()
+    second = Tally()
+    both = Tally()
+    one = _simulated(_drive("a", 1), spun=True)
+    two = _drive("b", 2)
     first.add(one)
     second.add(two)
     both.add(one)
@@ -320,7 +323,8 @@ def survey_place(place, monkeypatch):
 
 
 def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
-    place, results = survey_place, survey_place.folder / "results" / "ground"
+    place = survey_place
+    results = survey_place.folder / "results" / "ground"
     code, out, err = place("run", "ground", "--jobs", "1")
     assert code == 0, err
     assert "the study goes on without it" in err

@@ -80,7 +80,8 @@ def test_few_manoeuvres_that_say_all_hold_less_often_than_many_that_say_nothing(
 
 
 def test_draws_are_the_same_again_and_several_tests_together_have_a_narrower_interval():
-    calibration, test = scores(8, 0.4, 1), scores(8, 0.4, 2)
+    calibration = scores(8, 0.4, 1)
+    test = scores(8, 0.4, 2)
     louder = Scores(3.0 * test.values, test.manoeuvres)
     assert share_if_shuffled(calibration, test, 50) == share_if_shuffled(calibration, test, 50)
     assert share_if_shuffled(calibration, louder, 200) == pytest.approx(
@@ -90,6 +91,7 @@ def test_draws_are_the_same_again_and_several_tests_together_have_a_narrower_int
     tests = [scores(10, 0.3, seed) for seed in range(5)]
     share = together(tests)[0]
     assert share == pytest.approx(np.mean([np.mean(own.values <= 1.0) for own in tests]))
-    alone, fourfold = together(tests[:1]), together(tests[:1] * 4)
+    alone = together(tests[:1])
+    fourfold = together(tests[:1] * 4)
     assert fourfold[0] == pytest.approx(alone[0])
     assert fourfold[2] - fourfold[1] < 0.55 * (alone[2] - alone[1])

@@ -32,8 +32,10 @@ BUDGETS = {
     "generations": 5,
     "restarts": 1,
 }
-MOST_DRIVES, MOST_SECONDS = 3, 100  # of each kind in a simulated data set; of a drive
-DIGITS, SHOWN = 6, 5
+MOST_DRIVES = 3
+MOST_SECONDS = 100  # of each kind in a simulated data set; of a drive
+DIGITS = 6
+SHOWN = 5
 _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
 
 
@@ -101,7 +103,8 @@ def write_data_sets(folder):
 
 def run(study, out, output, jobs):
     """Run the pilot of a study and keep its tables; returns whether all of it succeeded."""
-    begun, computed = time.monotonic(), sum(os.times()[2:4])  # the latter of processes that ended
+    begun = time.monotonic()
+    computed = sum(os.times()[2:4])  # the latter of processes that ended
     pipeline = yaml.safe_load((ROOT / "pipelines" / f"{study}.yaml").read_text(encoding="utf-8"))
     (output / f"{study}.yaml").write_text(
         yaml.safe_dump(reduced(pipeline), allow_unicode=True, sort_keys=False), encoding="utf-8"
@@ -156,7 +159,8 @@ def differences(first, second):
         if absent:
             yield f"{name}: not in {absent[0]}"
             continue
-        table, other = _texts(first / name), _texts(second / name)
+        table = _texts(first / name)
+        other = _texts(second / name)
         if list(table) != list(other) or len(table) != len(other):
             yield f"{name}: {len(table)} rows of {','.join(table)} | {len(other)} rows of {','.join(other)}"
             continue

@@ -13,7 +13,9 @@ import pandas as pd
 DRIVE = "revs/20140222_01_01_03_250lm"
 RUNS = "f1tenth/iros_hoons_1_with_friction.csv"
 G = 9.80665
-RATIO, RADIUS, TRACK = 16.0, 0.32, 1.35
+RATIO = 16.0
+RADIUS = 0.32
+TRACK = 1.35
 UNIX = 1_393_000_000.0
 
 
@@ -66,7 +68,8 @@ def later(t, samples, delay):
 
 def nuisances(t, seed):
     """What a logger writes besides: a temperature that rises, a gear, a voltage, a level that stays."""
-    random, n = np.random.default_rng(seed), len(t)
+    random = np.random.default_rng(seed)
+    n = len(t)
     temperature = 80.0 + 10.0 * (1.0 - np.exp(-t / 60.0)) + 0.05 * random.standard_normal(n)
     gear = np.repeat(random.integers(2, 5, n // 200 + 1), 200)[:n].astype(float)
     return {
@@ -143,7 +146,8 @@ def flipped(data, folder):
 
 def wheels(data, folder):
     """Wheels in rpm for a speed, a gyro that counts to the right."""
-    d, rpm = ferrari(data), 60.0 / (2.0 * np.pi * RADIUS)
+    d = ferrari(data)
+    rpm = 60.0 / (2.0 * np.pi * RADIUS)
     side = 0.5 * TRACK * d["r"]
     rear = {"HL": rpm * (d["vx"] - side), "HR": rpm * (d["vx"] + side)}
     front = {"VL": rear["HL"] / np.cos(d["delta"]), "VR": rear["HR"] / np.cos(d["delta"])}
@@ -167,7 +171,8 @@ def mdf(data, folder):
     """MDF 4 in groups of two rasters, units for some of the signals, a yaw rate that counts to the right."""
     import asammdf
 
-    fast, slow = ferrari(data), ferrari(data, 2)
+    fast = ferrari(data)
+    slow = ferrari(data, 2)
     more = nuisances(slow["t"], 8)
 
     def signal(d, name, samples, unit=""):
@@ -219,7 +224,8 @@ def bag(data, folder):
 
     still = made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     origin = made["geometry_msgs/msg/Pose"](made["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), still)
-    none, flat = np.zeros(9), np.zeros(36)
+    none = np.zeros(9)
+    flat = np.zeros(36)
     pose = made["geometry_msgs/msg/PoseWithCovariance"](origin, flat)
 
     def imu(k):

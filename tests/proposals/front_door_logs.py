@@ -32,7 +32,8 @@ def six_seconds(data, folder):
 
 def standstill_first(data, folder):
     """A minute at standstill before the drive."""
-    d, waits = ferrari(data), 6000
+    d = ferrari(data)
+    waits = 6000
     random = np.random.default_rng(2)
     noise = {
         "vx": 0.0003,
@@ -52,7 +53,8 @@ def standstill_first(data, folder):
 
 def two_speeds(data, folder):
     """The speed of antennas and that of the car's bus; the antenna's comes first and is the smoother one."""
-    d, random = ferrari(data), np.random.default_rng(3)
+    d = ferrari(data)
+    random = np.random.default_rng(3)
     own = np.round(
         MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05
     ) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
@@ -79,7 +81,8 @@ def misnamed_lateral(data, folder):
 
 def two_yaw_rates(data, folder):
     """The yaw rate of the car's ESP, 40 ms late and rough, and that of the reference."""
-    d, random = ferrari(data), np.random.default_rng(5)
+    d = ferrari(data)
+    random = np.random.default_rng(5)
     rough = np.round(
         np.degrees(later(d["t"], d["r"], 0.04)) / 0.1
     ) * 0.1 + 0.05 * random.standard_normal(len(d["t"]))

@@ -62,7 +62,8 @@ def rows_of(log, answers, proposed):
     if "time" in answers:
         rows.append(_clock(log, answers["time"], proposed))
     for key in WHOLE:
-        wanted, told = key in answers["asked"], key in asked
+        wanted = key in answers["asked"]
+        told = key in asked
         if wanted or told or key == "left_right":
             evidence = asked[key]["evidence"] if told else [proposed["left_right"] or ""]
             shown = str(asked[key]["proposed"]) if told else "decided"

@@ -4,7 +4,10 @@ import numpy as np
 import pandas as pd
 
 G = 9.80665
-WHEELBASE, RATIO, RADIUS, TRACK = 2.7, 15.0, 0.31, 1.5
+WHEELBASE = 2.7
+RATIO = 15.0
+RADIUS = 0.31
+TRACK = 1.5
 
 
 def drive(seconds=120.0, rate_hz=50.0, seed=0):
@@ -23,7 +26,8 @@ def drive(seconds=120.0, rate_hz=50.0, seed=0):
     r = ay_wanted / vx
     vy = r * (1.4 - 0.0045 * vx * vx) + 0.08 * np.sin(2 * np.pi * 0.31 * t + phases[4])
     steer = WHEELBASE * r / vx + 0.002 * ay_wanted
-    ax, ay = np.gradient(vx, t) - vy * r, np.gradient(vy, t) + vx * r
+    ax = np.gradient(vx, t) - vy * r
+    ay = np.gradient(vy, t) + vx * r
 
     def noisy(samples, level):
         return samples + level * generator.standard_normal(len(t))

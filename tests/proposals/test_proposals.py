@@ -74,18 +74,16 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
 def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(
     tmp_path, unit, of_rate, of_ay
 ):
-    d, size = (
-        drive(),
-        {
-            "m/s": 1.0,
-            "km/h": 3.6,
-            "mph": 1.0 / 0.44704,
-            "rad/s": 1.0,
-            "deg/s": 180.0 / np.pi,
-            "m/s²": 1.0,
-            "g": 1.0 / 9.80665,
-        },
-    )
+    d = drive()
+    size = {
+        "m/s": 1.0,
+        "km/h": 3.6,
+        "mph": 1.0 / 0.44704,
+        "rad/s": 1.0,
+        "deg/s": 180.0 / np.pi,
+        "m/s²": 1.0,
+        "g": 1.0 / 9.80665,
+    }
     columns = {
         "a": d["t"],
         "b": size[unit] * d["vx"],
@@ -114,10 +112,8 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     assert "right wheels are faster" in found.left_right
     assert {found.by_channel[name].sign for name in LATERAL} == {-1}
     heading = np.cumsum(d["r"]) / 50.0  # counter-clockwise from east
-    east, north = (
-        np.cumsum(d["vx"] * np.cos(heading)) / 50.0,
-        np.cumsum(d["vx"] * np.sin(heading)) / 50.0,
-    )
+    east = np.cumsum(d["vx"] * np.cos(heading)) / 50.0
+    north = np.cumsum(d["vx"] * np.sin(heading)) / 50.0
     mirrored["Latitude"] = 48.0 + north / 111_000.0
     mirrored["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
     mirrored.to_csv(tmp_path / "course.csv", index=False)
@@ -223,7 +219,8 @@ def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path):
 
 @pytest.mark.parametrize("columns", [20, pytest.param(300, marks=pytest.mark.slow)])
 def test_columns_of_noise_do_not_hide_the_car(tmp_path, columns):
-    d, random = drive(60.0), np.random.default_rng(1)
+    d = drive(60.0)
+    random = np.random.default_rng(1)
     noise = pd.DataFrame(
         {f"S{k}": random.standard_normal(len(d["t"])).cumsum() for k in range(columns)}
     )
@@ -402,10 +399,8 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_th
         ("Speed", "km/h"),
         ("LongAcc", "g"),
     ]
-    rate, wheelbase = (
-        4.0 * d["r"],
-        3.6,
-    )  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
+    rate = 4.0 * d["r"]
+    wheelbase = 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
     nameless = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
     assert {"a", "b", "c"} <= set(asked(tmp_path, nameless))
 
@@ -471,11 +466,9 @@ def written(file, table):
     """A table as a VBOX or as a measuring system writes it, or as it is."""
     if file.suffix == ".csv":
         return write(file, table)
-    t, units = (
-        table["Time [s]"].to_numpy(),
-        dict(
-            zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True)
-        ),
+    t = table["Time [s]"].to_numpy()
+    units = dict(
+        zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True)
     )
     if file.suffix == ".vbo":
         rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(
@@ -573,7 +566,8 @@ def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_t
 
 
 def standing():
-    random, names = np.random.default_rng(0), ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
+    random = np.random.default_rng(0)
+    names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
     return pd.DataFrame(
         {"Time [s]": np.arange(3000) / 50.0}
         | {name: 0.02 * random.standard_normal(3000) for name in names}
@@ -1043,7 +1037,8 @@ def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
 def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     d = drive()
     table = usual(d).drop(columns="Beta")
-    slow, back = 3.0 / d["vx"], slice(2000, 2500)
+    slow = 3.0 / d["vx"]
+    back = slice(2000, 2500)
     table.loc[2000:2499, "Speed"] = 10.8
     for name, sign in (("Gyro", -1.0), ("Steer", 1.0), ("LatAcc", 1.0)):
         table.loc[2000:2499, name] *= sign * slow[back]

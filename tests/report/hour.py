@@ -8,7 +8,8 @@ from vehest.report.document import Column, Document, Figure, ModelLink, Table
 from vehest.report.explorer import explorer_json, reckoned_course
 from vehest.report.style import on_dark
 
-RATE, SECONDS = 20.0, 3600.0
+RATE = 20.0
+SECONDS = 3600.0
 COLOURS = ("#4aa5e0", "#0b4f9c", "#f59a23", "#b8480b", "#8e24aa", "#00876c", "#d6336c", "#767676")
 
 

@@ -27,13 +27,12 @@ def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay
 
 
 def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate_and_starts_anew_after_a_gap():
-    n, step = 4_001, 0.05
+    n = 4_001
+    step = 0.05
     x, y = reckoned_course(np.full(n, 20.0), np.full(n, -1.0), np.full(n, 0.2), step)
-    radius, angle, heading = (
-        np.hypot(20.0, 1.0) / 0.2,
-        0.2 * step * np.arange(n),
-        np.arctan2(-1.0, 20.0),
-    )
+    radius = np.hypot(20.0, 1.0) / 0.2
+    angle = 0.2 * step * np.arange(n)
+    heading = np.arctan2(-1.0, 20.0)
     assert x == pytest.approx(radius * (np.sin(angle + heading) - np.sin(heading)), abs=0.01)
     assert y == pytest.approx(-radius * (np.cos(angle + heading) - np.cos(heading)), abs=0.01)
     vx = np.array([1.0, 1.0, np.nan, 1.0, 1.0, 1.0])

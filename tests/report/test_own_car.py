@@ -95,9 +95,11 @@ def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_comm
 def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, tmp_path):
     """25 s of which 1.5 s are left out: 94 %; a slide at the start of the range, a stop at its end."""
     recording = drive()
-    vx, vy = recording["vx"].copy(), recording["vy_ref"].copy()
+    vx = recording["vx"].copy()
+    vy = recording["vy_ref"].copy()
     vy[round(60.5 * 20)] = 10.0
-    vx[round(84.0 * 20) : round(84.5 * 20)], vy[round(84.0 * 20) : round(84.5 * 20)] = 0.0003, 0.02
+    vx[round(84.0 * 20) : round(84.5 * 20)] = 0.0003
+    vy[round(84.0 * 20) : round(84.5 * 20)] = 0.02
     file = tmp_path / "lap.parquet"
     write_recording(
         replace(recording, channels={**recording.channels, "vx": vx, "vy_ref": vy}), file

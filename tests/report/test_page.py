@@ -82,12 +82,10 @@ def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_
     fill(chromium, "|ay| from [m/s²]", "4")
     fill(chromium, "|ay| to [m/s²]", "10")
     recording = drive()
-    time, vx, vy_ref, ay = (
-        recording.time,
-        recording["vx"],
-        recording["vy_ref"],
-        np.abs(recording["ay"]),
-    )
+    time = recording.time
+    vx = recording["vx"]
+    vy_ref = recording["vy_ref"]
+    ay = np.abs(recording["ay"])
     rows = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9) & (vx >= 30) & (ay >= 4) & (ay <= 10)
     assert 20 < rows.sum() < 400
     vy = vy_ref + 0.15 * np.sin(

@@ -82,7 +82,8 @@ def study(folder, tests=None):
     write_recording(recording, folder / "lap.parquet")
     tests = tests or {"test": (Span("toy", "lap", 60.0, 85.0),)}
     split = Split("toy", (Span("toy", "lap", 2.0, 40.0),), (Span("toy", "lap", 42.0, 58.0),), tests)
-    models, rows = [], []
+    models = []
+    rows = []
     for number, ((estimator, variant, title), sizes) in enumerate(FAMILIES.items()):
         for seed, (on_validation, on_test) in enumerate(sizes):
             home = folder / f"{estimator}-{seed}"
@@ -212,7 +213,8 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
     recording = drive()
     time = recording.time
     scored = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9)
-    vx, vy_ref = recording["vx"][scored], recording["vy_ref"][scored]
+    vx = recording["vx"][scored]
+    vy_ref = recording["vy_ref"][scored]
     rmse = []
     for seed, (_, size) in enumerate(
         FAMILIES["ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"]
@@ -221,7 +223,8 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
         error = np.degrees(np.arctan(vy / vx) - np.arctan(vy_ref / vx))
         rmse.append(math.sqrt(sum(error**2) / len(error)))
         if seed == 1:
-            chosen_vy, chosen_error = vy, error
+            chosen_vy = vy
+            chosen_error = error
     row = row_of(leaderboard(artefacts), "ksnn")
     assert row["rmse_sideslip_chosen"] == pytest.approx(rmse[1], rel=1e-12)
     assert row["rmse_sideslip"] == pytest.approx(math.sqrt(np.mean(np.square(rmse))), rel=1e-9)
@@ -539,10 +542,8 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
 ):
     places = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # that of this process is drawn
-    made, report = (
-        tmp_path / artefacts.references["toy", "lap"].parent.name,
-        tmp_path / written.name,
-    )
+    made = tmp_path / artefacts.references["toy", "lap"].parent.name
+    report = tmp_path / written.name
     subprocess.run(
         [sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places],
         env=environment,
@@ -615,7 +616,10 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.attributes, self.loads, self.rows = [], [], [], []
+        self.tags = []
+        self.attributes = []
+        self.loads = []
+        self.rows = []
         self.policy = self.text = ""
         self._cell = False
         self.feed(text)
@@ -760,7 +764,8 @@ def test_each_family_has_one_hue_each_estimator_a_line_and_colours_stand_out_on_
 def test_decimation_keeps_peaks_ends_and_gaps():
     time = np.arange(10_000) / 100.0
     values = np.sin(time)
-    values[4321], values[8000:8200] = 7.0, np.nan
+    values[4321] = 7.0
+    values[8000:8200] = np.nan
     at, kept = decimated(time, values, 400)
     assert len(at) < 650
     assert (np.nanmax(kept), (at[0], at[-1])) == (7.0, (time[0], time[-1]))

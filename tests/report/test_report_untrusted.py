@@ -58,7 +58,8 @@ def test_a_hostile_name_ends_as_text_in_both_forms_of_a_report_and_reads_as_it_i
     for calm, shown in zip(
         _rendered(tmp_path / "plain"), _rendered(tmp_path / "hostile"), strict=True
     ):
-        expected, seen = Page(calm), Page(shown)
+        expected = Page(calm)
+        seen = Page(shown)
         assert seen.tags.count("script") == expected.tags.count("script")
         assert seen.tags.count("img") == expected.tags.count("img") == 0
         assert seen.tags.count("td") == expected.tags.count("td"), "a cell stays one cell"

@@ -69,7 +69,8 @@ def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
 
 def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evaluated, tmp_path):
     place, model, _ = evaluated
-    lap, out = place.folder / "lap.csv", tmp_path / "estimate.csv"
+    lap = place.folder / "lap.csv"
+    out = tmp_path / "estimate.csv"
     drive = planar_drive(20.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv(lap, index=False)
     for name, folder in (

@@ -162,7 +162,8 @@ def test_train_eval_estimate_report_one_by_one(place):
             place.told("estimate", name, "lap.csv", "dataset=lap", "-o", out)["estimated"]
             == 600 - 30
         )
-    frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
+    frame = pq.read_table("out.parquet").to_pandas()
+    text = pd.read_csv("out.csv")
     assert list(frame.columns) == [
         "time",
         "vy",

@@ -17,7 +17,8 @@ from vehest.run.study import jobs_of, read_study
 def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(
     elsewhere,
 ):
-    estimators, splits = choices("estimator"), choices("split")
+    estimators = choices("estimator")
+    splits = choices("split")
     for at, estimator in enumerate(estimators):
         split = splits[at * len(splits) // len(estimators)]
         config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])

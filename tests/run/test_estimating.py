@@ -100,7 +100,8 @@ def in_parts(monkeypatch, seconds=7.0):
 def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(
     saved, monkeypatch, name
 ):
-    speed, lost = np.array(drive_of(4)["vx"]), slice(1200, 1500)
+    speed = np.array(drive_of(4)["vx"])
+    lost = slice(1200, 1500)
     speed[
         lost
     ] = -30.0  # which no guard believes: the estimators wait, and start anew across a seam

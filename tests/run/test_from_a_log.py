@@ -31,7 +31,8 @@ def log_of(data_root):
 
 
 def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_root):
-    logged, page = place, PAGE.read_text(encoding="utf-8")
+    logged = place
+    page = PAGE.read_text(encoding="utf-8")
     folder = place.folder / "raw" / "my_log"
     folder.mkdir()
     log_of(data_root).to_csv(folder / "lap.csv", index=False)

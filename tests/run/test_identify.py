@@ -109,7 +109,8 @@ def test_a_drive_that_steady_cornering_explains_better_than_the_bank_tells_nothi
 
 
 def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
-    prior, likelihoods = Normal(1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
+    prior = Normal(1.0, 2.0)
+    likelihoods = {"a": (3.0, 1.0), "b": (3.2, 0.5)}
     posteriors = {}
     for name, (mean, deviation) in likelihoods.items():
         variance = 1.0 / (1.0 / prior[1] ** 2 + 1.0 / deviation**2)
@@ -128,7 +129,8 @@ def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
 
 
 def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
-    prior, sure = Normal(0.0, 1.0), Normal(0.2, 1e-3, 0.5)
+    prior = Normal(0.0, 1.0)
+    sure = Normal(0.2, 1e-3, 0.5)
     for drives in ({"a": sure}, dict.fromkeys("abcd", sure)):
         found = together(prior, drives)
         assert (found.value, found.deviation) == pytest.approx((0.2, 0.5), rel=1e-4)
@@ -164,7 +166,8 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     known = ("estimator.wheelbase=2.7", "estimator.cg_to_rear_axle=1.25")
     code, out, err = place("identify", "one.csv", "two.csv", *known, "-o", "car.yaml", "--json")
     assert code == 0, err
-    said, kept = json.loads(out), read_car(place.folder / "car.yaml")
+    said = json.loads(out)
+    kept = read_car(place.folder / "car.yaml")
     assert (
         said["leakage"]["value"]
         == kept.leakage.value
@@ -227,10 +230,8 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
 def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
     """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
     time = np.arange(0.0, 60.0, 1.0 / RATE)
-    speed, curvature = (
-        np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]),
-        np.where(time < 20.0, 0.09, 0.01),
-    )
+    speed = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0])
+    curvature = np.where(time < 20.0, 0.09, 0.01)
     channels = {
         "yaw_rate": speed * curvature * scale**-0.5,
         "vx": speed * scale**0.5,

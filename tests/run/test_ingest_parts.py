@@ -12,7 +12,8 @@ from vehest.sources.tabular import TabularSource
 @pytest.fixture
 def slow(monkeypatch):
     """Tables that count as slow; the names that were read."""
-    read, names = TabularSource.read, []
+    read = TabularSource.read
+    names = []
 
     def counted(self, recording_id):
         names.append(recording_id)

@@ -43,7 +43,8 @@ def held_elsewhere(output, stage, name):
 def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(
     tmp_path,
 ):
-    lock, said = Lock(tmp_path, "train", "a model"), []
+    lock = Lock(tmp_path, "train", "a model")
+    said = []
     asked = iter([False, False, True])
     with held_elsewhere(tmp_path, "train", "a model") as holder:
         assert not lock.take()
@@ -76,7 +77,8 @@ def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, m
 
 
 def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
-    first, second = Lock(tmp_path, "train", "../a/b"), Lock(tmp_path, "train", ".._a_b")
+    first = Lock(tmp_path, "train", "../a/b")
+    second = Lock(tmp_path, "train", ".._a_b")
     assert first.take()
     assert second.take()
     assert not Lock(tmp_path, "train", "../a/b").take()
@@ -91,7 +93,8 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
         for seed in range(3)
     ]
     jobs = [TrainJob(plan, {}, {}, None, seed, {}) for seed, plan in enumerate(plans)]
-    first, second = jobs[0].plan.lock, jobs[1].plan.lock
+    first = jobs[0].plan.lock
+    second = jobs[1].plan.lock
     assert first.take()
     with _held(jobs, lambda: False, pytest.fail) as free:
         assert [job.seed for job in free] == [1, 2]
@@ -203,7 +206,8 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
     )
     said = {file.name: file.read_text() for file in place.folder.glob("said-*")}
     assert done.stdout == "[0] [0, 0, 0]\n", (done.stderr, said)
-    alone, together = place.folder / "alone", place.folder / "together"
+    alone = place.folder / "alone"
+    together = place.folder / "together"
     assert _contents(together) == _contents(alone)
     lines = [
         line.split()

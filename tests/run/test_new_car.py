@@ -21,7 +21,8 @@ class Log:
     """A working folder with nothing but lap.csv in it, and ``vehest new my_car``."""
 
     def __init__(self, folder, capsys):
-        self.folder, self._capsys = folder, capsys
+        self.folder = folder
+        self._capsys = capsys
         self.write("lap.csv", usual(drive()))
 
     def write(self, name, table):

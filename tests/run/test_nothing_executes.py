@@ -268,7 +268,8 @@ def watch(name, folder):
     from vehest.sources import limited
 
     limited.subprocess = processes.READING
-    honest, hostile = folder / "honest", folder / "hostile"
+    honest = folder / "honest"
+    hostile = folder / "hostile"
     honest.mkdir()
     hostile.mkdir()
     read = CASES[name][0](honest, hostile)
@@ -276,7 +277,10 @@ def watch(name, folder):
         read(file)
     with contextlib.suppress(VehestError):  # what the way to an error imports
         read(folder / "nowhere" / min(hostile.iterdir()).name)
-    outcome, seen, armed, temporary = {}, [], [False], tempfile.gettempdir()
+    outcome = {}
+    seen = []
+    armed = [False]
+    temporary = tempfile.gettempdir()
 
     def hook(event, arguments):
         if not armed[0]:

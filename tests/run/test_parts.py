@@ -188,7 +188,8 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
 
 
 def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
-    both, turned = read_study("both"), read_study("turned")
+    both = read_study("both")
+    turned = read_study("turned")
     assert [part.split for part in both.parts.values()] == ["forth", "back", "other"]
     assert [part.split for part in turned.parts.values()] == ["back", "back", "other"]
     assert [part.sweeps for part in turned.parts.values()] == [
@@ -198,7 +199,8 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
 
 
 def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
-    simulated, official = read_study("ksnn"), read_study("ksnn_revs")
+    simulated = read_study("ksnn")
+    official = read_study("ksnn_revs")
     shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]
     pairs = list(zip(shared, official.parts.values(), strict=True))
     changed = {part.split: other.split for part, other in pairs if part != other}
@@ -219,7 +221,8 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
 
 
 def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
-    study, schemes = read_study("ksnn"), ("scheme_1", "scheme_2")
+    study = read_study("ksnn")
+    schemes = ("scheme_1", "scheme_2")
     jobs = jobs_of(
         dataclasses.replace(study, parts={name: study.parts[name] for name in schemes}), []
     )

@@ -70,10 +70,8 @@ def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equal
 def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
     folder = pretrained_folder()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
-    row, about = (
-        make_pretrained.chosen_step(),
-        yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"],
-    )
+    row = make_pretrained.chosen_step()
+    about = yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
     assert about["note"] == make_pretrained.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
     trust = read_trust(
@@ -99,9 +97,11 @@ def bands_on(name, data_root):
     recording = next(iter(source.recordings()))
     estimate = vehest.estimate(vehest.load_model(), recording)
     reference = np.interp(estimate.time, recording.time, recording["sideslip_ref"])
-    error, band = np.abs(estimate["sideslip"] - reference), estimate["band_sideslip"]
+    error = np.abs(estimate["sideslip"] - reference)
+    band = estimate["band_sideslip"]
     judged = np.isfinite(error) & np.isfinite(band)
-    inside, valid = np.mean(error[judged] <= band[judged]), np.mean(estimate["health"][judged] == 0)
+    inside = np.mean(error[judged] <= band[judged])
+    valid = np.mean(estimate["health"][judged] == 0)
     return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
 
 

@@ -89,7 +89,8 @@ def test_a_published_copy_that_is_gone_is_published_again(study):
 
 def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
     def changed(file, content):
-        former, about = file.read_bytes(), file.stat()
+        former = file.read_bytes()
+        about = file.stat()
         file.write_bytes(content)
         os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
         assert not cached(), file
@@ -138,7 +139,8 @@ def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_ov
 def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
     (tmp_path / "again").symlink_to(tmp_path)  # walked once
     (tmp_path / "lap.csv").write_text("1")
-    before, about = stamp_of(str(tmp_path)), (tmp_path / "lap.csv").stat()
+    before = stamp_of(str(tmp_path))
+    about = (tmp_path / "lap.csv").stat()
     (tmp_path / "new.csv").write_text("2")
     os.utime(tmp_path / "new.csv", ns=(about.st_atime_ns, about.st_mtime_ns))
     os.replace(tmp_path / "new.csv", tmp_path / "lap.csv")

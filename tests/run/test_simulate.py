@@ -81,7 +81,8 @@ def test_the_ordinary_ingest_makes_the_same_which_says_that_it_is_simulated_and_
 
 def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypatch):
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
-    read, begun = SimulatedSource.read, []
+    read = SimulatedSource.read
+    begun = []
 
     def interrupted(self, recording_id):
         begun.append(recording_id)

@@ -54,7 +54,9 @@ def jobs_of(scores, keys):
 def artefacts_of(jobs, keys, kind="simulated"):
     spans = {name: Span("mine", name, -math.inf, math.inf) for name in ("one", "two", "three")}
     split = Split("mine", (spans["one"],), (spans["two"],), {"test": (spans["three"],)})
-    protocol, titles, none = Protocol(20.0, 10.0, 1.5), {"mine": "My car"}, pd.DataFrame()
+    protocol = Protocol(20.0, 10.0, 1.5)
+    titles = {"mine": "My car"}
+    none = pd.DataFrame()
     part = PartArtefacts(
         "s",
         "s",
@@ -207,7 +209,8 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     folder = Path(outcome["folder"])
     assert folder.parent == Path("outputs/sweep")
     assert folder.name.startswith("ksnn-mine-")
-    jobs, table = pd.read_csv(folder / "sweep.csv"), pd.read_csv(folder / "summary.csv")
+    jobs = pd.read_csv(folder / "sweep.csv")
+    table = pd.read_csv(folder / "summary.csv")
     assert (len(jobs), len(table), set(jobs["status"])) == (8, 4, {"done"})
     own = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)][
         "rmse_sideslip.test"

@@ -32,7 +32,8 @@ from vehest.run.train import new_estimator
 from vehest.run.usable import all_usabilities, lacking_to_train, usability
 from vehest.training.context import FitContext
 
-RADIUS, RATIO = 0.32, 16.0
+RADIUS = 0.32
+RATIO = 16.0
 VALUES = {"wheel_radius": RADIUS, "ratio": RATIO}
 """What only the user knows of the car below."""
 
@@ -276,7 +277,8 @@ def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to
     assert (found["ksnn"]["gaps"], found["kalman"]["gaps"]) == (["ay"], []), (
         "the filter skips a sample of ay"
     )
-    one, other = summary_of(drive), summary_of(log(FULL - {"ax"}, name="other"))
+    one = summary_of(drive)
+    other = summary_of(log(FULL - {"ax"}, name="other"))
     assert common_channels([one, other]) == FULL - {"ax"}
     assert (
         usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"

@@ -16,7 +16,8 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
 ):
     """Of four minutes of a simulated car in a logger's dress, in an empty folder."""
     undrawn(monkeypatch)
-    log, drive = elsewhere, planar_drive(240.0, 50.0, seed=5, noise=0.02)
+    log = elsewhere
+    drive = planar_drive(240.0, 50.0, seed=5, noise=0.02)
     beta = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]))
     columns = {
         "Time": drive.time,
@@ -73,7 +74,8 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     code, _, err = run_vehest(capsys, *words, "--onnx")
     assert code != 0
     assert "leave one out" in err
-    online, batch = pd.read_csv(log / export[2] / "expected.csv"), pd.read_csv(log / "out.csv")
+    online = pd.read_csv(log / export[2] / "expected.csv")
+    batch = pd.read_csv(log / "out.csv")
     assert np.isfinite(online["sideslip"]).sum() > 4000
     steps = len(online) - len(batch) + round(20 * (batch["time"][0] - 0.0))
     assert np.allclose(

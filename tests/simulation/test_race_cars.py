@@ -33,7 +33,8 @@ def _lagging(lengths=LENGTHS):
 
 def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a plant without lag asks for there."""
-    plant, plain = _lagging(), _lagging((0.0, 0.0))
+    plant = _lagging()
+    plain = _lagging((0.0, 0.0))
     states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
     for k in range(1500):  # of a swerve
         steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
@@ -69,7 +70,8 @@ def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_r
             plant = MultiBodyPlant(
                 replace(plant_of("ferrari_250_lm").vehicle, relaxation=(length, length)), step
             )
-            state, per_ms = plant.initial_state(0.0, 0.0, 0.0, 25.0), round(1e-3 / step)
+            state = plant.initial_state(0.0, 0.0, 0.0, 25.0)
+            per_ms = round(1e-3 / step)
             for k in range(800):
                 steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
                 state = plant.advance(state, np.array([steering, 0.0, 0.0, 0.0, 0.0]), per_ms)
@@ -92,7 +94,8 @@ def test_a_payload_moves_the_static_loads_as_levers_say_and_stays_on_the_axles()
         state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
         loads.append(plant.evaluate([state], np.zeros((1, 5)))[1][0, 2])
     more = loads[1] - loads[0]
-    a, b = empty.parameters.a, empty.parameters.b
+    a = empty.parameters.a
+    b = empty.parameters.b
     assert more.sum() == pytest.approx(80.0 * GRAVITY, rel=2e-3)
     assert more[:2].sum() == pytest.approx(80.0 * GRAVITY * (b - 0.6) / (a + b), rel=0.02)
     assert full.parameters.I_z - empty.parameters.I_z == pytest.approx(
@@ -109,7 +112,8 @@ def test_tyres_warm_up_and_wear_which_the_plant_feels_and_the_driver_does_not_kn
     assert stint.friction_at(5000.0) == pytest.approx(0.96, abs=1e-9)
     laps = Laps(course="palm_beach_like", duration=5.0, severity=0.8)
     plant = plant_of("ferrari_250_lm")
-    plain, cold = drive(plant, laps, 3), drive(plant, laps, 3, stint=Stint(cold=0.1))
+    plain = drive(plant, laps, 3)
+    cold = drive(plant, laps, 3, stint=Stint(cold=0.1))
     np.testing.assert_allclose(cold.motion.friction[0] / plain.motion.friction[0], 0.9, rtol=1e-9)
     assert cold.drawn == plain.drawn
 

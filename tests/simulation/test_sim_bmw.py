@@ -102,7 +102,8 @@ def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_cho
     assert mix("unseen", "sim_bmw_unseen") == {
         name: 2 * count for name, count in TEST_MANOEUVRES.items()
     }
-    new, old = source("sim_bmw_unseen").drives, source().drives
+    new = source("sim_bmw_unseen").drives
+    old = source().drives
     seeds = {source("sim_bmw_unseen").seed_of(name) for name in new}
     assert not seeds & {source().seed_of(name) for name in old}
     assert len(seeds) == len(new) == 94
@@ -116,7 +117,8 @@ def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_cho
         if "unseen" in name
     }
     assert tested == known
-    full, limited = split("sim_bmw_unseen"), split("sim_bmw_unseen_limited")
+    full = split("sim_bmw_unseen")
+    limited = split("sim_bmw_unseen_limited")
     assert full.train == split("sim_bmw").train
     assert limited.train == split("sim_bmw_limited").train
     assert set(split("sim_bmw").validation) < set(full.validation)
@@ -154,7 +156,8 @@ def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_
                 drive for drive in source().ids() if role_of(drive) == role
             }
             assert {span.dataset for span in spans} == {"sim_bmw"}
-    full, limited = split("sim_bmw"), split("sim_bmw_limited")
+    full = split("sim_bmw")
+    limited = split("sim_bmw_limited")
     assert {span.stop for span in full.train + full.validation} == {4.0}  # a spin after that
     assert {span.stop for span in full.tests["test"]} == {4.5}  # below 5 m/s after that
     assert {span.stop for span in limited.train + limited.validation} == {

@@ -173,7 +173,8 @@ def test_courses_styles_and_steps_that_make_no_sense_are_refused():
 
 
 def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_lap():
-    patchy, places = surface_from_config("patchy"), np.arange(0.0, 5000.0)
+    patchy = surface_from_config("patchy")
+    places = np.arange(0.0, 5000.0)
     scale = patchy.along(places, 3, 2500.0)
     np.testing.assert_array_equal(scale[:2500], scale[2500:])
     np.testing.assert_array_equal(scale, patchy.along(places, 3, 2500.0))
@@ -182,10 +183,8 @@ def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_
     assert 0.85 < scale.max() <= 1.0
     edges = np.flatnonzero(np.diff(scale) != 0.0)
     assert np.diff(edges)[np.diff(edges) > 3].min() >= 15  # patches of 20 m, less their two edges
-    own, places = (
-        surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7}),
-        np.arange(1000.0),
-    )
+    own = surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7})
+    places = np.arange(1000.0)
     np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
 
 
@@ -210,7 +209,8 @@ def test_surfaces_and_drives_that_make_no_sense_are_refused():
 def test_smoothest_line_agrees_with_a_general_solver():
     generator = np.random.default_rng(0)
     rows = np.diff(np.eye(46)[:, 3:-3], 3, axis=0)
-    lower, upper = np.full(40, -np.inf), np.full(40, np.inf)
+    lower = np.full(40, -np.inf)
+    upper = np.full(40, np.inf)
     for place in (5, 12, 20, 31):
         lower[place], upper[place] = np.sort(generator.uniform(-2.0, 2.0, 2))
     reference = lsq_linear(rows, np.zeros(len(rows)), (lower, upper), tol=1e-12).x
@@ -241,11 +241,9 @@ def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
 
 
 def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippery_road():
-    driver, car, used = (
-        Driver(),
-        car_of(MultiBodyPlant(LOWERED)),
-        np.full_like(HANDLING.curvature, 8.0),
-    )
+    driver = Driver()
+    car = car_of(MultiBodyPlant(LOWERED))
+    used = np.full_like(HANDLING.curvature, 8.0)
     speed = speed_profile(HANDLING.curvature, used, HANDLING.arc_length[1], car, driver)
     lateral = speed**2 * HANDLING.curvature
     longitudinal = np.diff(speed**2) / (2.0 * HANDLING.arc_length[1])
@@ -256,7 +254,8 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert (longitudinal * speed[:-1]).max() <= car.power_per_mass + 1e-9
     assert speed.max() <= car.top_speed
     assert np.isclose(np.abs(lateral), 8.0).sum() > 5  # and uses all of it in the corners
-    curvature, used = np.full(200, 0.02), np.full(200, 8.0)
+    curvature = np.full(200, 0.02)
+    used = np.full(200, 8.0)
     speed = speed_profile(curvature, used, 1.0, car, driver)[100]
     helped = speed_profile(curvature, used, 1.0, car, driver, bank=np.full(200, -0.1))[
         100
@@ -290,7 +289,8 @@ def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_wh
 
 
 def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
-    course, motion = course_by_name("palm_beach_like"), circuit.motion
+    course = course_by_name("palm_beach_like")
+    motion = circuit.motion
     place, _ = places_on(course, motion.x, motion.y)
     # The car is turned against the road by its sideslip and by the line's angle, a few degrees.
     np.testing.assert_allclose(
@@ -304,8 +304,10 @@ def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
 
 
 def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit):
-    motion, plant = circuit.motion, MultiBodyPlant(LOWERED)
-    mass, drag = plant.parameters.m, car_of(plant).drag
+    motion = circuit.motion
+    plant = MultiBodyPlant(LOWERED)
+    mass = plant.parameters.m
+    drag = car_of(plant).drag
     speed = np.hypot(motion.vx, motion.vy)
     along = (
         motion.tyre_fx.sum(axis=1) / mass + 9.81 * np.sin(motion.grade) - drag * speed * motion.vx

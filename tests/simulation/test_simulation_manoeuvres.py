@@ -82,7 +82,8 @@ def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(
         MANOEUVRES
     )
-    car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
+    car = car_of(MultiBodyPlant(vehicle("bmw_545i")))
+    surface = surface_from_config("dry")
     sides = {
         manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"]
         for seed in range(12)
@@ -98,7 +99,8 @@ def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
 )
 def test_moderate_severity_is_completed_by_every_car(car, which):
     trip = moderate(car, which)
-    flags, motion = trip.flags, trip.motion
+    flags = trip.flags
+    motion = trip.motion
     assert flags.completed
     assert not flags.spun
     assert not flags.left_road
@@ -121,9 +123,11 @@ def test_moderate_severity_is_completed_by_every_car(car, which):
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("which", ["lane change", "obstacle"])
 def test_lane_change_keeps_the_car_between_the_cones(car, which):
-    trip, manoeuvre = moderate(car, which), manoeuvre_from_config(MODERATE[which])
+    trip = moderate(car, which)
+    manoeuvre = manoeuvre_from_config(MODERATE[which])
     width = car_of(MultiBodyPlant(vehicle(car))).width
-    x, y = trip.motion.x, side_of(trip) * trip.motion.y
+    x = trip.motion.x
+    y = side_of(trip) * trip.motion.y
     for gate in manoeuvre.gates(width):
         inside = (x >= gate.begin) & (x <= gate.end)
         assert inside.sum() > 5
@@ -151,7 +155,8 @@ def test_gates_are_those_of_the_standards():
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("which", ["slalom 18 m", "slalom 30 m"])
 def test_slalom_passes_the_cones_on_alternating_sides(car, which):
-    trip, manoeuvre = moderate(car, which), manoeuvre_from_config(MODERATE[which])
+    trip = moderate(car, which)
+    manoeuvre = manoeuvre_from_config(MODERATE[which])
     width = car_of(MultiBodyPlant(vehicle(car))).width
     cones = np.arange(manoeuvre.cones) * manoeuvre.spacing
     at_cones = side_of(trip) * np.interp(cones, trip.motion.x, trip.motion.y)
@@ -164,11 +169,13 @@ def test_slalom_passes_the_cones_on_alternating_sides(car, which):
 @pytest.mark.parametrize("car", CARS)
 def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
     trip = moderate(car, "skidpad")
-    motion, side = trip.motion, side_of(trip)
+    motion = trip.motion
+    side = side_of(trip)
     turned = side * (motion.yaw - motion.yaw[0]) > math.pi / 3.0
     turned &= times(trip) < times(trip)[-1] - 2.5
     # Three distant places of the path and their circle: not what the driver was told.
-    x, y = motion.x[turned], motion.y[turned]
+    x = motion.x[turned]
+    y = motion.y[turned]
     system = np.stack([x, y, np.ones_like(x)], axis=1)
     cx, cy, _ = np.linalg.lstsq(system, x**2 + y**2, rcond=None)[0]
     centre = np.array([cx, cy]) / 2.0
@@ -186,7 +193,8 @@ def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
 @pytest.mark.parametrize("car", CARS)
 def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand(car):
     trip = moderate(car, "braking in turn")
-    motion, side = trip.motion, side_of(trip)
+    motion = trip.motion
+    side = side_of(trip)
     braking = (times(trip) > trip.drawn["brakes_at"] + 0.5) & (motion.vx > 5.0)
     assert motion.ax[braking].mean() == pytest.approx(-3.0, abs=0.5)
     assert (side * motion.yaw_rate[braking] > 0.05).all()
@@ -217,7 +225,8 @@ def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
 @pytest.mark.parametrize("car", CARS)
 def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     trip = moderate(car, "j-turn")
-    motion, drawn = trip.motion, trip.drawn
+    motion = trip.motion
+    drawn = trip.drawn
     last = slice(-100, None)
     assert np.ptp(motion.yaw_rate[last]) < 0.01 * abs(motion.yaw_rate[-1]) + 2e-3  # steady
     assert side_of(trip) * motion.ay[last].mean() == pytest.approx(
@@ -232,7 +241,9 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
 
 def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
     trip = moderate("bmw_545i", "spiral")
-    motion, side, drawn = trip.motion, side_of(trip), trip.drawn
+    motion = trip.motion
+    side = side_of(trip)
+    drawn = trip.drawn
     ramp = (times(trip) > drawn["begin"] + 0.5) & (
         times(trip) < drawn["begin"] + drawn["ramp_time"]
     )
@@ -273,7 +284,8 @@ def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(ca
 def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
     trip = go("heavy_truck", name="speed_laps", speeds=[45.0 / 3.6])
     motion = trip.motion
-    x, y = motion.x, motion.y
+    x = motion.x
+    y = motion.y
     crossing = np.flatnonzero(
         (x[:-1] < 0.0) & (x[1:] >= 0.0) & (np.abs(y[1:]) < 10.0)
     )  # the line, where the road leads along x
@@ -314,7 +326,8 @@ def oversteering():
 
 def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
     trip = go(oversteering(), **SPINNING)
-    flags, motion = trip.flags, trip.motion
+    flags = trip.flags
+    motion = trip.motion
     assert (flags.spun, flags.completed, flags.stood) == (True, False, True)
     assert flags.gave_up_at is not None
     assert flags.largest_sideslip > math.radians(60.0)

@@ -59,9 +59,11 @@ def freestyle(seed=1, rate_hz=1000.0):
 
 
 def test_slow_motors_and_locked_wheels_have_the_forces_of_the_closed_form():
-    car, current = replace(CAR, air_drag=1.0), 1.15 * CAR.coulomb_torque / CAR.torque_constant
+    car = replace(CAR, air_drag=1.0)
+    current = 1.15 * CAR.coulomb_torque / CAR.torque_constant
     state = held(car, 30.0, speed=1.0, current=current)
-    speed, wheels = state[VX], state[FIRST_WHEEL : FIRST_WHEEL + 4].mean()
+    speed = state[VX]
+    wheels = state[FIRST_WHEEL : FIRST_WHEEL + 4].mean()
     torque = car.torque_constant * current - car.coulomb_torque - car.viscous_torque * wheels
     assert torque == pytest.approx(car.wheel_radius * car.air_drag * speed**2, rel=2e-3)
     assert 0.5 < speed < 2.0
@@ -97,9 +99,11 @@ def test_slow_circle_is_that_of_the_axles_geometry(steer):
 
 
 def test_small_slips_have_the_stiffness_of_the_linear_single_track():
-    plant, car = PlanarPlant(EVEN), EVEN
+    plant = PlanarPlant(EVEN)
+    car = EVEN
     state = plant.initial_state(3.0)
-    state[VY], state[STEER] = 0.003, 0.001
+    state[VY] = 0.003
+    state[STEER] = 0.001
     steady, _ = plant.derivative(state, Inputs(steer=0.001))
     for _ in range(400):  # the carcass comes to rest while the car is held
         rate, forces = plant.derivative(state, Inputs(steer=0.001))
@@ -162,7 +166,8 @@ def test_a_drive_is_consistent_in_forces_kinematics_and_friction():
 def test_wheel_loads_carry_the_weight_and_a_fixed_step_agrees_with_solve_ivp():
     plant = PlanarPlant(CAR)
     state = plant.initial_state(2.0)
-    state[LOAD_AX], state[LOAD_AY] = 2.0, -3.0
+    state[LOAD_AX] = 2.0
+    state[LOAD_AY] = -3.0
     load = plant.derivative(state, Inputs())[1][:, 2]
     assert load.sum() == pytest.approx(CAR.mass * GRAVITY)
     assert 0.5 * CAR.track * (load[1] + load[3] - load[0] - load[2]) == pytest.approx(
@@ -170,7 +175,8 @@ def test_wheel_loads_carry_the_weight_and_a_fixed_step_agrees_with_solve_ivp():
     )
     axles = CAR.cg_to_front_axle * load[:2].sum() - CAR.cg_to_rear_axle * load[2:].sum()
     assert -axles == pytest.approx(CAR.mass * CAR.cg_height * 2.0)
-    plant, inputs = PlanarPlant(CAR), Inputs(steer=0.45, current=45.0)
+    plant = PlanarPlant(CAR)
+    inputs = Inputs(steer=0.45, current=45.0)
     start = plant.initial_state(2.0)
     reference = solve_ivp(
         lambda _, state: plant.derivative(state, inputs)[0],
@@ -192,7 +198,8 @@ def test_wheel_loads_carry_the_weight_and_a_fixed_step_agrees_with_solve_ivp():
 def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate):
     plant = PlanarPlant(CAR)
     state = plant.initial_state(4.0)
-    state[VY], state[YAW_RATE] = 1.5, yaw_rate
+    state[VY] = 1.5
+    state[YAW_RATE] = yaw_rate
     energies = []
     for _ in range(500):
         wheels = state[FIRST_WHEEL : FIRST_WHEEL + 4]
@@ -233,8 +240,12 @@ def test_a_car_at_rest_stays_at_rest_and_a_slippery_floor_lowers_what_is_reached
 
 
 def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spins_and_backwards():
-    plant, generator = PlanarPlant(CAR), np.random.default_rng(5)
-    state, fastest, backwards, turned = plant.initial_state(), 0.0, 0.0, 0.0
+    plant = PlanarPlant(CAR)
+    generator = np.random.default_rng(5)
+    state = plant.initial_state()
+    fastest = 0.0
+    backwards = 0.0
+    turned = 0.0
     for _ in range(80):
         inputs = Inputs(
             float(generator.choice([-1.0, 0.0, 1.0])),
@@ -242,7 +253,8 @@ def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spin
             float(generator.uniform(0.3, 1.2)),
         )
         state = plant.advance(state, inputs, 500)
-        fastest, backwards = max(fastest, state[VX]), min(backwards, state[VX])
+        fastest = max(fastest, state[VX])
+        backwards = min(backwards, state[VX])
         turned = max(turned, abs(state[YAW_RATE]))
     assert np.isfinite(state).all()
     assert 2.0 < fastest < 20.0
@@ -286,7 +298,8 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
         assert len(of(pattern, "vx")) / 6000.0 == pytest.approx(minutes, rel=0.1)
     # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
     for pattern in ("learn_a", "test_a", "test_d"):
-        vx, vy = of(pattern, "vx_ref"), of(pattern, "vy_ref")
+        vx = of(pattern, "vx_ref")
+        vy = of(pattern, "vy_ref")
         fast = vx > 0.5
         assert fast.mean() > 0.97
         assert 20.0 < np.degrees(np.quantile(np.abs(np.arctan2(vy, vx))[fast], 0.99)) < 65.0
@@ -296,7 +309,8 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
         assert 1.4 < np.median(np.abs(of(pattern, "yaw_rate_ref"))) < 2.5
     grip = {}
     for tyre in ("test_a", "test_d"):
-        vx, yaw_rate = of(tyre, "vx_ref"), of(tyre, "yaw_rate_ref")
+        vx = of(tyre, "vx_ref")
+        yaw_rate = of(tyre, "yaw_rate_ref")
         grip[tyre] = np.quantile(np.abs(vx * yaw_rate), 0.9)
     assert grip["test_d"] / grip["test_a"] == pytest.approx(0.45 / 0.65, rel=0.1)
 

@@ -33,11 +33,9 @@ from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, VX, VY, YAW_RATE,
 
 AS_PUBLISHED = Vehicle("bmw_320i", parameter_set=2)
 LOWERED = shipped("bmw_320i_low")
-FERRARI, CORVETTE, TRUCK = (
-    shipped("ferrari_250_lm"),
-    shipped("corvette_grand_sport"),
-    shipped("heavy_truck"),
-)
+FERRARI = shipped("ferrari_250_lm")
+CORVETTE = shipped("corvette_grand_sport")
+TRUCK = shipped("heavy_truck")
 
 # CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py): BMW 320i, state, derivatives.
 PUBLISHED_INPUTS = (0.15, 0.63 * GRAVITY)
@@ -129,7 +127,8 @@ class TwoTyres:
     """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one for two, and so on."""
 
     def __init__(self, vehicle):
-        self.values, self.asked = library_parameters(vehicle), 0
+        self.values = library_parameters(vehicle)
+        self.asked = 0
         self.tyres = (self.values.tire, rear_tyre(vehicle))
 
     def __getattr__(self, name):
@@ -162,10 +161,8 @@ def equations_in_python():
 
 
 def derivatives_of(x, inputs, vehicle):
-    derivatives, contact = (
-        [math.nan] * 29,
-        (int(Regime.ROLLING), np.zeros(5), 1.0, 1.0, False, np.zeros(8)),
-    )
+    derivatives = [math.nan] * 29
+    contact = (int(Regime.ROLLING), np.zeros(5), 1.0, 1.0, False, np.zeros(8))
     equations_in_python()(list(x), *inputs, contact, compiled_parameters(vehicle), derivatives)
     return derivatives
 
@@ -181,7 +178,9 @@ def inputs_of(steering=0.0, acceleration=0.0, moment=0.0, along=0.0, across=0.0)
 
 def drive(plant, state, command, seconds, rate_hz=100.0, friction=1.0):
     """What follows from inputs command(time, state), held between samples."""
-    states, inputs, n_steps = [], [], round(1.0 / (rate_hz * plant.step))
+    states = []
+    inputs = []
+    n_steps = round(1.0 / (rate_hz * plant.step))
     for k in range(round(seconds * rate_hz)):
         now = np.asarray(command(k / rate_hz, state), dtype=float)
         states.append(state)
@@ -226,20 +225,16 @@ def test_published_derivatives_are_reproduced():
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
 def test_equations_are_the_librarys_bit_by_bit(vehicle):
-    plant, generator, parameters = (
-        MultiBodyPlant(vehicle),
-        np.random.default_rng(0),
-        TwoTyres(vehicle),
-    )
+    plant = MultiBodyPlant(vehicle)
+    generator = np.random.default_rng(0)
+    parameters = TwoTyres(vehicle)
     assert (
         plant.initial_state(0.0, 0.0, 0.0, 0.0).values[[16, 21]].tolist()
         == np.array(init_mb([0.0] * 7, parameters))[[16, 21]].tolist()
     )
     for _ in range(200):
-        state, inputs = (
-            disturbed(plant, generator, generator.uniform(0.7, 60.0)),
-            generator.uniform([-0.5, -15.0], [0.5, 15.0]),
-        )
+        state = disturbed(plant, generator, generator.uniform(0.7, 60.0))
+        inputs = generator.uniform([-0.5, -15.0], [0.5, 15.0])
         state[FIRST_WHEEL] *= generator.uniform(-0.1, 1.0)
         expected = vehicle_dynamics_mb(state.tolist(), inputs.tolist(), parameters)
         assert derivatives_of(state.tolist(), inputs.tolist(), vehicle) == expected
@@ -247,13 +242,12 @@ def test_equations_are_the_librarys_bit_by_bit(vehicle):
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
 def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle):
-    plant, generator, parameters = (
-        MultiBodyPlant(vehicle),
-        np.random.default_rng(1),
-        TwoTyres(vehicle),
-    )
+    plant = MultiBodyPlant(vehicle)
+    generator = np.random.default_rng(1)
+    parameters = TwoTyres(vehicle)
     for _ in range(20):
-        state, inputs = disturbed(plant, generator), generator.uniform([-0.3, -8.0], [0.3, 0.5])
+        state = disturbed(plant, generator)
+        inputs = generator.uniform([-0.3, -8.0], [0.3, 0.5])
         expected = np.array(vehicle_dynamics_mb(state.tolist(), inputs.tolist(), parameters))
         derivatives, _ = plant.evaluate(
             [PlantState(state, Regime.ROLLING)], inputs_of(*inputs)[None]
@@ -283,8 +277,10 @@ def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_bel
 
 
 def test_fixed_step_agrees_with_solve_ivp():
-    plant, inputs = MultiBodyPlant(LOWERED), inputs_of(0.04, -2.0)
-    parameters, start = library_parameters(LOWERED), plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    plant = MultiBodyPlant(LOWERED)
+    inputs = inputs_of(0.04, -2.0)
+    parameters = library_parameters(LOWERED)
+    start = plant.initial_state(0.0, 0.0, 0.0, 30.0)
 
     def right_hand_side(_, state):
         return vehicle_dynamics_mb(state.tolist(), inputs[:2].tolist(), parameters)
@@ -364,8 +360,10 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
 @pytest.mark.parametrize("moment", [0.0, 900.0, -900.0])
 def test_tyre_forces_account_for_all_accelerations(moment):
     # Masses times accelerations by differences of velocities of the body and of both axles, against the sum of forces.
-    plant, slope = MultiBodyPlant(FERRARI), road_gravity(bank=0.05, grade=0.03)
-    p, rate_hz = plant.parameters, 1000.0
+    plant = MultiBodyPlant(FERRARI)
+    slope = road_gravity(bank=0.05, grade=0.03)
+    p = plant.parameters
+    rate_hz = 1000.0
 
     def command(time, state):
         return inputs_of(20.0 * (0.05 * math.sin(3.0 * time) - state.steer), -1.0, moment, *slope)
@@ -387,7 +385,8 @@ def test_tyre_forces_account_for_all_accelerations(moment):
     )
     joint = 8.0  # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
     np.testing.assert_allclose(forces[1].sum(axis=1), lateral, atol=joint)
-    arm_x, arm_y = np.array([p.a, p.a, -p.b, -p.b]), 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])
+    arm_x = np.array([p.a, p.a, -p.b, -p.b])
+    arm_y = 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])
     turning = (forces[1] * arm_x).sum(axis=1) - (forces[0] * arm_y).sum(axis=1)
     np.testing.assert_allclose(turning, p.I_z * change[:, YAW_RATE], atol=1.0)
     assert np.abs(motion.ay).max() > 8.0
@@ -395,7 +394,8 @@ def test_tyre_forces_account_for_all_accelerations(moment):
 
 def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     plant = MultiBodyPlant(FERRARI)
-    p, state = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    p = plant.parameters
+    state = plant.initial_state(0.0, 0.0, 0.0, 30.0)
     inputs = np.array([inputs_of(moment=moment) for moment in (0.0, 900.0, 1e6)])
     without, with_moment, too_much = plant.motion([state] * 3, inputs, 100.0).ax
     arm = 0.25 * (p.T_f + p.T_r)
@@ -411,7 +411,8 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
 
 def test_gravity_on_a_bank_pulls_alike_and_friction_halves_what_is_reached():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
-    plant, across = MultiBodyPlant(FERRARI), road_gravity(bank=0.1, grade=0.0)[1]
+    plant = MultiBodyPlant(FERRARI)
+    across = road_gravity(bank=0.1, grade=0.0)[1]
     assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
     motion, states = drive(
         plant,
@@ -572,7 +573,8 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
 
 
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
-    function, called = compiled._Kept(compiled._advance), Event()
+    function = compiled._Kept(compiled._advance)
+    called = Event()
     assert function.lock is not None
     monkeypatch.setattr(function, "dispatcher", called.set)
     first = Thread(target=function)
@@ -588,11 +590,10 @@ def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
 
 
 def test_no_kind_of_array_is_compiled_for_twice():
-    plant, state = (
-        MultiBodyPlant(FERRARI),
-        MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0),
-    )
-    read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
+    plant = MultiBodyPlant(FERRARI)
+    state = MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
+    read_only = np.broadcast_to(inputs_of(), (3, 5))
+    columns = np.zeros((3, 10), order="F")[:, ::2]
     for inputs in (read_only, columns, columns.tolist()):
         for friction in (1.0, [1, 1, 1], np.broadcast_to(1.0, 3)):
             plant.motion([state] * 3, inputs, 100.0, friction=friction)

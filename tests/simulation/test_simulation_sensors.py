@@ -55,7 +55,9 @@ def weaving(seconds=20.0, rate_hz=100.0):
     """A car that weaves, rolls and pitches on a banked grade; every quantity moves, and each in its own way."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     wheels = np.stack([80.0 + i + np.sin((1.0 + i) * t) for i in range(4)], axis=1)
-    yaw_rate, roll, pitch = 0.4 * np.sin(1.1 * t), 0.05 * np.sin(1.3 * t), 0.02 * np.cos(0.7 * t)
+    yaw_rate = 0.4 * np.sin(1.1 * t)
+    roll = 0.05 * np.sin(1.3 * t)
+    pitch = 0.02 * np.cos(0.7 * t)
     return motion_of(
         len(t),
         rate_hz,
@@ -97,7 +99,8 @@ def swerving(seconds):
     vy, vy_change = sines((0.6, 0.07, 1.0), (0.3, 0.2, 2.0), (0.2, 0.7, 0.5))
     vx, vx_change = sines((5.0, 0.02, 0.0), (2.0, 0.11, 1.0), (0.8, 0.5, 2.0))
     vx = vx + 35.0
-    ax, ay = vx_change - vy * yaw_rate, vy_change + vx * yaw_rate
+    ax = vx_change - vy * yaw_rate
+    ay = vy_change + vx * yaw_rate
     return motion_of(
         len(t),
         vx=vx,
@@ -146,7 +149,8 @@ def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of
 def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_none():
     electric = weaving(1.0)
     motion = replace(electric, motor_speed=None, motor_current=None)
-    with_motor, without = measure(electric, SensorLevels(), 0), measure(motion, SensorLevels(), 0)
+    with_motor = measure(electric, SensorLevels(), 0)
+    without = measure(motion, SensorLevels(), 0)
     assert set(with_motor) - set(without) == {"motor_speed", "motor_current"}
     assert all(np.array_equal(without[name], with_motor[name]) for name in without)
     assert set(described(SensorLevels(), electric)) - set(described(SensorLevels(), motion)) == {
@@ -182,10 +186,8 @@ def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz):
     shown = measure(motion_of(20_000, rate_hz, vx=20.0), only(ay=SensorLevel(noise=0.01)), seed=5)
     assert np.std(shown["ay"]) == pytest.approx(0.01 * math.sqrt(rate_hz / 2.0), rel=0.02)
     frequency, power = signal.welch(shown["ay"], rate_hz, nperseg=256)
-    low, high = (
-        power[(frequency > 0) & (frequency < rate_hz / 4)].mean(),
-        power[frequency > rate_hz / 4].mean(),
-    )
+    low = power[(frequency > 0) & (frequency < rate_hz / 4)].mean()
+    high = power[frequency > rate_hz / 4].mean()
     assert math.sqrt(low) == pytest.approx(0.01, rel=0.05)
     assert math.sqrt(high) == pytest.approx(0.01, rel=0.05)
     assert abs(np.corrcoef(shown["ay"][1:], shown["ay"][:-1])[0, 1]) < 0.03
@@ -278,15 +280,14 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
     motion = weaving()
     force = specific_force(motion, Tilt())
     for k in (0, 333, 1999):
-        road, body = (
-            _rotation(motion.bank[k], motion.grade[k]),
-            _rotation(motion.roll[k], motion.pitch[k]),
-        )
+        road = _rotation(motion.bank[k], motion.grade[k])
+        body = _rotation(motion.roll[k], motion.pitch[k])
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
     shown = body_rates(motion, Tilt())
-    t, h = 3.21, 1e-5
+    t = 3.21
+    h = 1e-5
     k = 321
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
     at = lambda s: _turn_z(yaw(s)) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s))  # noqa: E731
@@ -324,13 +325,15 @@ def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
     motion = weaving()
     lever = np.array([1.0, -0.6, 0.8])
     levels = only(imu=Mounting(*lever), tilt=Tilt(bank=False, grade=False))
-    shown, bare = measure(motion, levels, 0), measure(motion, only(tilt=levels.tilt), 0)
+    shown = measure(motion, levels, 0)
+    bare = measure(motion, only(tilt=levels.tilt), 0)
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
     place = lambda s: (  # noqa: E731
         _turn_z(yaw(s)) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s)) @ lever
     )
     for k in (100, 321, 1500):
-        t, h = k / 100.0, 1e-3
+        t = k / 100.0
+        h = 1e-3
         axes = _turn_z(yaw(t)) @ _rotation(motion.roll[k], motion.pitch[k])
         expected = axes.T @ (place(t + h) - 2.0 * place(t) + place(t - h)) / h**2
         np.testing.assert_allclose(
@@ -354,10 +357,8 @@ def test_misalignment_lever_and_heading_errors_have_their_size():
         for seed in range(400)
     ]
     assert np.std(errors) == pytest.approx(0.5 * 0.02, rel=0.14)
-    motion, levels = (
-        weaving(1.0),
-        only(reference=Reference("gnss", heading=SensorLevel(offset=0.01))),
-    )
+    motion = weaving(1.0)
+    levels = only(reference=Reference("gnss", heading=SensorLevel(offset=0.01)))
     drives = [measure(motion, levels, seed) for seed in range(400)]
     errors = np.array([drive["sideslip_ref"] - motion.sideslip for drive in drives])
     assert np.ptp(errors, axis=1).max() < 1e-12

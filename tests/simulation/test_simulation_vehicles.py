@@ -32,7 +32,8 @@ def ramp_of(name):
 
 def steady_turn(plant, speed, steer, seconds=8.0):
     """The last moment of a turn at constant speed and steering angle, as a motion of one sample."""
-    state, integral = plant.initial_state(0.0, 0.0, 0.0, speed), 0.0
+    state = plant.initial_state(0.0, 0.0, 0.0, speed)
+    integral = 0.0
     for _ in range(round(100 * seconds)):
         error = speed - state.vx
         integral += 0.01 * error
@@ -60,8 +61,10 @@ def cornering_stiffnesses(plant):
 @pytest.mark.parametrize("speed", [10.0, 30.0])
 def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_tracks(name, speed):
     plant = plant_of(name)
-    p, (front, rear) = plant.parameters, cornering_stiffnesses(plant_of(name))
-    length, ay = p.a + p.b, 0.7
+    p = plant.parameters
+    (front, rear) = cornering_stiffnesses(plant_of(name))
+    length = p.a + p.b
+    ay = 0.7
     understeer = p.m / length * (p.b / front - p.a / rear)
     turn = steady_turn(plant, speed, ay * (length + understeer * speed**2) / speed**2)
     assert turn.ay[0] == pytest.approx(ay, rel=0.03)
@@ -75,8 +78,10 @@ def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_track
 
 @each_vehicle
 def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
-    ramp, plant = ramp_of(name), plant_of(name)
-    angle, limit = understeer_angle(ramp, plant.wheelbase), int(np.argmax(ramp.ay))
+    ramp = ramp_of(name)
+    plant = plant_of(name)
+    angle = understeer_angle(ramp, plant.wheelbase)
+    limit = int(np.argmax(ramp.ay))
     share = (
         0.95 if name == "jaguar_e_type" else 0.99
     )  # its rear bends as early as its front: at the limit it turns neutral
@@ -117,7 +122,8 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
     plant = plant_of(name)
     p = plant.parameters
     turn = steady_turn(plant, 20.0, 0.02)
-    load, ay = turn.tyre_fz[0], turn.ay[0]
+    load = turn.tyre_fz[0]
+    ay = turn.ay[0]
     transfer = 0.5 * p.T_f * (load[1] - load[0]) + 0.5 * p.T_r * (load[3] - load[2])
     deflection = load.mean() / p.K_zt
     unsprung = p.m_uf + p.m_ur
@@ -139,7 +145,8 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
 @each_vehicle
 def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
     plant = plant_of(name)
-    p, rest = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    p = plant.parameters
+    rest = plant.initial_state(0.0, 0.0, 0.0, 0.0)
     assert p.m_s + p.m_uf + p.m_ur == pytest.approx(p.m, rel=1e-4)
     disturbed = rest.values.copy()
     disturbed[[HEAVE, PITCH, ROLL, ROLL_RATE]] += 0.02, 0.01, 0.02, 0.1
@@ -156,7 +163,8 @@ def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
 
 def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
     plant = plant_of("ferrari_250_lm")
-    p, (front, rear) = plant.parameters, cornering_stiffnesses(plant)
+    p = plant.parameters
+    (front, rear) = cornering_stiffnesses(plant)
     assert (p.m, p.a, p.b) == (982.0, 1.33, 1.07)
     assert p.I_z == pytest.approx(982.0 / 12.0 * (1.7**2 + 4.09**2), rel=1e-4)
     assert front == pytest.approx(0.7e5, rel=0.01)
@@ -171,7 +179,8 @@ def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
         load = p.m * GRAVITY * load_arm / (p.a + p.b)
         assert -tyre.p_ky1 * load == pytest.approx(c2, rel=0.01)
         assert load == pytest.approx(c2 * math.sqrt(2.0 * c1) / 2.0, rel=0.01)
-    front, rear = (486735.0, 622319.0)
+    front = 486735.0
+    rear = 622319.0
     for speed, ratio in ((2.0, 1.27), (6.5, 1.0), (15.0, 1.0)):
         coupling = front * p.a - rear * p.b
         matrix = [
@@ -259,8 +268,10 @@ CONTROL = StabilityControl(
 
 def sine_with_dwell(plant, amplitude, control, friction):
     """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that the control asked for."""
-    state, doing = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6), StabilityState()
-    largest, moments = 0.0, []
+    state = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6)
+    doing = StabilityState()
+    largest = 0.0
+    moments = []
     for k in range(400):
         time = 0.01 * k
         phase = min(time, max(time - 0.5, 0.75 / 0.7)) * 0.7
@@ -289,7 +300,8 @@ def sine_with_dwell(plant, amplitude, control, friction):
 @pytest.mark.parametrize("friction", [1.0, 0.5])
 def test_sideslip_stays_lower_with_control_than_without(name, friction):
     plant = plant_of(name)
-    control, amplitude = stability_control(plant), 0.16 if friction == 1.0 else 0.09
+    control = stability_control(plant)
+    amplitude = 0.16 if friction == 1.0 else 0.09
     without, _ = sine_with_dwell(plant, amplitude, None, friction)
     with_control, moments = sine_with_dwell(plant, amplitude, control, friction)
     assert with_control < 0.7 * without

@@ -51,7 +51,8 @@ def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0,
     import can
 
     folder.mkdir(parents=True, exist_ok=True)
-    dbc, log = folder / "car.dbc", folder / f"drive{suffix}"
+    dbc = folder / "car.dbc"
+    log = folder / f"drive{suffix}"
     dbc.write_text(DBC, encoding="cp1252")
     messages = _messages(recording)
     rng = np.random.default_rng(seed)

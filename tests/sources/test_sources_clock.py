@@ -56,7 +56,8 @@ def test_the_rate_survives_strong_jitter_and_gaps(rate, share):
 
 
 def test_jitter_beyond_a_hundredth_of_an_interval_and_gaps_need_interpolation():
-    even, noise = np.arange(1000) / 100.0, np.random.default_rng(0).uniform(-1, 1, 1000)
+    even = np.arange(1000) / 100.0
+    noise = np.random.default_rng(0).uniform(-1, 1, 1000)
     assert uniform_clock(even + 4e-5 * noise, "'file'").rate_hz == 100.0
     assert "set dataset.clock=interpolate" in refusal(
         lambda: uniform_clock(even + 2e-3 * noise, "'file'")

@@ -72,7 +72,8 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
-        whole, start = server.contents[name], 0
+        whole = server.contents[name]
+        start = 0
         same = server.careless or self.headers.get("If-Range") in (
             None,
             server.etag,
@@ -173,7 +174,9 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
 
 @pytest.mark.parametrize("modified", [None, "Sat, 22 Feb 2014 10:00:00 GMT"])
 def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
-    server.ranges, server.etag, server.modified = False, None, modified
+    server.ranges = False
+    server.etag = None
+    server.modified = modified
     server.breaks = [200_000]
     (outcome,) = download(server, tmp_path).fetch()
     assert (outcome.resumed_at, server.sent, server.asked[1][1] is None) == (
@@ -189,7 +192,9 @@ def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
 )
 def test_a_file_that_changes_between_attempts_is_never_mixed(server, tmp_path, size, careless):
     other = BYTES[::-1][:size]
-    server.breaks, server.changed, server.careless = [200_000], (other, '"two"'), careless
+    server.breaks = [200_000]
+    server.changed = (other, '"two"')
+    server.careless = careless
     list(download(server, tmp_path).fetch())
     assert_only(tmp_path, other)
     assert server.asked[1][2] == '"one"'
@@ -225,7 +230,8 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     )
     assert (tmp_path / "a.csv").read_bytes() == b"changed"
     (tmp_path / "a.csv").unlink()
-    server.contents["a.csv"], server.etag = BYTES[:-1] + b"?", '"two"'
+    server.contents["a.csv"] = BYTES[:-1] + b"?"
+    server.etag = '"two"'
     assert f"or {tmp_path / CHECKSUMS}" in refused(download(server, tmp_path), DataError)
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
@@ -235,9 +241,11 @@ def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one
 ):
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
     assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
-    server.headers, server.length = {}, False
+    server.headers = {}
+    server.length = False
     assert "does not state its length" in refused(download(server, tmp_path))
-    server.asked, server.statuses = [], [503, 404]  # the first passes
+    server.asked = []
+    server.statuses = [503, 404]  # the first passes
     message = refused(download(server, tmp_path))
     assert (
         message

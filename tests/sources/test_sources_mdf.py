@@ -75,7 +75,8 @@ def drive(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def tidy(tmp_path, monkeypatch):
     """Whatever a test reads, nothing is left in the current folder or among temporary files."""
-    here, temporary = tmp_path / "here", tmp_path / "temporary"
+    here = tmp_path / "here"
+    temporary = tmp_path / "temporary"
     here.mkdir()
     temporary.mkdir()
     monkeypatch.chdir(here)
@@ -173,10 +174,8 @@ def test_physical_values_are_read(tmp_path, raw, conversion, physical):
 def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp_path):
     gear = {"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"D", "default": b"?"}
     stamps = np.concatenate([FAST[:50], FAST[49:]])
-    text, where = (
-        "signal 'v' of group 0 'Only' holds text; numbers are needed",
-        "signal 'v' of group 0 'Only': ",
-    )
+    text = "signal 'v' of group 0 'Only' holds text; numbers are needed"
+    where = "signal 'v' of group 0 'Only': "
     for t, samples, more, said in (
         (FAST, np.arange(2001) % 2, {"conversion": gear}, text),
         (FAST, np.array([b"on"] * 2001), {"encoding": "utf-8"}, text),

@@ -65,7 +65,8 @@ def test_a_formula_anywhere_refuses_the_file_and_is_never_evaluated(tmp_path, ve
     trace = tmp_path / "EXECUTED"
     payload = f"__import__('pathlib').Path({str(trace)!r}).touch() or X1*1"
     formula = {"formula": payload}
-    file, inner = tmp_path / "a.mf4", conversion_of("4.10", formula)
+    file = tmp_path / "a.mf4"
+    inner = conversion_of("4.10", formula)
     if place == "signal":
         written(file, FAST, formula, version)
     elif place == "time channel":

@@ -104,12 +104,11 @@ HELD_CHANNELS = {
 @pytest.mark.parametrize("updated", ["sensor", None])
 def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path, updated):
     """A yaw rate that its sensor samples in every tenth row and that arrives four later, with the sensor's own clock beside it."""
-    time, taken = np.arange(1000) / RATE, (np.arange(1000) - 4) // 10 * 10
+    time = np.arange(1000) / RATE
+    taken = (np.arange(1000) - 4) // 10 * 10
     truth = np.sin(2 * np.pi * 0.5 * time)
-    values, stamps = (
-        np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0),
-        np.where(taken >= 0, 300.0 + taken / RATE, 0.0),
-    )
+    values = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0)
+    stamps = np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
     table = pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps})
     held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
     recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
@@ -165,7 +164,8 @@ def test_excluded_files_are_no_recordings(tmp_path):
         circle(1.0).to_csv(tmp_path / f"{name}.csv", index=False)
     assert source(tmp_path, exclude=["still"]).ids() == ["lap_1", "lap_2"]
     assert list(source(tmp_path, exclude=["lap_*"]).inputs()) == ["still.csv"]
-    own, held = {"channels": HELD_CHANNELS}, {"channels": ["vx"], "delay": {"yaw_rate": 0.1}}
+    own = {"channels": HELD_CHANNELS}
+    held = {"channels": ["vx"], "delay": {"yaw_rate": 0.1}}
     for options, kind, said in (
         ({"exclude": ["lap"]}, MissingError, "exclude names 'lap', which no file is called"),
         ({"exclude": ["*"]}, MissingError, "exclude leaves none"),

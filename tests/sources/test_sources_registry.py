@@ -105,10 +105,8 @@ def test_of_several_vehicles_each_drive_has_the_one_it_names():
 
 def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles():
     dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
-    vehicle, vary = (
-        vehicle_from_configuration(dataset["vehicle"]),
-        variations_from_config(dataset["vary"]),
-    )
+    vehicle = vehicle_from_configuration(dataset["vehicle"])
+    vary = variations_from_config(dataset["vary"])
     cars = [compiled_parameters(varied(vehicle, vary, seed)) for seed in range(50)]
     for car in cars:
         assert car.m_s + car.m_uf + car.m_ur == pytest.approx(car.m, abs=1.0)

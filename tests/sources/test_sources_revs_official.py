@@ -11,7 +11,8 @@ from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
 NAME = "20140222_01_01_03_250lm"
-SECONDS, BLANK = 4.0, 37
+SECONDS = 4.0
+BLANK = 37
 ONE_ROUNDING = {
     "rtol": 4e-16,
     "atol": 1e-300,

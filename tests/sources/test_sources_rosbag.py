@@ -27,11 +27,11 @@ ROOT = Path(__file__).parents[2]
 CONFIGURATION = ROOT / "conf" / "dataset" / "f1tenth_bag.yaml"
 START_NS = 1_700_000_000_123_456_789
 SECONDS = 3.0
-VX, VY, YAW_RATE = 2.0, -0.5, 1.5  # m/s, m/s, rad/s: a circle driven with a sideslip of -14°
-ACCELERATION, PULSATION = (
-    3.0,
-    2.0 * np.pi,
-)  # ax = 3 m/s² · sin(2π·1 Hz·t), ay likewise with the cosine
+VX = 2.0
+VY = -0.5
+YAW_RATE = 1.5  # m/s, m/s, rad/s: a circle driven with a sideslip of -14°
+ACCELERATION = 3.0
+PULSATION = 2.0 * np.pi  # ax = 3 m/s² · sin(2π·1 Hz·t), ay likewise with the cosine
 WINDOW = 9
 LAYOUTS = {
     "car_msgs/msg/MotorStamped": "std_msgs/Header header\nMotor motor\n",
@@ -75,8 +75,10 @@ Topic = namedtuple(
 
 def drive(seconds=SECONDS):
     """A circle in closed form; every topic has a rate and a phase of its own."""
-    imu, motor = np.arange(0.0007, seconds, 1 / 400), np.arange(0.0, seconds, 1 / 100)
-    servo, body = np.arange(0.003, seconds, 0.05), np.arange(0.0042, seconds, 1 / 100)
+    imu = np.arange(0.0007, seconds, 1 / 400)
+    motor = np.arange(0.0, seconds, 1 / 100)
+    servo = np.arange(0.003, seconds, 0.05)
+    body = np.arange(0.0042, seconds, 1 / 100)
     heading = 0.3 + YAW_RATE * body
     east = (np.sin(heading) * VX + np.cos(heading) * VY) / YAW_RATE
     north = (-np.cos(heading) * VX + np.sin(heading) * VY) / YAW_RATE
@@ -223,7 +225,8 @@ def test_a_circle_comes_back_from_its_poses(bags):
 def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags):
     """Straight lines are exact; a line between samples 2.5 ms apart misses a sine by up to A·(ω·dt)²/8 = 1e-4 m/s²."""
     recording = read(bags)
-    time, missed = recording.time, 1.01 * ACCELERATION * (PULSATION / 400) ** 2 / 8
+    time = recording.time
+    missed = 1.01 * ACCELERATION * (PULSATION / 400) ** 2 / 8
     for name, expected, atol in (
         ("ax", ACCELERATION * np.sin(PULSATION * time), missed),
         ("ay", ACCELERATION * np.cos(PULSATION * time), missed),
@@ -278,7 +281,8 @@ def test_a_moving_average_removes_what_would_alias(tmp_path):
     imu.fields["linear_acceleration.y"] = np.cos(2 * np.pi * 100 * (imu.times - imu.times[0]))
     imu.fields["linear_acceleration.x"] = 2.0 * imu.times
     bags = write_bag(tmp_path, topics).parent
-    plain, averaged = read(bags), read(bags, topics=topic_options("imu", average=0.01))
+    plain = read(bags)
+    averaged = read(bags, topics=topic_options("imu", average=0.01))
     assert abs(plain["ay"].mean()) > 0.4
     np.testing.assert_allclose(averaged["ay"], 0.0, atol=1e-9)
     np.testing.assert_allclose(
@@ -314,10 +318,8 @@ def test_absent_or_empty_topics_other_layouts_long_gaps_and_more_than_the_limits
         ),
     ):
         assert said in refused(write_bag(tmp_path / name, *how).parent)
-    gap, whole = (
-        topic_options("motor", max_gap=0.009),
-        topic_options("servo", type="std_msgs/msg/Int64"),
-    )
+    gap = topic_options("motor", max_gap=0.009)
+    whole = topic_options("servo", type="std_msgs/msg/Int64")
     assert "topic '/servo' carries 'std_msgs/msg/Float64', not 'std_msgs/msg/Int64'" in refused(
         bags, topics=whole
     )
@@ -373,11 +375,9 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
     zstd = importlib.import_module(
         "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
     )
-    expected, data, metadata = (
-        read(folder),
-        folder / "lap" / "lap.db3",
-        folder / "lap" / "metadata.yaml",
-    )
+    expected = read(folder)
+    data = folder / "lap" / "lap.db3"
+    metadata = folder / "lap" / "metadata.yaml"
     about = yaml.safe_load(metadata.read_text())
     told = {
         "compression_format": "zstd",
@@ -396,7 +396,8 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
 
 
 def test_a_misspelt_declaration_is_refused(bags):
-    vx, topics = CHANNELS["vx"], topic_options
+    vx = CHANNELS["vx"]
+    topics = topic_options
     for changes, said in (
         ({"topics": topics("imu", rate_hz=None)}, "a uniform clock needs"),
         ({"topics": topics("motor", average=0.01)}, "a moving average needs"),
@@ -447,7 +448,8 @@ def test_declared_constants_are_those_that_the_data_show(data_root):
     declared = yaml.safe_load(
         CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root))
     )
-    channels, pose = declared["channels"], declared["pose"]
+    channels = declared["channels"]
+    pose = declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
     rpm = 1 / channels["vx"]["factor"]
     assert abs(rpm - identified["erpm_per_mps"]) < 2 * identified["erpm_per_mps_sd"]

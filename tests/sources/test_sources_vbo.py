@@ -19,7 +19,8 @@ def read(folder, **more):
 
 def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path):
     write_log(tmp_path / "lap.vbo")
-    recording, true = read(tmp_path), drive()
+    recording = read(tmp_path)
+    true = drive()
     assert (recording.id, recording.rate_hz, len(recording)) == ("lap", 100.0, 1000)
     assert recording.start_time == pytest.approx(38_870.45)
     for name, own in (

@@ -11,7 +11,9 @@ UNITS = ("rad", "km/h", "°/s", "g", "g", "°", "°")
 def drive(seconds=10.0):
     """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²], in ISO 8855 axes, (T,) each."""
     t = np.arange(round(seconds * RATE)) / RATE
-    vx, yaw_rate, vy = 20.0 + np.sin(t / 3.0), 0.3 * np.sin(t), 0.2 * np.sin(t + 0.3)
+    vx = 20.0 + np.sin(t / 3.0)
+    yaw_rate = 0.3 * np.sin(t)
+    vy = 0.2 * np.sin(t + 0.3)
     return {
         "vx": vx,
         "yaw_rate": yaw_rate,

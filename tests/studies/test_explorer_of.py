@@ -42,7 +42,8 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]
     assert len(found) == sum(lengths) + 5
-    first, second = found[: lengths[0]], found[lengths[0] + 5 :]
+    first = found[: lengths[0]]
+    second = found[lengths[0] + 5 :]
     onset = round((FROZEN - SPANS[1].start - 1.5) * RATE)
     assert (first == VALID).all()
     assert (second[:onset] == VALID).all()

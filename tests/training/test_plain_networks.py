@@ -39,7 +39,8 @@ class Recurrent(StandardisedNetwork):
 
     def __init__(self, layer):
         super().__init__(4)
-        self.layer, self.output = layer(4, 3, batch_first=True), nn.Linear(3, 1)
+        self.layer = layer(4, 3, batch_first=True)
+        self.output = nn.Linear(3, 1)
 
     def forward(self, windows):
         states, _ = self.layer(windows)
@@ -135,7 +136,8 @@ def known(name, dtype="float64"):
 def test_online_agrees_with_batch(name, dtype, tolerance):
     member = known(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
-    batch, stepper = member.estimate([drive])[0]["vy"], member.online()
+    batch = member.estimate([drive])[0]["vy"]
+    stepper = member.online()
     online = [
         stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
         for k in range(len(drive))

@@ -78,7 +78,9 @@ def test_drives_are_cut_from_their_start_or_at_random_places():
     def drawn(seed):
         return placed(numbered(45, 9, 20), 10, torch.Generator().manual_seed(seed))
 
-    one, again, other = drawn(1), drawn(1), drawn(2)
+    one = drawn(1)
+    again = drawn(1)
+    other = drawn(2)
     assert torch.equal(one.states, again.states)
     assert not torch.equal(one.states, other.states)
     assert one.states[:, 0, 1].tolist() == [0.0] * 4 + [2.0] * 2
@@ -182,7 +184,8 @@ def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its
 
 def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     generator = np.random.default_rng(0)
-    errors, factors = generator.standard_normal((7, 3)), generator.standard_normal((7, 3, 3))
+    errors = generator.standard_normal((7, 3))
+    factors = generator.standard_normal((7, 3, 3))
     covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
     expected = -np.mean(
         [
@@ -230,7 +233,8 @@ def test_noise_starts_where_residuals_say_or_as_given():
 
 def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
     nothing = PhaseSettings(max_epochs=1, learning_rate=1e-300)
-    alone, after = estimator(through_filter=False), estimator(through_filter=False)
+    alone = estimator(through_filter=False)
+    after = estimator(through_filter=False)
     alone.fit(DATA, settings(noise=nothing))
     after.fit(DATA, settings(noise=PhaseSettings(learning_rate=1e-2, max_epochs=2)))
     changed = {
@@ -240,7 +244,8 @@ def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
     }
     assert changed
     assert all("noise" in name for name in changed)
-    before, after = estimator(), estimator()
+    before = estimator()
+    after = estimator()
     before.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-300)))
     record = after.fit(DATA, settings(through=PhaseSettings(max_epochs=4, learning_rate=2e-3)))
     assert record.metrics["best_validation_loss"] < record.metrics["start_validation_loss"]

@@ -174,7 +174,9 @@ def _loop_with_all_its_weights(averaging):
     )
     adam = torch.optim.Adam(network.parameters(), lr=1e-2)
     generator = torch.Generator().manual_seed(_shuffle_seed(3))
-    steps, averages, losses = [], [], []
+    steps = []
+    averages = []
+    losses = []
     for _ in range(4):
         for batch in torch.randperm(len(y), generator=generator).split(64):
             adam.zero_grad()

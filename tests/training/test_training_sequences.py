@@ -84,14 +84,16 @@ def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_p
     whole = _network()
     records = train_phases(_two_phases(whole), 3, FitContext())
     assert [record.name for record in records] == ["read-out", "all"]
-    stops, interrupted = 0, True
+    stops = 0
+    interrupted = True
     while (
         interrupted
     ):  # each run gets eight questions further, in a fresh network as in a fresh process
         resumed = _network()
         context = FitContext([tmp_path], should_stop=stop_after(8))
         again = train_phases(_two_phases(resumed), 3, context, checkpoint_seconds=often)
-        interrupted, stops = again[-1].interrupted, stops + 1
+        interrupted = again[-1].interrupted
+        stops = stops + 1
     assert stops > 5
     assert torch.equal(_flat(whole), _flat(resumed))
     assert _without_times(again) == _without_times(records)
@@ -119,7 +121,8 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
 
 
 def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finished(tmp_path):
-    one, other = _network(), _network()
+    one = _network()
+    other = _network()
     records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
     assert resume_epoch(tmp_path) == -1
     asked = []
@@ -161,7 +164,8 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
 
 
 def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
-    network, seen = _network(), []
+    network = _network()
+    seen = []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
 
     def validation():
@@ -199,11 +203,10 @@ def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_o
 @pytest.mark.parametrize("decay", [0.0, 0.1])
 def test_adam_is_that_of_torch_bit_by_bit(decay):
     generator = torch.Generator().manual_seed(0)
-    own, other = (_network(), _network())
-    adam, theirs = (
-        Adam(own.parameters(), 0.01, decay),
-        torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay),
-    )
+    own = _network()
+    other = _network()
+    adam = Adam(own.parameters(), 0.01, decay)
+    theirs = torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay)
     for _ in range(20):
         for one, two in zip(own.parameters(), other.parameters(), strict=True):
             one.grad = torch.randn(one.shape, generator=generator, dtype=one.dtype)
@@ -256,7 +259,9 @@ def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
 
 @pytest.mark.parametrize("where", ["loss", "gradient"])
 def test_step_that_is_not_finite_is_skipped_and_counted(where):
-    network, calls, held = _network(), 0, []
+    network = _network()
+    calls = 0
+    held = []
 
     def loss(batch):
         nonlocal calls
@@ -286,7 +291,8 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
         match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate",
     ):
         train_phases([phase], 0, FitContext())
-    network, calls = _network(), 0
+    network = _network()
+    calls = 0
 
     def loss(batch):
         nonlocal calls

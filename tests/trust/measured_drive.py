@@ -10,7 +10,8 @@ from single_track_drive import linear_drive
 RATE = 50.0
 CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
 WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr")
-RADIUS, HALF_TRACK = 0.3, 0.75
+RADIUS = 0.3
+HALF_TRACK = 0.75
 QUIET = {"yaw_rate": 0.005, "ay": 0.2, "steer": 0.0005}
 ADDED = {"vx": 0.02, "ax": 0.1, "steer": 0.0005}
 WHEEL_NOISE = 0.1  # rad/s

@@ -104,10 +104,8 @@ def test_each_block_counts_once_and_blocks_that_say_nothing_as_their_samples():
     assert pooled_quantile(scores, np.arange(1008), 0.003)[0] == 4.0
     scores = np.random.default_rng(5).permutation(np.arange(1.0, 1001.0))
     assert pooled_quantile(scores, np.arange(1000) // 100, 0.9)[0] == pytest.approx(901.0, abs=3.0)
-    scores, blocks = (
-        np.repeat(np.arange(1.0, 6.0), 2),
-        np.arange(10) // 2,
-    )  # K = 5, alike within: levels up to 5/6
+    scores = np.repeat(np.arange(1.0, 6.0), 2)
+    blocks = np.arange(10) // 2  # K = 5, alike within: levels up to 5/6
     assert pooled_quantile(scores, blocks, 0.9) == (pytest.approx(5.0 * 1.2), True)
     assert pooled_quantile(scores, blocks, 0.68)[1] is False
 
@@ -159,10 +157,16 @@ def by_numpy(bands, rows, vy, variance, *, elsewhere):
 @pytest.mark.parametrize("variance", [math.nan, 0.01])
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_kernel_agrees_with_numpy(variance, elsewhere):
-    bands, rng = bands_of(variance=variance), np.random.default_rng(6)
+    bands = bands_of(variance=variance)
+    rng = np.random.default_rng(6)
     own = piece_of(rng, 300, variance=variance)
-    rows, vy, spread = own.rows * 2.0, own.vy.copy(), own.variance.copy()
-    rows[10, 0], rows[20, 1], vy[30], spread[40] = np.nan, np.nan, np.nan, -1.0
+    rows = own.rows * 2.0
+    vy = own.vy.copy()
+    spread = own.variance.copy()
+    rows[10, 0] = np.nan
+    rows[20, 1] = np.nan
+    vy[30] = np.nan
+    spread[40] = -1.0
     rows[50, 1] = 0.0
     found = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
     np.testing.assert_allclose(
@@ -171,8 +175,10 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
 
 
 def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are():
-    packed, own = bands_of().packed(), piece_of(np.random.default_rng(7), 50)
-    together, one = np.empty((50, 2)), np.empty((1, 2))
+    packed = bands_of().packed()
+    own = piece_of(np.random.default_rng(7), 50)
+    together = np.empty((50, 2))
+    one = np.empty((1, 2))
     band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
     for k in range(50):
         band_rows(
@@ -184,8 +190,10 @@ def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are(
             one,
         )
         assert np.array_equal(one[0], together[k])
-    bands, own = bands_of(), piece_of(np.random.default_rng(8), 20)
-    rows, vy = own.rows.copy(), own.vy.copy()
+    bands = bands_of()
+    own = piece_of(np.random.default_rng(8), 20)
+    rows = own.rows.copy()
+    vy = own.vy.copy()
     rows[:10] = np.nan
     vy[15] = np.nan
     half = bands.half_widths(rows, vy, own.variance)
@@ -247,7 +255,8 @@ def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
 
 
 def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
-    rng, n = np.random.default_rng(10), 100
+    rng = np.random.default_rng(10)
+    n = 100
     own = piece_of(rng, n)
     measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, own.rows.T, strict=True)))
     estimate = Estimate(

@@ -40,7 +40,8 @@ def columns(estimator, drive):
 def hostile_columns(estimator, drive, seed):
     """Bursts of senseless values of 1 sample to 1.5 s, the drive's last third left whole."""
     generator = np.random.default_rng(seed)
-    samples, rate = columns(estimator, drive), estimator.settings.rate_hz
+    samples = columns(estimator, drive)
+    rate = estimator.settings.rate_hz
     for _ in range(12):
         name = generator.choice(list(samples))
         first = generator.integers(len(drive) // 6, len(drive) // 2)
@@ -93,7 +94,8 @@ def test_one_bad_sample_does_no_lasting_harm(name):
     estimator = ready(name)
     drive = short_drive(estimator)
     whole = online(estimator, columns(estimator, drive))
-    at, later = len(drive) // 3, len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
+    at = len(drive) // 3
+    later = len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
     values = HOSTILE[:-1]  # 0 is a value like any other
     channels = estimator.channels
     for channel, value in {
@@ -110,7 +112,8 @@ class Constant(Stepper):
     """Says what it is told to; counts how often it was begun."""
 
     def __init__(self, owner):
-        self.owner, self.steps = owner, 0
+        self.owner = owner
+        self.steps = 0
         owner.begun += 1
 
     def step(self, sample):
@@ -122,17 +125,16 @@ class Constant(Stepper):
 class Saying:
     """As much of an estimator as the wrapper asks of one."""
 
-    channels, skippable, causal, warm_up_steps, horizon_steps, name = (
-        ("yaw_rate", "vx", "ay"),
-        (),
-        True,
-        0,
-        0,
-        "saying",
-    )
+    channels = ("yaw_rate", "vx", "ay")
+    skippable = ()
+    causal = True
+    warm_up_steps = 0
+    horizon_steps = 0
+    name = "saying"
 
     def __init__(self, says):
-        self.says, self.begun = says, 0
+        self.says = says
+        self.begun = 0
         self.settings = type("Settings", (), {"rate_hz": 20.0})()
 
     def online(self):

@@ -13,8 +13,10 @@ from vehest.data.errors import ConfigurationError
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, is_fault, size_of, window
 
 RATE = 20.0
-ONSET, DURATION = 10.0, 8.0
-FIRST, END = 200, 360
+ONSET = 10.0
+DURATION = 8.0
+FIRST = 200
+END = 360
 
 
 @pytest.fixture

@@ -130,13 +130,16 @@ def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
     generator = np.random.default_rng(3)
     rows = rows_of(drive)
     for _ in range(60):
-        k, c = generator.integers(0, len(rows)), generator.integers(0, 4)
+        k = generator.integers(0, len(rows))
+        c = generator.integers(0, 4)
         rows[k : k + generator.integers(1, 30), c] = generator.choice(
             [math.nan, math.inf, 0.0, 1e6, 3.0]
         )
     limits = GuardLimits({"ay": ChannelLimits(-20.0, 20.0, 2.0, 0.2)})
-    at_once, one_by_one = guard(("ay",), limits), guard(("ay",), limits)
-    together, parts = at_once(rows), [one_by_one(rows[k : k + 1]) for k in range(len(rows))]
+    at_once = guard(("ay",), limits)
+    one_by_one = guard(("ay",), limits)
+    together = at_once(rows)
+    parts = [one_by_one(rows[k : k + 1]) for k in range(len(rows))]
     for name in ("rows", "measured", "flow"):
         assert np.array_equal(
             getattr(together, name),

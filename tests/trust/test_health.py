@@ -105,7 +105,8 @@ def test_planted_faults_are_flagged_with_their_reason(fault):
 
 
 def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other():
-    model, drive = model_of(("yaw_rate", "vx", "ay", "ax")), measured_drive(3)
+    model = model_of(("yaw_rate", "vx", "ay", "ax"))
+    drive = measured_drive(3)
     found = judged(model, drive, ay=after(drive["ay"], np.negative))
     reason = usual_reason(found, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
     assert reason_in_words(reason) == "ay and yaw_rate contradict each other"
@@ -113,10 +114,12 @@ def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other():
 
 def sliding(seed, slide=0.0):
     """A drive in which v grows by ``slide`` [m/s] and back within 2 s while the car turns, without a change of r or u."""
-    drive, ramp = measured_drive(seed), np.zeros(len(measured_drive(seed)))
+    drive = measured_drive(seed)
+    ramp = np.zeros(len(measured_drive(seed)))
     first = ONSET + int(np.argmax(np.abs(drive["yaw_rate"][ONSET : ONSET + 1000]))) - 50
     ramp[first : first + 100] = slide * np.sin(np.linspace(0.0, np.pi, 100)) ** 2
-    ax, ay = drive["ax"] - ramp * drive["yaw_rate"], drive["ay"] + np.gradient(ramp, 1.0 / RATE)
+    ax = drive["ax"] - ramp * drive["yaw_rate"]
+    ay = drive["ay"] + np.gradient(ramp, 1.0 / RATE)
     return replace(drive, channels={**drive.channels, "ax": ax, "ay": ay})
 
 
@@ -148,7 +151,8 @@ def test_noise_jumps_and_lost_channels_are_told():
     assert found.status[ONSET] == DEGRADED
     assert found.status[ONSET + round(0.6 * RATE)] == INVALID
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
-    drive, generator = measured_drive(3), np.random.default_rng(0)
+    drive = measured_drive(3)
+    generator = np.random.default_rng(0)
     noisy = judged(
         model_of(),
         drive,
@@ -174,14 +178,17 @@ def test_a_flag_is_taken_back_after_the_fault():
 
 
 def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
-    model, drive = model_of(), measured_drive(4)
+    model = model_of()
+    drive = measured_drive(4)
     rows = np.ascontiguousarray(drive.stack(CHANNELS))
     rows[1000:1200, 2] = np.nan
     rows[1500:1600, 0] = rows[1500, 0]
     rows[2000:2500, 1] *= 3.6
     rows[2600] = np.inf
-    measured, packed = np.isfinite(rows), model.packed()
-    whole, state = health_rows(packed, rows, measured, model.start()), model.start()
+    measured = np.isfinite(rows)
+    packed = model.packed()
+    whole = health_rows(packed, rows, measured, model.start())
+    state = model.start()
     single = [
         health_rows(packed, rows[k : k + 1], measured[k : k + 1], state) for k in range(len(rows))
     ]
@@ -194,12 +201,14 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
 
 def test_without_compilation_health_is_the_same(tmp_path):
     """As under a debugger; 6 s of a drive with a fault."""
-    model, drive = model_of(), measured_drive(3)
+    model = model_of()
+    drive = measured_drive(3)
     rows = np.ascontiguousarray(
         np.stack([np.asarray(drive[name]) for name in model.channels], axis=1)[:300]
     )
     rows[200:, 0] += 0.5
-    measured, file = np.isfinite(rows), tmp_path / "health.npz"
+    measured = np.isfinite(rows)
+    file = tmp_path / "health.npz"
     compiled = health_rows(model.packed(), rows, measured, model.start())
     np.savez(file, tables=model.packed(), rows=rows, measured=measured, start=model.start())
     program = "import sys, numpy as np; from vehest.trust.health import health_rows; own = np.load(sys.argv[1])\n"
@@ -216,7 +225,8 @@ def test_without_compilation_health_is_the_same(tmp_path):
 
 
 def test_senseless_values_leave_nothing_behind():
-    model, drive = model_of(), measured_drive(4)
+    model = model_of()
+    drive = measured_drive(4)
     rows = np.ascontiguousarray(drive.stack(CHANNELS))
     healthy = health_rows(model.packed(), rows, np.isfinite(rows), model.start())
     for place, value in enumerate((1e200, -1e300, math.inf, math.nan, 1e7)):
@@ -262,7 +272,8 @@ def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
 
 @pytest.mark.parametrize("braking", [False, True])
 def test_a_locked_wheel_is_told_from_a_lost_one(braking):
-    model, drive = model_of((*CHANNELS, *WHEELS)), measured_drive(3)
+    model = model_of((*CHANNELS, *WHEELS))
+    drive = measured_drive(3)
     slows = np.clip(1.0 - np.arange(len(drive) - ONSET) / (0.2 * RATE), 0.0, 1.0)
     faulty = {"wheel_speed_fl": after(drive["wheel_speed_fl"], lambda part: part * slows)}
     if braking:
@@ -280,7 +291,8 @@ def test_a_locked_wheel_is_told_from_a_lost_one(braking):
 
 
 def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_another_rate():
-    model, drive = model_of(), measured_drive(3)
+    model = model_of()
+    drive = measured_drive(3)
     fast = {name: np.array(drive[name]) for name in CHANNELS}
     assert domain_verdict(model, outside_domain(model, fast)) == ""
     fast["ay"][: len(drive) // 4] = 50.0
@@ -311,7 +323,8 @@ def ferrari(data_root, start, stop):
 def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(
     data_root,
 ):
-    train, validation = ferrari(data_root, 150.0, 450.0), ferrari(data_root, 450.0, 550.0)
+    train = ferrari(data_root, 150.0, 450.0)
+    validation = ferrari(data_root, 450.0, 550.0)
     model = learn_health([train], [validation], CHANNELS, 100.0)
     found = judged(model, validation)
     at = [round((seconds - 450.0) * 100.0) for seconds in (503.49, 524.85)]

@@ -46,7 +46,8 @@ def test_the_planted_autoregression_is_found_with_its_order_whatever_outliers_do
 
 def test_innovations_move_by_what_the_filter_makes_of_a_signature():
     model = fit_autoregression([planted(5000)], max_order=4)
-    healthy, signature = planted(300, seed=5), np.zeros((300, 2))
+    healthy = planted(300, seed=5)
+    signature = np.zeros((300, 2))
     signature[100:, 1] = np.linspace(0.0, 5.0, 200)
     moved = model.innovations(healthy + signature) - model.innovations(healthy)
     np.testing.assert_allclose(
@@ -76,7 +77,8 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     covariance = np.array([[1.0, 0.9], [0.9, 1.0]])
     signature = np.tile([0.1, 0.0], (6000, 1))
     power = float(signature[0] @ np.linalg.solve(covariance, signature[0]))
-    test, delays = known_test(signature, covariance), []
+    test = known_test(signature, covariance)
+    delays = []
     for _ in range(200):
         above = (
             np.cumsum(

@@ -23,13 +23,13 @@ def code(kind, channel):
 
 def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, last=40):
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
-    statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
-    statuses[first:last], reasons[first:last] = status, code(kind, channel)
-    rows, measured, flow = (
-        np.ones((STEPS, 3)),
-        np.ones((STEPS, 3), np.bool_),
-        np.full(STEPS, USE, np.int8),
-    )
+    statuses = np.zeros(STEPS)
+    reasons = np.zeros(STEPS)
+    statuses[first:last] = status
+    reasons[first:last] = code(kind, channel)
+    rows = np.ones((STEPS, 3))
+    measured = np.ones((STEPS, 3), np.bool_)
+    flow = np.full(STEPS, USE, np.int8)
     isolate_rows(
         statuses,
         reasons,
@@ -71,13 +71,13 @@ def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
         heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART
     ).tolist() == [18, 28, 38]
     assert not (heeded(kernel.OFFSET, "ay", rollback=10, starts_anew=False)[2] == RESTART).any()
-    reasons, statuses = np.zeros(STEPS), np.zeros(STEPS)
-    statuses[10:40], reasons[10:40] = 2.0, code(kernel.SCALE, "vx")
-    rows, measured, flow = (
-        np.ones((STEPS, 3)),
-        np.ones((STEPS, 3), np.bool_),
-        np.full(STEPS, USE, np.int8),
-    )
+    reasons = np.zeros(STEPS)
+    statuses = np.zeros(STEPS)
+    statuses[10:40] = 2.0
+    reasons[10:40] = code(kernel.SCALE, "vx")
+    rows = np.ones((STEPS, 3))
+    measured = np.ones((STEPS, 3), np.bool_)
+    flow = np.full(STEPS, USE, np.int8)
     state = np.zeros(2)
     for k in range(STEPS):
         part = slice(k, k + 1)
@@ -100,7 +100,8 @@ def test_the_verdict_names_what_guard_and_watch_know():
     marks = np.array([0, 0, SPINNING, CLIPPED, EXTRAPOLATED], np.int8)
     measured = np.ones((5, 3), np.bool_)
     measured[1, 1] = False
-    status, reason = np.zeros(5), np.zeros(5)
+    status = np.zeros(5)
+    reason = np.zeros(5)
     verdict_rows(
         np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason
     )
@@ -134,7 +135,8 @@ def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_de
         [2.0, max(0.4, math.atan(2.0 / 20.0))]
     )  # as far as |v| and the farthest in training
     # Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded.
-    status, reason = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 40_200.0, 40_200.0, 0.0])
+    status = np.array([0.0, 1.0, 1.0, 0.0])
+    reason = np.array([0.0, 40_200.0, 40_200.0, 0.0])
     bands = np.radians([[2.0, 2.0], [2.0, 2.0], [4.0, 4.0], [7.0, 7.0]])
     widen_rows(status, reason, np.zeros(4, np.int8), np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
     assert status.tolist() == [0.0, 1.0, 2.0, 2.0]

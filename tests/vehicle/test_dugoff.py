@@ -12,7 +12,8 @@ from vehest.filters.unscented_scan import TorchModel
 from vehest.vehicle.dugoff import LoadedCar
 
 BOTH = pytest.mark.parametrize("tyres", ["plain", "smooth"])
-LOAD, SPEED = torch.tensor(9000.0, dtype=torch.float64), torch.tensor(25.0, dtype=torch.float64)
+LOAD = torch.tensor(9000.0, dtype=torch.float64)
+SPEED = torch.tensor(25.0, dtype=torch.float64)
 
 
 def drawn(*shape, seed=0):
@@ -30,7 +31,8 @@ def driven(count):
         ],
         -1,
     )
-    points[0], inputs[0, 1] = 0.0, 0.0
+    points[0] = 0.0
+    inputs[0, 1] = 0.0
     return points, inputs
 
 
@@ -73,7 +75,8 @@ def test_braking_loads_the_front_axle():
 @BOTH
 def test_the_compiled_track_is_the_readable_one(tyres):
     track = dugoff_track(tyres)
-    readable, compiled = TorchModel(track.transition, track.observation), CompiledDugoffTrack(track)
+    readable = TorchModel(track.transition, track.observation)
+    compiled = CompiledDugoffTrack(track)
     points, inputs = (part.numpy() for part in driven(300))
     for entry, size in enumerate((2, 5)):
         expected, found = (
@@ -133,7 +136,8 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
 
 def test_a_sequence_has_the_same_digits_alone_as_beside_others():
     """Eleven sequences fill one vector of eight and a part of another; one of them is repaired, one not measured."""
-    track, count = dugoff_track("smooth"), 11
+    track = dugoff_track("smooth")
+    count = 11
     inputs = torch.tensor([20.0, 0.05, 0.0]) + drawn(count, 6, 3) * torch.tensor([2.0, 0.03, 0.5])
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
     measurements = (

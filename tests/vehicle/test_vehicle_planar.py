@@ -40,7 +40,8 @@ def tensor(*values):
 
 def test_runge_kutta_is_an_independent_integrator(car):
     """Over 10 ms from a drifting state; and its error falls with the fourth power of the step."""
-    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    state = tensor(3.0, -0.6, 2.5, 3.4)
+    inputs = tensor(0.2, 8.0)
     known = solve_ivp(
         lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(),
         (0.0, 0.01),
@@ -59,7 +60,8 @@ def test_runge_kutta_is_an_independent_integrator(car):
 
 
 def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
-    state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
+    state = tensor(4.0, 0.0, 0.0, 4.0)
+    inputs = tensor(0.0, 0.0)
     own = rates(car, state, inputs)
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
     assert float(own[0]) == pytest.approx(-drag / F1TENTH["mass"])
@@ -67,7 +69,8 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     assert float(own[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
     # ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1).
     chassis, tyres = car
-    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    state = tensor(3.0, -0.6, 2.5, 3.4)
+    inputs = tensor(0.2, 8.0)
     own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
     assert float(own.ax) == pytest.approx(float(own.rates[0] - 2.5 * -0.6))
     assert float(own.ay) == pytest.approx(float(own.rates[1] + 2.5 * 3.0))
@@ -79,7 +82,8 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
 
 
 def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_for(car):
-    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    state = tensor(3.0, -0.6, 2.5, 3.4)
+    inputs = tensor(0.2, 8.0)
     mirror = tensor(1.0, -1.0, -1.0, 1.0)
     assert torch.allclose(
         rates(car, mirror * state, tensor(-0.2, 8.0)),
@@ -89,7 +93,8 @@ def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_f
     front, rear = car[0].loads()
     assert float(front + rear) == pytest.approx(F1TENTH["mass"] * GRAVITY)
     assert float(front * (F1TENTH["wheelbase"] - 0.115)) == pytest.approx(float(rear * 0.115))
-    plain, curved = PacejkaTyres(TYRES), PacejkaTyres(TYRES, with_curvature=True)
+    plain = PacejkaTyres(TYRES)
+    curved = PacejkaTyres(TYRES, with_curvature=True)
     assert (
         sum(p.numel() for p in curved.parameters()) - sum(p.numel() for p in plain.parameters())
         == 3
@@ -112,8 +117,12 @@ def test_for_small_slips_it_is_the_linear_single_track(car):
     linear = SingleTrackParameters(
         F1TENTH["mass"], 0.46, F1TENTH["wheelbase"] - 0.115, 0.115, front, rear
     )
-    speed, sideslip, yaw_rate, steer = 4.0, 2e-4, 3e-3, 1e-3
-    state, inputs = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed), tensor(steer, 0.0)
+    speed = 4.0
+    sideslip = 2e-4
+    yaw_rate = 3e-3
+    steer = 1e-3
+    state = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed)
+    inputs = tensor(steer, 0.0)
     own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
     A, B, C, D = lateral_model(linear, np.array(speed))
     x = np.array([sideslip, yaw_rate])
@@ -124,7 +133,8 @@ def test_for_small_slips_it_is_the_linear_single_track(car):
 
 
 def test_the_magic_formula_has_its_slope_its_peak_and_its_curvature():
-    stiffness, shape = tensor(5.948), tensor(2.2754)
+    stiffness = tensor(5.948)
+    shape = tensor(2.2754)
     slip = torch.linspace(-0.6, 0.6, 2001, dtype=torch.float64)
     curve = magic_formula(slip, stiffness, shape)
     assert float(magic_formula(tensor(1e-6), stiffness, shape)) == pytest.approx(

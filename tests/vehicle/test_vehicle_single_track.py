@@ -13,7 +13,9 @@ SPEEDS = np.array([8.0, 20.0, 45.0])
 
 def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
     """Slip angles and axle forces written out, then Newton and Euler."""
-    sideslip, yaw_rate, steer = 0.03, 0.4, -0.02
+    sideslip = 0.03
+    yaw_rate = 0.4
+    steer = -0.02
     state = np.array([sideslip, yaw_rate])
     A, B, C, D = lateral_model(CAR, SPEEDS)
     for k, u in enumerate(SPEEDS.tolist()):
@@ -28,13 +30,13 @@ def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
         assert float(derivative[1]) == pytest.approx(moment / CAR.yaw_inertia, rel=1e-12)
         assert float(C[k] @ state + D[k] * steer) == pytest.approx(acceleration, rel=1e-12)
     # λ² + 2σλ + ω²: sum and product of the poles as vehicle dynamics books give them.
-    front, rear, lf, lr = (
-        CAR.cornering_stiffness_front,
-        CAR.cornering_stiffness_rear,
-        CAR.cg_to_front_axle,
-        CAR.cg_to_rear_axle,
-    )
-    m, J, wheelbase = CAR.mass, CAR.yaw_inertia, CAR.cg_to_front_axle + CAR.cg_to_rear_axle
+    front = CAR.cornering_stiffness_front
+    rear = CAR.cornering_stiffness_rear
+    lf = CAR.cg_to_front_axle
+    lr = CAR.cg_to_rear_axle
+    m = CAR.mass
+    J = CAR.yaw_inertia
+    wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
     for u, A in zip(SPEEDS, lateral_model(CAR, SPEEDS).A, strict=True):
         damping = (front + rear) / (m * u) + (lf**2 * front + lr**2 * rear) / (J * u)
         stiffness = front * rear * wheelbase**2 / (m * J * u**2) + (lr * rear - lf * front) / J

@@ -29,10 +29,8 @@ def test_a_model_of_yesterday_estimates_as_it_did(name):
     then = read_estimate(folder / "estimate.parquet")
     now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
-    expected, wide = (
-        dict(then.channels),
-        np.nan_to_num(then["band_sideslip"]) > WIDEST,
-    )  # then valid or degraded, now invalid
+    expected = dict(then.channels)
+    wide = np.nan_to_num(then["band_sideslip"]) > WIDEST  # then valid or degraded, now invalid
     unexplained = wide & (then["health_reason"] == 0.0)
     expected["health"] = np.where(wide, INVALID, then["health"])
     expected["health_reason"] = np.where(unexplained, TOO_WIDE * 10_000.0, then["health_reason"])
@@ -62,7 +60,8 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     )
     assert code == 0, err
     assert "of the drive" in json.loads(out)["verdict"]
-    table, then = pd.read_csv("out.csv"), read_estimate(folder / "estimate.parquet")
+    table = pd.read_csv("out.csv")
+    then = read_estimate(folder / "estimate.parquet")
     wider = {"band_sideslip": 2.0}  # since a table names no vehicle that bands were calibrated on
     for channel in ("vy", "sideslip", "band_sideslip"):
         np.testing.assert_allclose(

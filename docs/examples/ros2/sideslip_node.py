@@ -23,11 +23,13 @@ class Samples:
     """Forms a sample of each message of the inertial unit, whose clock counts."""
 
     def __init__(self) -> None:
-        self._speed, self._when = math.nan, -math.inf
+        self._speed = math.nan
+        self._when = -math.inf
 
     def speed(self, message: Any) -> None:
         """Take a geometry_msgs/msg/TwistStamped."""
-        self._speed, self._when = message.twist.linear.x, seconds(message.header.stamp)
+        self._speed = message.twist.linear.x
+        self._when = seconds(message.header.stamp)
 
     def imu(self, message: Any) -> tuple[float, dict[str, float]]:
         """The time [s] and the sample of a sensor_msgs/msg/Imu."""
@@ -78,7 +80,8 @@ def main() -> None:
     node = Node("vehest")
     model = vehest.load_model(node.declare_parameter("model", "pretrained").value)
     stepper = vehest.online(model, node.declare_parameter("imu_rate_hz", 100.0).value)
-    samples, publisher = Samples(), node.create_publisher(SideslipEstimate, "sideslip", 10)
+    samples = Samples()
+    publisher = node.create_publisher(SideslipEstimate, "sideslip", 10)
     last = stepper.last
 
     def on_imu(message: Imu) -> None:
@@ -87,7 +90,8 @@ def main() -> None:
         said = stepper.step(sample, time)  # samples that are missing in between are bridged
         if said is last:  # the model's rate is below that of the inertial unit
             return
-        last, estimate = said, SideslipEstimate()
+        last = said
+        estimate = SideslipEstimate()
         estimate.header.frame_id = message.header.frame_id
         estimate.header.stamp = Time(nanoseconds=round(1e9 * (time + ahead_of(stepper)))).to_msg()
         for name, value in fields_of(said).items():

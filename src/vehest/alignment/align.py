@@ -135,7 +135,8 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     transforms: list[dict[str, Any]] = []
     residuals: tuple[Residual, ...] = ()
     notes: list[str] = []
-    corrected, correlation = recording, None
+    corrected = recording
+    correlation = None
     if settings.kinematic:
         fit = fit_imu(
             recording,
@@ -151,14 +152,13 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         for transform in transforms:
             corrected = transform_from_config(transform)(corrected)
         residuals = _residuals(fit, signals_of(corrected, settings))
-        correlation, notes = fit.correlation, _imu_notes(fit, parameters, settings)
+        correlation = fit.correlation
+        notes = _imu_notes(fit, parameters, settings)
     if "steering_ratio" in settings.estimate:
         found, transform, note = _align_steering(corrected, settings)
-        parameters, transforms, notes = (
-            [*parameters, *found],
-            [*transforms, transform],
-            [*notes, note],
-        )
+        parameters = [*parameters, *found]
+        transforms = [*transforms, transform]
+        notes = [*notes, note]
     return Alignment(
         recording,
         settings,
@@ -205,7 +205,8 @@ def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
 
 def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     """Sensor less reference, as recorded and as the transforms leave them."""
-    before, after = ImuModel(fit.signals), ImuModel(corrected)
+    before = ImuModel(fit.signals)
+    after = ImuModel(corrected)
     tilt = {name: value for name, value in fit.values.items() if name.startswith("tilt")}
     error_before, error_after = (model.measured - model(NOTHING)[0] for model in (before, after))
     rest = after.measured - after({**NOTHING, **tilt})[0]
@@ -220,7 +221,9 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
 def _imu_notes(
     fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings
 ) -> list[str]:
-    signals, values, notes = fit.signals, fit.values, []
+    signals = fit.signals
+    values = fit.values
+    notes = []
     left = [
         name for name in QUANTITIES if name not in settings.estimate and name != "steering_ratio"
     ]
@@ -297,10 +300,8 @@ def _align_steering(
     calm = (low(recording["vx"]) >= settings.min_speed) & (
         np.abs(low(recording["ay"])) <= settings.max_ay
     )
-    seconds, least = (
-        float(calm.sum()) * smoothing.step / recording.rate_hz,
-        FEWEST_BLOCKS * SHORTEST_BLOCK,
-    )
+    seconds = float(calm.sum()) * smoothing.step / recording.rate_hz
+    least = FEWEST_BLOCKS * SHORTEST_BLOCK
     if seconds < least:
         calm_is = f"above {settings.min_speed:g} m/s with less than {settings.max_ay:g} m/s² of ay"
         raise DataError(

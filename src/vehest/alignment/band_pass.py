@@ -42,10 +42,13 @@ def without_phase(sections: FloatArray, samples: FloatArray) -> FloatArray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _filtered(sections, samples):  # type: ignore[no-untyped-def]
-    state, out, level = np.empty((len(sections), 2)), np.empty(len(samples)), samples[0]
+    state = np.empty((len(sections), 2))
+    out = np.empty(len(samples))
+    level = samples[0]
     for s, (b0, b1, b2, a1, a2) in enumerate(sections):
         settled = level * (b0 + b1 + b2) / (1.0 + a1 + a2)
-        state[s, 0], state[s, 1] = settled - b0 * level, b2 * level - a2 * settled
+        state[s, 0] = settled - b0 * level
+        state[s, 1] = b2 * level - a2 * settled
         level = settled
     for k in range(len(samples)):
         value = samples[k]

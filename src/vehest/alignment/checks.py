@@ -33,7 +33,8 @@ from vehest.data.runs import equal_runs, true_runs
 __all__ = ["Finding", "checks_of_recording"]
 
 MOST_WRONG_UNITS = 3
-STUCK_SECONDS, FEWEST_STUCK = 1.0, 3  # seconds, samples
+STUCK_SECONDS = 1.0
+FEWEST_STUCK = 3  # seconds, samples
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
@@ -47,10 +48,10 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
-FASTEST_REVERSE, LEAST_TURN = (
-    8.0,
-    0.03,
-)  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
+FASTEST_REVERSE = 8.0
+LEAST_TURN = (
+    0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
+)
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
@@ -155,7 +156,8 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
     ):
         return
     expected = motion["ay"] - motion.turning
-    predicted, derived = band(expected), band(motion.sliding)
+    predicted = band(expected)
+    derived = band(motion.sliding)
     if predicted.std() == 0.0 or derived.std() < LEAST_SLIDING:
         return
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
@@ -190,7 +192,8 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
         known = np.flatnonzero(~np.isnan(samples))
-        unit, rests = CHANNELS[name].unit, CHANNELS[name].rests
+        unit = CHANNELS[name].unit
+        rests = CHANNELS[name].rests
         if rests and not samples[known].any():
             continue
         if len(known) > 1 and (samples[known] == samples[known[0]]).all():
@@ -206,12 +209,14 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
             (runs[:, 1] - runs[:, 0] >= FEWEST_STUCK)
             & ~(rests & (samples[known[runs[:, 0]]] == 0.0))
         ]
-        begins, ends = known[runs[:, 0]], known[runs[:, 1] - 1] + 1
+        begins = known[runs[:, 0]]
+        ends = known[runs[:, 1] - 1] + 1
         held = moved[ends] - moved[begins]
         if len(runs) and held.max() >= STUCK_SECONDS * recording.rate_hz:
             longest = int(np.argmax(held))
             first = int(begins[longest] + np.argmax(moving[begins[longest] : ends[longest]]))
-            seconds, time = held[longest] / recording.rate_hz, recording.time[first]
+            seconds = held[longest] / recording.rate_hz
+            time = recording.time[first]
             yield Finding(
                 "warning",
                 "stuck",
@@ -233,7 +238,8 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
             ("lowest", lowest, between.min()),
         ):
             at = known == extreme
-            number, fewest = int(at.sum()), SATURATED_EXCESS * np.count_nonzero(known == beside)
+            number = int(at.sum())
+            fewest = SATURATED_EXCESS * np.count_nonzero(known == beside)
             is_extreme = abs(extreme) >= 0.1 * max(abs(lowest), abs(highest))
             if (
                 is_extreme

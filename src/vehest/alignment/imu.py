@@ -95,11 +95,13 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     """Fit some of `IMU_PARAMETERS` to a drive; the others are zero. Needs and errors are those of `vehest.alignment.align.align`."""
     signals = signals_of(recording, settings)
     model = ImuModel(signals)
-    start, (predicted, columns) = dict(NOTHING), model(NOTHING)
+    start = dict(NOTHING)
+    (predicted, columns) = model(NOTHING)
     if "yaw" in names:
         expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, model.measured))
         if "offset_ax" in names:
-            expected, shown = expected - expected.mean(), shown - shown.mean()
+            expected = expected - expected.mean()
+            shown = shown - shown.mean()
         start["yaw"] = -float(
             np.angle(np.vdot(expected, shown))
         )  # brings both together best, without delay and lever arm
@@ -117,11 +119,9 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
         raise DataError(
             f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay"
         )
-    blocks, columns, rate_hz = (
-        n_blocks(signals.duration),
-        model(fit.values)[1],
-        signals.rate_hz / signals.smoothing.step,
-    )
+    blocks = n_blocks(signals.duration)
+    columns = model(fit.values)[1]
+    rate_hz = signals.rate_hz / signals.smoothing.step
     uncertainties = partial(
         _uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=rate_hz
     )
@@ -201,10 +201,8 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
     check_limit("filter_samples", lags, what, ConfigurationError)
     shift = math.ceil(lags) if "delay" in settings.estimate else 0
-    measured, velocity = (
-        recording["ax"] + 1j * recording["ay"],
-        recording[speed] + 1j * recording["vy_ref"],
-    )
+    measured = recording["ax"] + 1j * recording["ay"]
+    velocity = recording[speed] + 1j * recording["vy_ref"]
     rates = recording["yaw_rate"], recording.channels.get("yaw_rate_ref")
     signals = Signals(
         recording,
@@ -240,7 +238,8 @@ class ImuModel:
         """Prediction (C, T) and its derivatives, name -> (C, T), at a set of parameters."""
         low = self.signals.low_passed
         now = np.clip(self._clock - at["delay"], 0.0, self._clock[-1])
-        v, v_dot = self._velocity(now), self._velocity(now, 1)
+        v = self._velocity(now)
+        v_dot = self._velocity(now, 1)
         r = self.signals.gyro - at["offset_yaw_rate"] if self._rate is None else self._rate(now)
         lever = at["lever_x"] + 1j * at["lever_y"]
         gain, lag = (
@@ -248,30 +247,27 @@ class ImuModel:
         )
 
         rv = r * v
-        acceleration, jerk = (
-            low(v, 1) + 1j * low(rv),
-            low(v, 2) + 1j * low(rv, 1),
-        )  # at the reference point
-        r_low, r_dot, r_squared = low(r), low(r, 1), low(r * r)
+        acceleration = low(v, 1) + 1j * low(rv)
+        jerk = low(v, 2) + 1j * low(rv, 1)  # at the reference point
+        r_low = low(r)
+        r_dot = low(r, 1)
+        r_squared = low(r * r)
         arm = 1j * r_dot - r_squared
         tilted = acceleration + _axiswise(gain, acceleration) + _axiswise(lag, jerk)
         turned = np.exp(-1j * at["yaw"])
         plane = turned * (tilted + arm * lever + self._gravity)
 
         if self._rate is None:  # the yaw rate is on the sensor's own clock
-            late, late_dot, late_arm = (
-                low(v, 2) + 1j * low(r * v_dot),
-                low(v, 3) + 1j * low(r * v_dot, 1),
-                np.zeros_like(arm),
-            )
+            late = low(v, 2) + 1j * low(r * v_dot)
+            late_dot = low(v, 3) + 1j * low(r * v_dot, 1)
+            late_arm = np.zeros_like(arm)
         else:
-            late, late_dot, late_arm = (
-                jerk,
-                low(v, 3) + 1j * low(rv, 2),
-                1j * low(r, 2) - low(r * r, 1),
-            )
+            late = jerk
+            late_dot = low(v, 3) + 1j * low(rv, 2)
+            late_arm = 1j * low(r, 2) - low(r * r, 1)
         by_delay = late + _axiswise(gain, late) + _axiswise(lag, late_dot) + late_arm * lever
-        rows, ones = self.signals.as_rows, np.ones(len(plane), dtype=np.complex128)
+        rows = self.signals.as_rows
+        ones = np.ones(len(plane), dtype=np.complex128)
         columns = {
             "lever_x": rows(turned * arm),
             "lever_y": rows(turned * 1j * arm),
@@ -286,7 +282,8 @@ class ImuModel:
             "tilt_lag_y": rows(turned * 1j * jerk.imag),
         }
         if self._rate is None:
-            by_rate, by_rate_dot = -1j * low(v), -1j * low(v, 1)
+            by_rate = -1j * low(v)
+            by_rate_dot = -1j * low(v, 1)
             columns["offset_yaw_rate"] = rows(
                 turned
                 * (
@@ -347,22 +344,28 @@ class Fit:
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
     """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no delay of its own."""
-    v, gyro = signals.velocity, signals.gyro
+    v = signals.velocity
+    gyro = signals.gyro
 
     def low(samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
         return signals.smoothing(samples, order, margin=signals.smoothing.reach, step=1)
 
     if signals.reference_rate is not None:
-        pairs, what = [(low(gyro, 1), low(signals.reference_rate, 1))], "yaw acceleration"
+        pairs = [(low(gyro, 1), low(signals.reference_rate, 1))]
+        what = "yaw acceleration"
     else:
         own = np.exp(1j * yaw) * low(signals.measured) - 1j * low(gyro * v)
         derived = low(v, 1)
-        pairs, what = [(own.real, derived.real), (own.imag, derived.imag)], "acceleration"
+        pairs = [(own.real, derived.real), (own.imag, derived.imag)]
+        what = "acceleration"
     n_lags = math.ceil(settings.max_delay * signals.rate_hz)
     lags = np.arange(-n_lags, n_lags + 1)
-    products, own_energy, derived_energy = np.zeros(len(lags)), np.zeros(len(lags)), 0.0
+    products = np.zeros(len(lags))
+    own_energy = np.zeros(len(lags))
+    derived_energy = 0.0
     for own, derived in pairs:
-        own, core = own - own.mean(), (derived - derived.mean())[n_lags : len(derived) - n_lags]
+        own = own - own.mean()
+        core = (derived - derived.mean())[n_lags : len(derived) - n_lags]
         products += signal.correlate(own, core, mode="valid", method="fft")
         energy = np.concatenate([[0.0], np.cumsum(np.square(own))])
         own_energy += energy[len(core) :] - energy[: len(lags)]
@@ -407,7 +410,8 @@ def _most_likely(
             names, dict(values), error, np.stack([by_name[name] for name in names]), weights, prior
         )
 
-    fit, damping = fit_at(start), 1e-4
+    fit = fit_at(start)
+    damping = 1e-4
     for _ in range(N_ITERATIONS):
         information = fit.information
         require_condition(model.signals.recording, information, names, asked)
@@ -415,7 +419,8 @@ def _most_likely(
         moved = fit_at({**fit.values, **dict(zip(names, (fit.point + step).tolist(), strict=True))})
         settled = float(np.abs(step).max()) < SETTLED
         if moved.cost <= fit.cost:
-            fit, damping = moved, damping / 10.0
+            fit = moved
+            damping = damping / 10.0
         elif not settled:
             damping = max(damping, 1e-4) * 10.0
         if settled:
@@ -464,13 +469,16 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
 
     It is that of the reference and of the yaw rate, taken as white.
     """
-    speed_noise, side_noise = _noise(signals.velocity.real), _noise(signals.velocity.imag)
+    speed_noise = _noise(signals.velocity.real)
+    side_noise = _noise(signals.velocity.imag)
     rate_noise = _noise(signals.gyro if signals.reference_rate is None else signals.reference_rate)
     level, slope, bend = (
         float(np.linalg.norm(signals.smoothing.kernel(order))) for order in range(3)
     )
-    speed, turning = rms(np.abs(signals.velocity)), rms(signals.gyro)
-    ahead, aside = slope * speed_noise, math.hypot(slope * side_noise, level * speed * rate_noise)
+    speed = rms(np.abs(signals.velocity))
+    turning = rms(signals.gyro)
+    ahead = slope * speed_noise
+    aside = math.hypot(slope * side_noise, level * speed * rate_noise)
     arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
     by_offset = (
         (level * side_noise, level * speed_noise, 0.0)
@@ -548,11 +556,13 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     edges = np.linspace(0, fit.error.shape[1], blocks + 1).astype(int)
     changes = []
     for first, last in itertools.pairwise(edges):
-        columns, error = fit.columns[:, :, first:last], fit.error[:, first:last]
+        columns = fit.columns[:, :, first:last]
+        error = fit.error[:, first:last]
         own = np.einsum("pct,qct,c->pq", columns, columns, fit.weights, optimize=True)
         score = np.einsum("pct,ct,c->p", columns, error, fit.weights, optimize=True)
         changes.append(np.linalg.lstsq(information - own, -score, rcond=None)[0])
-    moved, inverse = np.stack(changes), np.linalg.inv(information)
+    moved = np.stack(changes)
+    inverse = np.linalg.inv(information)
     return (blocks - 1) / blocks * moved.T @ moved + inverse @ fit.prior @ inverse
 
 
@@ -656,7 +666,8 @@ class Smoothing:
         smooth = signal.upfirdn(
             self.kernel(order), np.concatenate([np.zeros(padding), inside]), down=step
         )
-        first, count = (padding + 2 * self.reach) // step, -(-(len(samples) - 2 * margin) // step)
+        first = (padding + 2 * self.reach) // step
+        count = -(-(len(samples) - 2 * margin) // step)
         return smooth[first : first + count]
 
     def kernel(self, order: int) -> FloatArray:

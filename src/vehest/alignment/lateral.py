@@ -60,13 +60,15 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
         weighted = None if found is None else _weighted(found.whole, found.omega)
         if found is None or weighted is None:
             return None
-        spectra, (start, weight) = found, weighted
+        spectra = found
+        (start, weight) = weighted
         if (
             max(map(abs, start)) < SETTLED
             or max(abs(turning + start[0]), abs(sliding + start[1])) > LARGEST_LAG
         ):
             break
-        turning, sliding = turning + start[0], sliding + start[1]
+        turning = turning + start[0]
+        sliding = sliding + start[1]
 
     def lateness(spectrum: ComplexArray) -> FloatArray:
         again = _fit(spectrum, spectra.omega, weight, start)
@@ -80,7 +82,8 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
 def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | None:
     """Of the signals, once yaw rate and ay are shifted onto the clock of the lateral velocity."""
     clock = np.arange(len(motion)) / motion.rate_hz
-    ay, yaw_rate = motion["ay"], motion["yaw_rate"]
+    ay = motion["ay"]
+    yaw_rate = motion["yaw_rate"]
     if turning or sliding:
         ay = scipy.interpolate.CubicSpline(clock, ay)(np.clip(clock - sliding, 0.0, clock[-1]))
         yaw_rate = scipy.interpolate.CubicSpline(clock, yaw_rate)(
@@ -103,11 +106,9 @@ def _weighted(
 ) -> tuple[tuple[float, float], FloatArray] | None:
     """Both delays, and the weights that the residual leaves, (F,)."""
     floor = LOWEST_RESIDUAL * float(whole[:, 0, 0].real.max())
-    weight, start, explained = (
-        np.ones(len(omega)) / max(floor, np.finfo(float).tiny),
-        (0.0, 0.0),
-        0.0,
-    )
+    weight = np.ones(len(omega)) / max(floor, np.finfo(float).tiny)
+    start = (0.0, 0.0)
+    explained = 0.0
     for _ in range(N_WEIGHTINGS):
         fitted = _fit(whole, omega, weight, start)
         if fitted is None:
@@ -128,12 +129,17 @@ def _fit(
     """Gauss-Newton: both delays, the power of the residual (F,), and the share of it that d(vy)/dt took away."""
     turning, sliding = start
     for _ in range(N_STEPS):
-        p, d = np.exp(1j * omega * turning), np.exp(1j * omega * sliding)
+        p = np.exp(1j * omega * turning)
+        d = np.exp(1j * omega * sliding)
         columns = np.zeros(
             (len(omega), 5, 5), dtype=np.complex128
         )  # (F, signals, parameters): g, g·τ₁, g·τ₂, x, y
-        columns[:, 1, 0], columns[:, 2, 0], columns[:, 3, 3], columns[:, 4, 4] = p, d, p, p
-        columns[:, 1, 1], columns[:, 2, 2] = 1j * omega * p, 1j * omega * d
+        columns[:, 1, 0] = p
+        columns[:, 2, 0] = d
+        columns[:, 3, 3] = p
+        columns[:, 4, 4] = p
+        columns[:, 1, 1] = 1j * omega * p
+        columns[:, 2, 2] = 1j * omega * d
         left = columns.conj().transpose(0, 2, 1)
         normal = np.einsum("fpq,f->pq", (left @ spectrum @ columns).real, weight)
         right = np.einsum("fp,f->p", (left @ spectrum[:, :, :1])[:, :, 0].real, weight)

@@ -104,7 +104,9 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
     """
     if not (motion.speed and "yaw_rate" in motion and "ay" in motion):
         return
-    moving, measured, turning = motion.moving, motion["ay"], motion.turning
+    moving = motion.moving
+    measured = motion["ay"]
+    turning = motion.turning
     if np.count_nonzero(moving) < FEWEST_SAMPLES or measured.std() < LEAST_ACCELERATION:
         return
     product = f"{motion.speed}·yaw_rate"
@@ -120,7 +122,8 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
         return
     right, left = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
     known = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
-    channels, powers = (motion.velocity, "ay", motion.speed)[:known], (1, -1, 1)[:known]
+    channels = (motion.velocity, "ay", motion.speed)[:known]
+    powers = (1, -1, 1)[:known]
     yield from _related(
         f"d({motion.velocity})/dt",
         f"ay - {product}",
@@ -155,7 +158,8 @@ def _longitudinal(motion: Motion) -> Iterator[Relation]:
     band = kinematic_band(motion) if motion.speed and "ax" in motion else None
     if band is None:
         return
-    left, right = band(motion["ax"]), band(motion.derivative(motion.vx))
+    left = band(motion["ax"])
+    right = band(motion.derivative(motion.vx))
     if motion.velocity and "yaw_rate" in motion:
         left, right = _without(
             np.stack([band(motion.vy * motion["yaw_rate"])], axis=1), left, right
@@ -174,7 +178,8 @@ def _longitudinal(motion: Motion) -> Iterator[Relation]:
 def _repeated(motion: Motion) -> Iterator[Relation]:
     """Quantities that are measured twice."""
     for name in ("yaw_rate", "vx"):
-        reference, moving = f"{name}_ref", motion.moving
+        reference = f"{name}_ref"
+        moving = motion.moving
         if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
             pair = (name, reference)
             steady = (
@@ -185,10 +190,8 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
         forwards = motion.moving & (
             motion.vx > 0.0
         )  # the angle of a car that goes backwards is taken either way
-        shown, expected = (
-            motion["sideslip_ref"][forwards],
-            np.arctan2(motion.vy, motion.vx)[forwards],
-        )
+        shown = motion["sideslip_ref"][forwards]
+        expected = np.arctan2(motion.vy, motion.vx)[forwards]
         if len(expected) >= FEWEST_SAMPLES and np.std(expected) >= LEAST_SIDESLIP:
             names = ("sideslip_ref", "vy_ref", motion.speed)
             right = f"atan2(vy_ref, {motion.speed})"
@@ -311,7 +314,8 @@ def sign_findings(
         motion.speed,
     ) in explanations:  # only suspected where it is negative, where the check reverse warns
         return []
-    best, others = explanations[0], explanations[1:]
+    best = explanations[0]
+    others = explanations[1:]
     if _decided(relations, explanations):
         alternative = (
             f", unless {' or '.join(_together(names) for names in others)} do" if others else ""

@@ -137,7 +137,8 @@ class Measured:
 
 def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
     """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after another (Student's)."""
-    whole, number = groups.sum(axis=0), len(groups)
+    whole = groups.sum(axis=0)
+    number = len(groups)
     left_out = np.stack([fit(whole - group) for group in groups])
     spread = np.sqrt(
         (number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0)
@@ -174,7 +175,8 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     """
     if not {source, follower} <= set(spectra.names):
         return None
-    x, y = spectra.names.index(source), spectra.names.index(follower)
+    x = spectra.names.index(source)
+    y = spectra.names.index(follower)
     whole = spectra.whole
     across = smoothed(whole[:, x, y].real) + 1j * smoothed(whole[:, x, y].imag)
     power = smoothed(whole[:, x, x].real) * smoothed(whole[:, y, y].real)
@@ -232,26 +234,27 @@ def _refined(
     size = np.abs(cross)
     for _ in range(N_STEPS):
         turned = cross * np.exp(1j * (omega * delay + np.arctan(omega * constant)))
-        by_delay, by_constant = omega, omega / (1.0 + np.square(omega * constant))
-        first, second = -(by_delay * turned.imag).sum(), -(by_constant * turned.imag).sum()
-        own, shared, other = (
-            (size * by_delay**2).sum(),
-            (size * by_delay * by_constant).sum(),
-            (size * by_constant**2).sum(),
-        )
+        by_delay = omega
+        by_constant = omega / (1.0 + np.square(omega * constant))
+        first = -(by_delay * turned.imag).sum()
+        second = -(by_constant * turned.imag).sum()
+        own = (size * by_delay**2).sum()
+        shared = (size * by_delay * by_constant).sum()
+        other = (size * by_constant**2).sum()
         if own <= 0.0:
             break
         determinant = own * other * (1.0 + 1e-6) - shared * shared
-        step, change = first / own, 0.0
+        step = first / own
+        change = 0.0
         if low_pass and determinant > 0.0:
             moved = (own * second - shared * first) / determinant
             if constant > 0.0 or moved > 0.0:
-                step, change = (other * first - shared * second) / determinant, moved
-        step, change = min(max(step, -0.1), 0.1), min(max(change, -0.5), 0.5)
-        delay, constant = (
-            min(max(delay + step, -LARGEST_LAG), LARGEST_LAG),
-            min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT),
-        )
+                step = (other * first - shared * second) / determinant
+                change = moved
+        step = min(max(step, -0.1), 0.1)
+        change = min(max(change, -0.5), 0.5)
+        delay = min(max(delay + step, -LARGEST_LAG), LARGEST_LAG)
+        constant = min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT)
         if abs(step) + abs(change) < 1e-7:
             break
     return float(delay), float(constant)

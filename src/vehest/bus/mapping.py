@@ -48,7 +48,8 @@ def from_dataset(
     Raises `ConfigurationError`: the data set is of another source, or declares no such channel. Raises `MissingError`: there is no DBC.
     Raises `DataError`: it cannot be used, lacks a signal, or contradicts a declared unit.
     """
-    where, declared = f"data set '{dataset.get('name')}'", dataset.get("channels") or {}
+    where = f"data set '{dataset.get('name')}'"
+    declared = dataset.get("channels") or {}
     if dataset.get("source") != "can":
         raise ConfigurationError(
             f"{where} is of source '{dataset.get('source')}'; a bus needs one of source 'can'"
@@ -73,7 +74,8 @@ def from_dataset(
     database, wanted = source.wanted()
     factors = {}
     for name, own in wanted.items():
-        column, unit = source.channels[name], CHANNELS[name].unit
+        column = source.channels[name]
+        unit = CHANNELS[name].unit
         if dataset.get("file_units") != "ignore":
             where = f"'{database.file}': signal '{own.signal}' for channel '{name}'"
             require_unit(
@@ -108,7 +110,8 @@ def from_names(
         f"no signal of '{dbc}' is called so; name one: --signals CHANNEL=MESSAGE.SIGNAL",
     )
     for name, entry in entries.items():
-        column, si_unit = entry["column"], CHANNELS[name].unit
+        column = entry["column"]
+        si_unit = CHANNELS[name].unit
         written = entry.get("unit") or units.get(column, si_unit)
         entry["unit"] = plain_unit(written)
         if entry["unit"] in (None, "another unit"):

@@ -14,7 +14,8 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.files import writing_error
 from vehest.trust.health import reason_in_words
 
-FIRST, LAST = ("vy", "sideslip"), ("band_vy", "band_sideslip", "health", "health_reason")
+FIRST = ("vy", "sideslip")
+LAST = ("band_vy", "band_sideslip", "health", "health_reason")
 
 
 def output_files(path: Path | None) -> list[Path]:

@@ -124,19 +124,15 @@ class Replay:
                 raise ConfigurationError(
                     f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id"
                 )
-        self.log, self.signals, self.bus, self.frames, self.stopped = (
-            log,
-            signals,
-            bus,
-            frames,
-            stopped,
-        )
-        self.timing, self.first, self.sampler, self.figures = (
-            timing,
-            timing.first,
-            Sampler(timing),
-            Figures(),
-        )
+        self.log = log
+        self.signals = signals
+        self.bus = bus
+        self.frames = frames
+        self.stopped = stopped
+        self.timing = timing
+        self.first = timing.first
+        self.sampler = Sampler(timing)
+        self.figures = Figures()
         self.channels_of = channels_by_message(signals.wanted)
         self.speed = bus.speed or 1.0
         self.begin = 0.0  # time of the clock on the wall at the first frame [s]
@@ -152,7 +148,8 @@ class Replay:
         Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
         """
         names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
-        self.stepper, self.view = make_stepper(), view
+        self.stepper = make_stepper()
+        self.view = view
         horizon = self.stepper.horizon_steps / self.stepper.estimator.settings.rate_hz
         self.ahead = horizon - self.stepper.delay - self.timing.offset
         with (
@@ -268,7 +265,8 @@ class Replay:
     def _advance(self, now: float) -> None:
         """Deal with the samples whose instant lies before now [s]."""
         while self.sampler.next_time < now:
-            sample, started = self.sampler.sample(), time.perf_counter()
+            sample = self.sampler.sample()
+            started = time.perf_counter()
             self._estimate(sample)
             took = (
                 time.perf_counter() - started
@@ -288,7 +286,8 @@ class Replay:
             self.output.estimate(sample.time + self.ahead, sample.time, values)
 
     def _count(self, sample: Sample, took: float) -> None:
-        figures, cycle = self.figures, self.sampler.cycle
+        figures = self.figures
+        cycle = self.sampler.cycle
         figures.seconds = figures.samples * cycle
         figures.samples += 1
         figures.latest_ms = max(figures.latest_ms, 1e3 * took)

@@ -90,7 +90,8 @@ class Sampler:
     """Forms samples; frames are to come in the order of their stamps. ``next_time`` is the instant of the next sample [s]."""
 
     def __init__(self, timing: Timing) -> None:
-        self.timing, self.cycle = timing, 1.0 / timing.rate_hz
+        self.timing = timing
+        self.cycle = 1.0 / timing.rate_hz
         self.next_time = timing.start
         self._limits = {
             name: max(period, self.cycle) + SLACK for name, period in timing.periods.items()
@@ -102,7 +103,8 @@ class Sampler:
     def take(self, values: Mapping[str, float], stamp: float) -> None:
         """Take what a frame carries, channel -> value [SI]; one that was stamped before the last sample counts for the next."""
         for name, value in values.items():
-            self._values[name], self._stamps[name] = value, stamp
+            self._values[name] = value
+            self._stamps[name] = stamp
         if self.timing.clock in values:
             early = (
                 stamp - self.next_time + self.timing.offset + 0.5 * self.cycle

@@ -41,7 +41,8 @@ class View:
     """Shows a replay on a stream; on None nothing."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        self._stream, self._due = stream, 0.0
+        self._stream = stream
+        self._due = 0.0
 
     def show(self, figures: Figures, values: Mapping[str, float], seconds: float) -> None:
         """Write an estimate's values and figures in a line, if it is time to, ``seconds`` after the first frame."""
@@ -55,10 +56,8 @@ class View:
             else "-"
         )
         yaw_rate = f"yaw rate {values['yaw_rate']:+.3f} rad/s, " if "yaw_rate" in values else ""
-        vy, sideslip = (
-            _with_band(values, "vy", 1.0, "m/s", 3),
-            _with_band(values, "sideslip", 180.0 / math.pi, "°", 2),
-        )
+        vy = _with_band(values, "vy", 1.0, "m/s", 3)
+        sideslip = _with_band(values, "sideslip", 180.0 / math.pi, "°", 2)
         self._stream.write(
             f"time {seconds:.1f} s, v {vy}, β {sideslip}, "
             f"{yaw_rate}health {health}, {figures.estimates} estimates, {figures.samples} samples, {figures.samples_lost} lost, "
@@ -70,7 +69,8 @@ class View:
 def _with_band(
     values: Mapping[str, float], name: str, factor: float, unit: str, digits: int
 ) -> str:
-    value, band = values.get(name, math.nan), values.get(f"band_{name}", math.nan)
+    value = values.get(name, math.nan)
+    band = values.get(f"band_{name}", math.nan)
     if math.isnan(value):
         return "-"
     return (

@@ -67,12 +67,14 @@ def derivation_of(
     if channel == "steer" and "handwheel" in channels:
         return Derivation(("handwheel",), ({"name": "steering_ratio", "ratio": None},))
     of: tuple[str, ...] = ()
-    speed, entry = "vx", dict[str, Any](name="acceleration_from_speed")
+    speed = "vx"
+    entry = dict[str, Any](name="acceleration_from_speed")
     if channel == "ax" and "vx" not in gappy:
         if rate_hz <= 2.0 * AccelerationFromSpeed.cutoff_hz:
             entry["cutoff_hz"] = SHARE_OF_RATE * rate_hz
     elif channel == "vy_ref" and "sideslip_ref" in channels:
-        of, speed = ("sideslip_ref",), "vx_ref" if "vx_ref" in channels else "vx"
+        of = ("sideslip_ref",)
+        speed = "vx_ref" if "vx_ref" in channels else "vx"
         entry = {"name": "velocity_from_sideslip"}
     else:
         return None

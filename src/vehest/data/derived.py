@@ -139,16 +139,16 @@ class SpeedFromWheels:
             )
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
         step = 1.0 / recording.rate_hz
-        most, patience = (
-            self.most_acceleration * step,
-            round(min(self.hold_seconds * recording.rate_hz, len(recording))),
-        )
+        most = self.most_acceleration * step
+        patience = round(min(self.hold_seconds * recording.rate_hz, len(recording)))
         number = counts.sum(0)
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
         ahead = (
             np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         )
-        vx, held, now = np.empty(len(recording)), 0, math.nan
+        vx = np.empty(len(recording))
+        held = 0
+        now = math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
             held = 0 if agreeing >= enough else held + 1
@@ -188,7 +188,8 @@ class AccelerationFromSpeed:
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``. Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate."""
-        speed, rate = recording[self.channel], recording.rate_hz
+        speed = recording[self.channel]
+        rate = recording.rate_hz
         if np.isnan(speed).any():
             raise DataError(
                 f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it"
@@ -219,7 +220,8 @@ class VelocityFromSideslip:
 
         At standstill, where the angle means nothing, 90 degrees and more become 0.
         """
-        angle, speed = recording["sideslip_ref"], speed_of_reference(recording)
+        angle = recording["sideslip_ref"]
+        speed = speed_of_reference(recording)
         beyond = np.abs(angle) >= 0.5 * np.pi
         moving = beyond & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
         if moving.any():

@@ -62,20 +62,16 @@ class Estimate:
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
-        where, lengths = (
-            f"estimate of '{self.recording_id}'",
-            {len(values) for values in self.channels.values()},
-        )
+        where = f"estimate of '{self.recording_id}'"
+        lengths = {len(values) for values in self.channels.values()}
         for name in self.channels.keys() - QUANTITIES.keys():
             raise DataError(f"{where}: unknown quantity '{name}'")
         if len(lengths) != 1:
             raise DataError(
                 f"{where}: quantities must have one common length, not {sorted(lengths)}"
             )
-        n_rows, shape = (
-            len(self.covariance_of),
-            None if self.covariance is None else self.covariance.shape,
-        )
+        n_rows = len(self.covariance_of)
+        shape = None if self.covariance is None else self.covariance.shape
         if (
             shape != ((len(self), n_rows, n_rows) if n_rows else None)
             or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows
@@ -114,7 +110,8 @@ class Estimate:
             raise DataError(
                 f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}"
             )
-        index, rows = self._held_index(times), [self.covariance_of.index(name) for name in names]
+        index = self._held_index(times)
+        rows = [self.covariance_of.index(name) for name in names]
         return np.where(
             index[:, None, None] < 0, np.nan, self.covariance[index][:, rows][:, :, rows]
         )

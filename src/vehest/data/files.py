@@ -114,10 +114,8 @@ def no_room(error: BaseException) -> OSError | None:
 
 def writing_error(path: Path, error: OSError) -> VehestError:
     """The one-line error for a failure to write to ``path``."""
-    path, full = (
-        Path(*(_ASIDE.sub("", part) for part in path.parts)),
-        no_room(error),
-    )  # as it is called in the end
+    path = Path(*(_ASIDE.sub("", part) for part in path.parts))
+    full = no_room(error)  # as it is called in the end
     if full is not None:
         return MissingError(
             f"no room left to write '{path}' ({full.strerror}); free some space and run again"

@@ -94,7 +94,8 @@ def _joined(
     for place, (span, own) in enumerate(joined):
         before = place > 0 and _touch(joined[place - 1][0], span)
         after = place + 1 < len(joined) and _touch(span, joined[place + 1][0])
-        start, stop = span.start + gap * before, span.stop - gap * after
+        start = span.start + gap * before
+        stop = span.stop - gap * after
         if own == role and start < stop:
             spans.append(replace(span, start=start, stop=stop))
     return tuple(spans)

@@ -29,10 +29,8 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     Args:
         recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks them.
     """
-    speed, turning = (
-        _first_of(recording, "vx", "vx_ref"),
-        _first_of(recording, "yaw_rate", "yaw_rate_ref"),
-    )
+    speed = _first_of(recording, "vx", "vx_ref")
+    turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")
     distance = np.cumsum(np.maximum(speed, 0.0)) / recording.rate_hz
     heading = np.cumsum(np.where(speed > 0.0, turning, 0.0)) / recording.rate_hz
     if len(recording) < 16 or not distance[-1] > 0.0:
@@ -94,11 +92,10 @@ def _correlations(samples: FloatArray) -> FloatArray:
     )
     lags = np.arange(number // 2 + 1)
     left = number - lags
-    first_sum, second_sum = sums[left], sums[number] - sums[lags]
-    first_square, second_square = (
-        squares[left] - first_sum**2 / left,
-        squares[number] - squares[lags] - second_sum**2 / left,
-    )
+    first_sum = sums[left]
+    second_sum = sums[number] - sums[lags]
+    first_square = squares[left] - first_sum**2 / left
+    second_square = squares[number] - squares[lags] - second_sum**2 / left
     scatter = np.sqrt(np.maximum(first_square * second_square, 0.0))
     together = products[: len(lags)] - first_sum * second_sum / left
     return np.divide(
@@ -108,7 +105,8 @@ def _correlations(samples: FloatArray) -> FloatArray:
 
 def _boundaries(curvature: FloatArray, period: int) -> list[int]:
     """Points at which laps begin: each a period after the one before, moved to where the two laps fit best."""
-    bounds, reach = [0], max(round(SEARCH * period), 1)
+    bounds = [0]
+    reach = max(round(SEARCH * period), 1)
     while bounds[-1] + period < len(curvature):
         last = bounds[-1]
         length = min(

@@ -70,7 +70,8 @@ def number_batches(
             raise DataError(
                 f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed"
             )
-    n_rows, done = file.metadata.num_rows, 0
+    n_rows = file.metadata.num_rows
+    done = 0
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
     check_unpacked(path, path.stat().st_size, 8 * n_rows * len(names))
     for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(names), use_threads=False):
@@ -86,7 +87,8 @@ def read_numbers(
     path: Path, file: pq.ParquetFile, names: Sequence[str]
 ) -> dict[str, NDArray[np.float64]]:
     """Columns of `number_batches`, float64 of shape (T,), missing values NaN."""
-    values, done = {name: np.empty(0) for name in names}, 0
+    values = {name: np.empty(0) for name in names}
+    done = 0
     for batch in number_batches(path, file, names):
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
             if not done:

@@ -163,14 +163,17 @@ _WANTED = {
 def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: list[str]) -> str:
     """The first error of pydantic in one line, with the other choices of its union."""
     errors = problem.errors(include_url=False)
-    error, loc, shown = errors[0], errors[0]["loc"], _shown(errors[0]["input"])
+    error = errors[0]
+    loc = errors[0]["loc"]
+    shown = _shown(errors[0]["input"])
     path = [*_path(loc, [content])[1:], *(loc[-1:] if error["type"] == "missing" else ())]
     name = ".".join(str(part) for part in [*group, *path]) or "it"
     match error["type"]:
         case "missing":
             return f"{name} is missing"
         case "unexpected_keyword_argument":
-            beside, known = name.rpartition(".")[0], _keys_of(_type_at(kind, path[:-1]))
+            beside = name.rpartition(".")[0]
+            known = _keys_of(_type_at(kind, path[:-1]))
             return (
                 f"{name} is not an option of {beside}; options: {known}"
                 if beside
@@ -183,7 +186,8 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
             return f"{name}: {error['ctx']['error']}"
         case other if other not in _WANTED:
             return f"{name}: {error['msg'][:1].lower()}{error['msg'][1:]}, not {shown}"
-    here, is_choice = _type_at(kind, path), len(loc) > len(path) + 1
+    here = _type_at(kind, path)
+    is_choice = len(loc) > len(path) + 1
     kinds = (
         [own["type"] for own in errors if own["loc"][:-1] == loc[:-1]]
         if is_choice

@@ -93,7 +93,8 @@ def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
         if not isinstance(entries, str):
             return entries
         if (share := PERCENT.fullmatch(entries)) is not None:
-            begin, done = done, done + float(share[1])
+            begin = done
+            done = done + float(share[1])
             if done > 100.0 + 1e-9:
                 raise ConfigurationError(
                     f"{where}: the percentages come to {done:g} %, more than there is"
@@ -151,10 +152,12 @@ def _seconds_of(spans: Iterable[Span]) -> float:
 
 def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
     """Pieces of ranges laid end to end that lie between two times of that line [s]."""
-    found, position = [], 0.0
+    found = []
+    position = 0.0
     for span in spans:
         length = span.stop - span.start
-        start, stop = max(begin - position, 0.0), min(end - position, length)
+        start = max(begin - position, 0.0)
+        stop = min(end - position, length)
         if stop - start > 1e-9:
             found.append(replace(span, start=span.start + start, stop=span.start + stop))
         position += length
@@ -163,17 +166,18 @@ def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
 
 class _Ranges:
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
-        self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
+        self._file = file
+        self._catalogue = catalogue
+        self._where = f"split '{file.name}'"
         self._known: dict[str, Mapping[str, Reader]] = {}
 
     def split(self) -> Split:
         """The split of the ranges, or of one fold of a cross-validation."""
-        file, folds = self._file, self._file.folds
+        file = self._file
+        folds = self._file.folds
         if folds is None:
-            train, validation = (
-                self._spans("train", file.train),
-                self._spans(VALIDATION, file.validation),
-            )
+            train = self._spans("train", file.train)
+            validation = self._spans(VALIDATION, file.validation)
             tests = {test: self._spans(test, entries) for test, entries in file.tests.items()}
             return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
@@ -192,7 +196,8 @@ class _Ranges:
 
     def limited(self, split: Split) -> Split:
         """The split with fewer minutes to learn from, of which validation keeps its share."""
-        minutes, at = self._file.minutes, self._file.minutes_at
+        minutes = self._file.minutes
+        at = self._file.minutes_at
         if minutes is None:
             return split
         train, validation = (

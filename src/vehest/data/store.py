@@ -87,7 +87,8 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
     columns, described = _read(
         path, RecordingDescription, None if channels is None else list(channels)
     )
-    gappy, about = described.gappy & columns.keys(), _attributes(described, _OF_RECORDING)
+    gappy = described.gappy & columns.keys()
+    about = _attributes(described, _OF_RECORDING)
     try:
         return Recording(channels=columns, gappy=gappy, provenance=described.provenance, **about)
     except DataError as error:
@@ -121,7 +122,8 @@ def write_estimate_parts(parts: Iterable[Estimate], path: Path) -> None:
 
 def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
     """Time, quantities and entries of the covariance of each part of an estimate, on one clock."""
-    done, start = 0, None
+    done = 0
+    start = None
     for part in parts:
         start = part.start_time if start is None else start
         columns = {
@@ -143,7 +145,8 @@ def read_estimate(path: Path) -> Estimate:
     Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged or not an estimate.
     """
     columns, described = _read(path, EstimateDescription)
-    covariance, n_states = None, described.n_states
+    covariance = None
+    n_states = described.n_states
     try:
         del columns["time"]
         if n_states is not None:

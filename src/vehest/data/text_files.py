@@ -93,7 +93,8 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
     """Rows of a CSV file whose first line names its columns, such as vehest writes them; `DataError` if one is missing or short."""
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
-        rows, header = list(reader), list(reader.fieldnames or [])
+        rows = list(reader)
+        header = list(reader.fieldnames or [])
     except (csv.Error, ValueError) as error:
         raise DataError(f"'{path}' cannot be read as CSV ({first_line(error)})") from None
     for name in columns:

@@ -85,7 +85,8 @@ class Resample:
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
             what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
             raise DataError(f"recording '{recording.id}': {what}")
-        up, down = ratio.numerator, ratio.denominator
+        up = ratio.numerator
+        down = ratio.denominator
         if up == down:
             return recording
         if self.method == "decimate":
@@ -102,7 +103,8 @@ class Resample:
                 length,
                 f"recording '{recording.id}': resampling by {up}/{down} needs a filter of {length} samples",
             )
-            names, taps = _without_gaps(recording, tuple(recording.channels)), self._taps(up, down)
+            names = _without_gaps(recording, tuple(recording.channels))
+            taps = self._taps(up, down)
             n_out = -(-len(recording) * up // down)
             channels = {name: _resampled(recording[name], up, down, taps, n_out) for name in names}
         return replace(recording, rate_hz=self.rate_hz, channels=channels)
@@ -110,7 +112,8 @@ class Resample:
     @classmethod
     def reach(cls, ratio: Fraction) -> int:
         """How many samples before or after it a sample depends on at most, in whole steps of the new clock."""
-        up, down = ratio.numerator, ratio.denominator
+        up = ratio.numerator
+        down = ratio.denominator
         return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
 
     def _taps(self, up: int, down: int) -> FloatArray:
@@ -156,7 +159,8 @@ class LowPass:
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels; errors where one is missing or has gaps, or the cut-off does not suit the rate or the limits."""
-        where, rate_hz = f"recording '{recording.id}'", recording.rate_hz
+        where = f"recording '{recording.id}'"
+        rate_hz = recording.rate_hz
         if not 0 < self.cutoff_hz < rate_hz / 2:
             raise ConfigurationError(
                 f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz"
@@ -245,7 +249,8 @@ class BridgeImpossible:
     def __call__(self, recording: Recording) -> Recording:
         """Bridge them; a channel with more than a tenth of them stays, whose unit is then wrong."""
         around = np.ones(2 * round(self.beside * recording.rate_hz) + 1)
-        places, changed = np.arange(len(recording)), {}
+        places = np.arange(len(recording))
+        changed = {}
         for name, samples in recording.channels.items():
             beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
             if (
@@ -280,8 +285,10 @@ class MountingCorrection:
         ax, ay, yaw_rate = (
             recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate"))
         )
-        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
+        cosine = math.cos(self.yaw)
+        sine = math.sin(self.yaw)
+        rotated_x = cosine * ax - sine * ay
+        rotated_y = sine * ax + cosine * ay
         if self.lever_x or self.lever_y:
             yaw_acceleration = derivative(yaw_rate, recording.rate_hz)
             rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
@@ -334,11 +341,13 @@ class DelayCorrection:
 
     def __call__(self, recording: Recording) -> Recording:
         """Shift the channels, and cut the recording to the samples that then exist."""
-        length, position = len(recording), self.delay * recording.rate_hz
+        length = len(recording)
+        position = self.delay * recording.rate_hz
         whole = round(min(max(position, -length), length))
         fraction = position - whole
         reach = 0 if abs(fraction) < 1e-9 else self.reach
-        first, last = max(reach - whole, 0), length - max(reach + whole, 0)
+        first = max(reach - whole, 0)
+        last = length - max(reach + whole, 0)
         if first >= last:
             raise DataError(
                 f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s"
@@ -473,18 +482,17 @@ def _compiled_sums() -> Callable[..., None]:
 
 def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
     """Add what each sample gives to the outputs; ``newest``: place of the first output's last tap on the grid of up times the rate."""
-    down, sums = len(rows), np.empty(OUTPUTS_AT_ONCE)
+    down = len(rows)
+    sums = np.empty(OUTPUTS_AT_ONCE)
     for begin in range(0, len(filtered), OUTPUTS_AT_ONCE * up):
         for phase in range(min(up, len(filtered) - begin)):
             count = min((len(filtered) - begin - phase + up - 1) // up, OUTPUTS_AT_ONCE)
             sums[:] = 0.0
             last = newest + phase * down
             for sample in range(-((len(taps) - 1 - last) // up), last // up + 1):
-                row, first, tap = (
-                    rows[sample % down],
-                    np.uint64(sample // down + begin // up),
-                    taps[last - up * sample],
-                )
+                row = rows[sample % down]
+                first = np.uint64(sample // down + begin // up)
+                tap = taps[last - up * sample]
                 for i in range(count):
                     sums[i] += row[first + np.uint64(i)] * tap
             for i in range(count):

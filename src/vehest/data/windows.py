@@ -35,7 +35,10 @@ def windows_of(
 ) -> WindowSet:
     """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1); raises `DataError` for gaps or no windows."""
     check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
-    series, targets, starts, offset = [], [], [], 0
+    series = []
+    targets = []
+    starts = []
+    offset = 0
     for recording in recordings:
         for name in (*channels, target):
             if name in recording.gappy and np.isnan(recording[name]).any():

@@ -165,15 +165,14 @@ class Estimator(ABC):
         cls.settings_type = make_dataclass(
             "settings_type", described, bases=tuple(bases), frozen=True
         )
-        cls.settings_type.__module__, cls.settings_type.__qualname__ = (
-            cls.__module__,
-            f"{cls.__qualname__}.settings_type",
-        )
+        cls.settings_type.__module__ = cls.__module__
+        cls.settings_type.__qualname__ = f"{cls.__qualname__}.settings_type"
         for name in own:
             setattr(cls, name, property(attrgetter(f"settings.{name}")))
 
     def __init__(self, settings: Any) -> None:
-        self.settings, self._seed = settings, 0
+        self.settings = settings
+        self._seed = 0
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
         self.check()
 
@@ -391,7 +390,8 @@ class Estimator(ABC):
         self.require_fitted()
         samples = recording.stack(self.channels)
         found, _ = self.run(samples, self.first_state(samples[0], dict(initial_state or {})))
-        covariance, innovations = found.pop("covariance", None), found.pop("innovations", None)
+        covariance = found.pop("covariance", None)
+        innovations = found.pop("innovations", None)
         if innovations is not None:
             found["nis"], found["nis_dof"] = innovations()
         return self._wrapped(
@@ -448,7 +448,8 @@ class RunStepper(Stepper):
         state = self._state if self._started else estimator.first_state(row, {})
         found, self._state = estimator.run(row[None], state)
         self._started = True
-        covariance, _ = found.pop("covariance", None), found.pop("innovations", None)
+        covariance = found.pop("covariance", None)
+        _ = found.pop("innovations", None)
         values = {name: quantity.item(0) for name, quantity in found.items()}
         if covariance is not None:
             row_of_vy = estimator.covariance_of.index("vy")

@@ -44,7 +44,8 @@ START = (
 )  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
 SATURATED = 20.0  # of which the logistic function is 1
-DISTRUST, PROCESS = 1, [2, 3]  # which outputs they are
+DISTRUST = 1
+PROCESS = [2, 3]  # which outputs they are
 MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
 
 
@@ -114,7 +115,8 @@ class CnnUkf(NetworkUkf):
     estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
     """
 
-    name, title = "cnn_ukf", "UKF-informed network"
+    name = "cnn_ukf"
+    title = "UKF-informed network"
     trials = (
         Trial(
             13,
@@ -223,7 +225,8 @@ class CnnUkf(NetworkUkf):
     def _hold(self, network: SampleNetwork) -> list[RemovableHandle]:
         """Take heads away: what is held has no weights and no gradient, so that the network is of the usual shape and says constants."""
         s = self
-        held_weights, held_biases = [], []
+        held_weights = []
+        held_biases = []
         if not (s.adaptive_distrust and s.pseudo_measurement):
             held_weights.append(DISTRUST)
         if not s.pseudo_measurement:
@@ -251,7 +254,8 @@ class CnnUkf(NetworkUkf):
         self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
     ) -> Phase:
         """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
-        network, dropout = self.network, self.dropout
+        network = self.network
+        dropout = self.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
             found = self.output_of(outputs)
@@ -289,12 +293,10 @@ class EndToEnd:
         recordings: Sequence[Recording],
         training: EndToEndSettings,
     ) -> None:
-        self.estimator, self.samples, self.recordings, self.training = (
-            estimator,
-            samples,
-            recordings,
-            training,
-        )
+        self.estimator = estimator
+        self.samples = samples
+        self.recordings = recordings
+        self.training = training
         self.filter = TrackFilter(estimator.track())
         self.sensors = estimator.noise_covariances(estimator.levels)[1]
         self.lengths = [len(recording) for recording in recordings]
@@ -360,10 +362,8 @@ class EndToEnd:
         found = estimator.output_of(outputs)
         initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
         measurements = torch.cat([batch.measured, found.sideslip.unsqueeze(-1)], -1)
-        process, noise = (
-            torch.diag_embed(found.process.square()),
-            with_variance(self.sensors[batch.trusted.long()], found.variance),
-        )
+        process = torch.diag_embed(found.process.square())
+        noise = with_variance(self.sensors[batch.trusted.long()], found.variance)
         filtered = self.filter.filtered(
             measurements, batch.driven, process, noise, initial
         ).steps.filtered

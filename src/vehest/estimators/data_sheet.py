@@ -21,7 +21,8 @@ class DataSheet(Recursive):
     Dynamics, 1995); 10 is assumed where nothing better is known.
     """
 
-    name, title = "data_sheet", "Data sheet"
+    name = "data_sheet"
+    title = "Data sheet"
     trials = (
         Trial(
             1,

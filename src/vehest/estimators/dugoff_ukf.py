@@ -162,7 +162,8 @@ class DugoffUkf(SigmaPointEstimator):
     Source: Bertipaglia et al. 2024, Sections III-B and IV-C.
     """
 
-    name, title = "dugoff_ukf", "UKF with Dugoff tyres"
+    name = "dugoff_ukf"
+    title = "UKF with Dugoff tyres"
     trials = (
         Trial(
             9,
@@ -407,7 +408,8 @@ class DugoffUkf(SigmaPointEstimator):
         sums: list[tuple[float, int]] = []
         for rows, steps in self.filtered(recordings, levels=levels, pseudo=pseudo):
             for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
-                vx, reference = recordings[row]["vx"], reference_sideslip(recordings[row])
+                vx = recordings[row]["vx"]
+                reference = reference_sideslip(recordings[row])
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
                 counted = (vx >= self.minimum_speed) & np.isfinite(reference)
                 counted[:skip] = False
@@ -437,7 +439,8 @@ class DugoffUkf(SigmaPointEstimator):
                     "nis": nis[place, :n].copy(),
                     "nis_dof": dof[place, :n].copy(),
                 }
-                vy, own = mean[place, :n, 0].copy(), covariance[place, :n].copy()
+                vy = mean[place, :n, 0].copy()
+                own = covariance[place, :n].copy()
                 estimates[row] = self._wrapped(recordings[row], vy, own, TRACK_STATES, **others)
         return [estimates[row] for row in range(len(recordings))]
 
@@ -463,7 +466,8 @@ class DugoffUkf(SigmaPointEstimator):
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [self.taken(recordings[row].stack(self.channels)) for row in rows]
-            seen, steps_noise = [part[0] for part in parts], process
+            seen = [part[0] for part in parts]
+            steps_noise = process
             if pseudo is not None:
                 own = [pseudo[row] for row in rows]
                 seen = [
@@ -550,11 +554,13 @@ class DugoffUkf(SigmaPointEstimator):
             memory |= {"process": process, "noise": process, "sensors": sensors, "trusts": False}
         measurements, inputs = (part[0] for part in self.taken(sample[None]))
         memory["trusts"] = bool(self.trusts_forces(measurements[:1], memory["trusts"])[0])
-        noise, process = memory["sensors"][int(memory["trusts"])], memory["noise"]
+        noise = memory["sensors"][int(memory["trusts"])]
+        process = memory["noise"]
         memory["noise"] = memory["process"]
         measurements, noise = self.with_pseudo(sample, measurements, noise, memory)
         if inputs[0] < self.minimum_speed:
-            measurements, memory["noise"] = np.full_like(measurements, np.nan), ROLLING
+            measurements = np.full_like(measurements, np.nan)
+            memory["noise"] = ROLLING
         return FilterStep(measurements, inputs, process[None], noise[None])
 
     def with_pseudo(
@@ -595,7 +601,8 @@ class DugoffUkf(SigmaPointEstimator):
     def c_values(self) -> dict[str, Any]:
         """The filter alone."""
         s = self.settings
-        car, forces = s.car, s.inputs == "full"
+        car = s.car
+        forces = s.inputs == "full"
         wheelbase = car.cg_to_front_axle + car.cg_to_rear_axle
         process, sensors = self.noise_covariances(self.levels)
         measured = 4 if forces else 2  # forces that are never measured need no row

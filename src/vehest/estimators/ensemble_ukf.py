@@ -64,7 +64,8 @@ class EnsembleUkf(NetworkUkf):
     predictive uncertainty estimation using deep ensembles, 2017.
     """
 
-    name, title = "ensemble_ukf", "UKF with a deep ensemble"
+    name = "ensemble_ukf"
+    title = "UKF with a deep ensemble"
     trials = (
         Trial(
             12,
@@ -146,7 +147,8 @@ class EnsembleUkf(NetworkUkf):
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""
-        outputs, unit = self.network.outputs(inputs), float(self.network.unit)
+        outputs = self.network.outputs(inputs)
+        unit = float(self.network.unit)
         variance = outputs[..., 0].var(axis=0)
         if self.variance == "mixture":
             variance = variance + np.logaddexp(outputs[..., 1], 0.0).mean(axis=0)

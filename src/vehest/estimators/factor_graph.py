@@ -66,7 +66,8 @@ class FactorGraph(SideslipFilter):
     deviations are. The window's estimate here is that of its newest sample, with that sample's measurements.
     """
 
-    name, title = "factor_graph", "Factor graph"
+    name = "factor_graph"
+    title = "Factor graph"
     trials = (
         Trial(
             10,
@@ -134,12 +135,12 @@ class FactorGraph(SideslipFilter):
 
     def run(self, samples: FloatArray, state: WindowState) -> tuple[dict[str, Any], WindowState]:  # type: ignore[override]
         """Lateral velocity [m/s] and yaw rate [rad/s]: of all samples together, or window by window."""
-        rows, start, refused = (
-            np.vstack([state.samples, samples]),
-            state.start,
-            state.refused.copy(),
-        )
-        model, behind, full = self.linear_model(rows), len(state.samples), self.intervals + 1
+        rows = np.vstack([state.samples, samples])
+        start = state.start
+        refused = state.refused.copy()
+        model = self.linear_model(rows)
+        behind = len(state.samples)
+        full = self.intervals + 1
         if self.causal:
             states = np.empty((len(samples), 2))
             for k in range(len(samples)):
@@ -159,16 +160,16 @@ class FactorGraph(SideslipFilter):
         """Model of samples of ``channels``, (T, 4); yaw rate and a_y are measured."""
         _, vx, _, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
-        steps, noise = len(samples), self.noise
+        steps = len(samples)
+        noise = self.noise
         observation = np.zeros((steps, 2, 2))
-        observation[:, 0, 1], observation[:, 1] = 1.0, C
+        observation[:, 0, 1] = 1.0
+        observation[:, 1] = C
         offset = np.stack([np.zeros(steps), D * steer], axis=1)
         process = np.diag(np.square([noise.model_sideslip, noise.model_yaw_rate]))
         measured = np.square([noise.measured_yaw_rate, noise.measured_ay])
-        process, measured = (
-            np.broadcast_to(process, (steps, 2, 2)),
-            np.broadcast_to(measured, (steps, 2)),
-        )
+        process = np.broadcast_to(process, (steps, 2, 2))
+        measured = np.broadcast_to(measured, (steps, 2))
         return LinearModel(A, B * steer[:, None], process, observation, offset, measured)
 
     def solve_window(
@@ -186,10 +187,8 @@ class FactorGraph(SideslipFilter):
         filtered = kalman_scan(model, samples[:, MEASURED], start)
         gate = self.gate_in_use()
         if gate is not None:
-            errors, variances = (
-                filtered.innovation[-1],
-                filtered.innovation_covariance[-1].diagonal(),
-            )
+            errors = filtered.innovation[-1]
+            variances = filtered.innovation_covariance[-1].diagonal()
             for i, column in enumerate(MEASURED):
                 if filtered.measured[-1, i] and refuses(
                     errors[i], variances[i], gate.deviations**2, gate.patience, refused, i

@@ -38,7 +38,8 @@ class GruNetwork(RecurrentNetwork):
 class Gru(RecurrentEstimator):
     """GRU benchmark."""
 
-    name, title = "gru", "GRU"
+    name = "gru"
+    title = "GRU"
     trials = (TRIAL,)
     network_type = GruNetwork
     style = "#8e24aa", "solid", "D"

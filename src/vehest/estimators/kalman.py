@@ -90,7 +90,8 @@ class KalmanFilter(SideslipFilter):
     Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public code.
     """
 
-    name, title = "kalman", "Kalman filter"
+    name = "kalman"
+    title = "Kalman filter"
     trials = (Trial(5, "Kalman filter over a single track; only noise levels are learnt", "{car}"),)
     learns_from = ()
     may_be_nan = LEVELS
@@ -181,26 +182,26 @@ class KalmanFilter(SideslipFilter):
         """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ - b_δ."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
-        offsets, steps = self.offsets, len(samples)
+        offsets = self.offsets
+        steps = len(samples)
         n = 2 + len(offsets.given)
-        transition, noise, observation = (
-            np.zeros((steps, n, n)),
-            np.zeros((steps, n, n)),
-            np.zeros((steps, 2, n)),
-        )
+        transition = np.zeros((steps, n, n))
+        noise = np.zeros((steps, n, n))
+        observation = np.zeros((steps, 2, n))
         spread = self.values["steer"] * self.noise.steer_factor * B
-        transition[:, :2, :2], noise[:, :2, :2] = A, spread[:, :, None] * spread[:, None, :]
-        observation[:, 0, :2], observation[:, 1, 1] = C, 1.0
+        transition[:, :2, :2] = A
+        noise[:, :2, :2] = spread[:, :, None] * spread[:, None, :]
+        observation[:, 0, :2] = C
+        observation[:, 1, 1] = 1.0
         kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
         for row, name in enumerate(offsets.given, 2):
-            transition[:, row, row], noise[:, row, row] = (
-                kept,
-                getattr(offsets, name) ** 2 * (1.0 - kept**2),
-            )
+            transition[:, row, row] = kept
+            noise[:, row, row] = getattr(offsets, name) ** 2 * (1.0 - kept**2)
             if name == "ay":
                 observation[:, 0, row] = 1.0
             else:
-                transition[:, :2, row], observation[:, 0, row] = -B, -D
+                transition[:, :2, row] = -B
+                observation[:, 0, row] = -D
         driven = np.zeros((steps, n))
         driven[:, :2] = B * steer[:, None]
         expected = np.stack([D * steer, np.zeros_like(steer)], axis=1)
@@ -215,13 +216,15 @@ class KalmanFilter(SideslipFilter):
 
     def c_values(self) -> dict[str, Any]:
         """Its car, levels of noise, offsets and gate."""
-        car, kept = self.car, math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
+        car = self.car
+        kept = math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
         offsets = [
             {"name": name, "row": row, "initial": level, "wander": level * math.sqrt(1.0 - kept**2)}
             for row, name in enumerate(self.offsets.given, 2)
             for level in (getattr(self.offsets, name),)
         ]
-        front, rear = car.cornering_stiffness_front, car.cornering_stiffness_rear
+        front = car.cornering_stiffness_front
+        rear = car.cornering_stiffness_rear
         return {
             **super().c_values(),
             "n": 2 + len(offsets),

@@ -15,7 +15,8 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-SHORTEST, LONGEST = 0.02, 200.0  # s, time constants that are looked at
+SHORTEST = 0.02
+LONGEST = 200.0  # s, time constants that are looked at
 N_STARTS = 25  # of a grid over them, in equal ratios, around the best of which the search goes on
 
 
@@ -26,7 +27,8 @@ class Kinematic(Recursive):
     them every slow slide. Between samples the acceleration is held.
     """
 
-    name, title = "kinematic", "Kinematic integration"
+    name = "kinematic"
+    title = "Kinematic integration"
     trials = (Trial(0.2, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate", "ay")
     ignores_initial_state = True
@@ -61,7 +63,8 @@ class Kinematic(Recursive):
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """v [m/s] at each sample, from that one sample before."""
         vx, yaw_rate, ay = samples.T
-        gain, (start,) = (1.0 - self.kept) * self.time_constant, state
+        gain = (1.0 - self.kept) * self.time_constant
+        (start,) = state
         vy = scipy.signal.lfilter(
             [gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start])
         )[0]

@@ -25,7 +25,8 @@ class Ksnn(WindowedEstimator):
     Source: Da Lio et al. 2023; patented (PCT/IT2023/050058).
     """
 
-    name, title = "ksnn", "KS-NN"
+    name = "ksnn"
+    title = "KS-NN"
     trials = (
         Trial(
             2,
@@ -50,7 +51,8 @@ class Ksnn(WindowedEstimator):
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str]:
         """Blue with linear feedback, orange with nonlinear; darker and solid with biases (Da Lio et al. 2023, Fig. 6)."""
-        nonlinear, bias = "nonlinear" in variant, "bias" in variant and "no_bias" not in variant
+        nonlinear = "nonlinear" in variant
+        bias = "bias" in variant and "no_bias" not in variant
         shades = ("#f59a23", "#b8480b") if nonlinear else ("#4aa5e0", "#0b4f9c")
         return shades[bias], "solid" if bias else "dashed", "^" if nonlinear else "o"
 
@@ -92,7 +94,8 @@ class Ksnn(WindowedEstimator):
 
     def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
         """By the compiled recursion alone."""
-        weights, own = self.weights(), self.settings
+        weights = self.weights()
+        own = self.settings
         flat = np.concatenate(
             [
                 weights[name].ravel()

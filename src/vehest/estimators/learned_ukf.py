@@ -134,7 +134,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
     the authors' public code.
     """
 
-    name, title = "learned_ukf", "Learned UKF"
+    name = "learned_ukf"
+    title = "Learned UKF"
     trials: ClassVar[tuple[Trial, ...]] = (
         Trial(
             14,
@@ -430,11 +431,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 .result.mul(steps.innovation)
                 .sum(-1)
             )
-        mean, covariance, dof = (
-            steps.filtered.mean.double().numpy(),
-            steps.filtered.covariance.double().numpy(),
-            steps.measured.sum(-1),
-        )
+        mean = steps.filtered.mean.double().numpy()
+        covariance = steps.filtered.covariance.double().numpy()
+        dof = steps.measured.sum(-1)
         estimates = []
         for row, recording in enumerate(recordings):
             own = {name: mean[row, :, k].copy() for k, name in enumerate(STATES)}

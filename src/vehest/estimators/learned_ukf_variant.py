@@ -16,8 +16,10 @@ class LearnedUkfVariant(LearnedUkf):
     Source: Węgrzynowski et al. 2024, Sections III-B.2 (Eq. 3) and III-B.3.
     """
 
-    name, title = "learned_ukf_variant", "Learned UKF, variant"
-    template, trials = "", ()
+    name = "learned_ukf_variant"
+    title = "Learned UKF, variant"
+    template = ""
+    trials = ()
     correlated_noise: bool = setting(
         True,
         "whether covariances of process and measurements have entries off their diagonals, as in the paper",

@@ -37,7 +37,8 @@ class LstmNetwork(RecurrentNetwork):
 class Lstm(RecurrentEstimator):
     """LSTM benchmark."""
 
-    name, title = "lstm", "LSTM"
+    name = "lstm"
+    title = "LSTM"
     trials = (TRIAL,)
     network_type = LstmNetwork
     style = "#c792dd", "dashed", "v"

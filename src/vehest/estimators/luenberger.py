@@ -40,14 +40,13 @@ def implicit_euler_observer(
     if math.isnan(u):
         u = measurements[0, 1]
     for k in range(measurements.shape[0]):
-        omega, speed, ay, ax = (
-            measurements[k, 0],
-            measurements[k, 1],
-            measurements[k, 2],
-            measurements[k, 3],
-        )
+        omega = measurements[k, 0]
+        speed = measurements[k, 1]
+        ay = measurements[k, 2]
+        ax = measurements[k, 3]
         if abs(omega) < threshold:
-            v, u = 0.0, speed
+            v = 0.0
+            u = speed
         else:
             from_u = step * gain * gain * omega
             from_v = step * omega
@@ -57,7 +56,8 @@ def implicit_euler_observer(
             determinant = damping + from_u * from_v
             v = (damping * right_v - from_u * right_u) / determinant
             u = (right_u + from_v * right_v) / determinant
-        vy[k], vx[k] = v, u
+        vy[k] = v
+        vx[k] = u
 
 
 compiled_observer = numba.njit(cache=True, error_model="numpy")(implicit_euler_observer)
@@ -72,7 +72,8 @@ def observe(
     u: float = math.nan,
 ) -> tuple[FloatArray, FloatArray]:
     """Estimated vy and vx [m/s], each of shape (T,)."""
-    vy, vx = np.empty(len(measurements)), np.empty(len(measurements))
+    vy = np.empty(len(measurements))
+    vx = np.empty(len(measurements))
     compiled_observer(
         np.ascontiguousarray(measurements),
         float(gain),
@@ -92,7 +93,8 @@ class Luenberger(Recursive):
     Source: Da Lio et al. 2023, Appendix A (gains in the order that its Appendix B implies).
     """
 
-    name, title = "luenberger", "Luenberger"
+    name = "luenberger"
+    title = "Luenberger"
     trials = (
         Trial(
             4,
@@ -100,7 +102,8 @@ class Luenberger(Recursive):
             "training.grid=2 training.max_evaluations=100",
         ),
     )
-    channels, states = ("yaw_rate", "vx", "ay", "ax"), ("vy", "vx")
+    channels = ("yaw_rate", "vx", "ay", "ax")
+    states = ("vy", "vx")
     training_type = DirectSearchSettings
     template = "luenberger"
     gain: float = fitted("gain α", start=(3.0, 20.0), box=(0.0, 50.0))

@@ -87,7 +87,8 @@ def load_model(folder: Path) -> Estimator:
     Raises `MissingError`: there is no model. Raises `DataError`: a file is damaged or of another format, the estimator is unknown, a weight
     is not finite, or the weights do not fit the settings.
     """
-    description, path = read_description(folder), folder / DESCRIPTION
+    description = read_description(folder)
+    path = folder / DESCRIPTION
     try:
         kind = estimator_class(description.estimator)
     except ConfigurationError as error:

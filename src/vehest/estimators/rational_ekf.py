@@ -61,10 +61,8 @@ BOXES = {
 }  # powers of ten: ay and steer over yaw_rate, tyres as it is
 EDGE = 0.01  # of a box's width: a search that ends nearer to its end has ended on it
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
-FIRST_SCALE, CALIBRATIONS = (
-    0.01,
-    2,
-)  # rad/s: where the level of the yaw rate starts, and how often it is scaled
+FIRST_SCALE = 0.01
+CALIBRATIONS = 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
 
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -125,7 +123,8 @@ class RationalFilter(SideslipFilter):
     Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60; friction as a state and the unscented filter are beyond it.
     """
 
-    name, title = "rational_ekf", "EKF with tyres"
+    name = "rational_ekf"
+    title = "EKF with tyres"
     trials = (
         Trial(
             6,
@@ -273,7 +272,8 @@ class RationalFilter(SideslipFilter):
         if training.method == "data":
             self.values = self._levels_of(data.train)
         elif self._searched:
-            extended, drives = self._extended(), self._drives(data.train)
+            extended = self._extended()
+            drives = self._drives(data.train)
             search = extended._tune(drives, training, context)
             n = len(self._searched)
             history = search.history(self._searched)
@@ -376,10 +376,13 @@ class RationalFilter(SideslipFilter):
 
         scale = FIRST_SCALE
         for _ in range(CALIBRATIONS):
-            levels, total, count = scaled(scale), 0.0, 0.0
+            levels = scaled(scale)
+            total = 0.0
+            count = 0.0
             for samples, _ in drives:
                 nis, n_measured = self.filter_samples(samples, levels=levels).nis()
-                total, count = total + float(nis.sum()), count + float(n_measured.sum())
+                total = total + float(nis.sum())
+                count = count + float(n_measured.sum())
             if not (math.isfinite(total) and total > 0.0):
                 break
             scale *= math.sqrt(total / max(count, 1.0))
@@ -392,14 +395,13 @@ class RationalFilter(SideslipFilter):
         skip: int,
     ) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
-        total, count = 0.0, 0
+        total = 0.0
+        count = 0
         for samples, reference in drives:
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
-            total, count = (
-                total + float(np.square(error[counted]).sum()),
-                count + int(counted.sum()),
-            )
+            total = total + float(np.square(error[counted]).sum())
+            count = count + int(counted.sum())
         return finite(total / max(count, 1))
 
     def first_gaussian(
@@ -448,8 +450,11 @@ class RationalFilter(SideslipFilter):
         first = self.first_gaussian(samples[0], {}) if first is None else first
         if self.filter == "unscented":
             return self._unscented(samples, first, levels)
-        car, adapted, bounds = self.car, self.adapted, self.bounds()
-        mean, covariance = first.mean.copy(), first.covariance.copy()
+        car = self.car
+        adapted = self.adapted
+        bounds = self.bounds()
+        mean = first.mean.copy()
+        covariance = first.covariance.copy()
         pull = [crossfall] * (len(mean) - len(bounds))
         out = _empty(len(samples), len(mean))
         track = (
@@ -488,7 +493,9 @@ class RationalFilter(SideslipFilter):
         self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]
     ) -> FilteredStates:
         """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
-        car, track, bound = self.car, self.track(), self.bounds()
+        car = self.car
+        track = self.track()
+        bound = self.bounds()
         limit = torch.as_tensor(
             bound
         )  # points are drawn again each time, so they may be kept within it in place
@@ -497,7 +504,8 @@ class RationalFilter(SideslipFilter):
             lambda points, inputs: track.observation(points.clamp_(-limit, limit), inputs),
         )
         filtered = UnscentedStepper(model, *first, 2, symmetric_rule(len(bound), 0.0))
-        prior, (mean, covariance) = filtered.prior, filtered.state
+        prior = filtered.prior
+        (mean, covariance) = filtered.state
         mean[:], covariance[:] = first
         sensors = np.square([[levels["yaw_rate"], levels["ay"]]])[..., None] * np.eye(2)
         geometry = np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle])
@@ -506,7 +514,9 @@ class RationalFilter(SideslipFilter):
         for k, (yaw_rate, vx, ay, steer) in enumerate(samples):
             if vx < self.minimum_speed:
                 _roll.py_func(mean, covariance, np.square(ROLLING), geometry, vx, steer)
-                innovation, spread, measured = np.zeros(2), np.eye(2), np.zeros(2, bool)
+                innovation = np.zeros(2)
+                spread = np.eye(2)
+                measured = np.zeros(2, bool)
             else:
                 if k:
                     before = np.array(
@@ -521,13 +531,12 @@ class RationalFilter(SideslipFilter):
                     if diverged or not prior.covariance[0, 0] < LOST**2:
                         _roll.py_func(*prior, np.square(ROLLING), geometry, vx, steer)
                     if diverged:
-                        prior.mean[4:], prior.covariance[4:, 4:] = 0.0, self.start_tyres()
+                        prior.mean[4:] = 0.0
+                        prior.covariance[4:, 4:] = self.start_tyres()
                 filtered.update(np.array([yaw_rate, ay]), np.array([vx, steer]), sensors)
-                innovation, spread, measured = (
-                    filtered.innovation,
-                    filtered.innovation_covariance,
-                    ~np.isnan([yaw_rate, ay]),
-                )
+                innovation = filtered.innovation
+                spread = filtered.innovation_covariance
+                measured = ~np.isnan([yaw_rate, ay])
                 if abs(vx * prior.mean[1]) < self.adapt_above:
                     gain = filtered.gain.copy()
                     gain[4:] = 0.0
@@ -676,7 +685,8 @@ def _covariances_of_logarithms(
     for own, other, covariance in zip(
         (fit.front, fit.rear), (shifted.front, shifted.rear), fit.covariance, strict=True
     ):
-        effect, scale = np.log(other / own), np.eye(len(own))[-1] * FORCE_SCALE
+        effect = np.log(other / own)
+        scale = np.eye(len(own))[-1] * FORCE_SCALE
         found.append(
             covariance / np.outer(own, own) + np.outer(effect, effect) + np.outer(scale, scale)
         )

@@ -32,7 +32,8 @@ SCALED = {
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "compliance": -0.5},
 }
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
-WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
+WINDOW = 30
+NETWORK_HZ = 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
@@ -48,7 +49,9 @@ class SelfCalibrating(Recursive):
     v = ω (b - C u²) with the priors of b and C count by how well each explains v' and u' on the drive so far, which needs no reference.
     """
 
-    name, title, version = "self_calibrating", "Self-calibrating filter", "4"
+    name = "self_calibrating"
+    title = "Self-calibrating filter"
+    version = "4"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -257,7 +260,8 @@ class SelfCalibrating(Recursive):
     @property
     def noise(self) -> FloatArray:
         """Variances by which states grow in a sample of steady driving, (8,)."""
-        n, noise = self.numbers(), np.square(self.prior[1]) * (1.0 - np.square(self.decay))
+        n = self.numbers()
+        noise = np.square(self.prior[1]) * (1.0 - np.square(self.decay))
         noise[[kernel.V, kernel.U]] = n.dt * n.noise_vy**2, n.dt * n.noise_vx**2
         return noise
 
@@ -294,7 +298,8 @@ class SelfCalibrating(Recursive):
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> kernel.State:
         """The priors, v = 0 or what is given, and the measured speed."""
         mean, deviation = self.prior
-        mean[kernel.V], mean[kernel.U] = given.get("vy", 0.0), sample[1]
+        mean[kernel.V] = given.get("vy", 0.0)
+        mean[kernel.U] = sample[1]
         lags = np.zeros(kernel.LAGS)
         first = self.with_ax(sample[None])[0]
         lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = (
@@ -304,10 +309,8 @@ class SelfCalibrating(Recursive):
         )
         lags[kernel.PREDICTED] = first[0] * (self.rear - mean[kernel.COMPLIANCE] * first[1] ** 2)
         weights = self.bank_arrays[1]
-        means, covariances = (
-            np.tile(mean, (len(weights), 1)),
-            np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1)),
-        )
+        means = np.tile(mean, (len(weights), 1))
+        covariances = np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
         candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
         return kernel.State(
             means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1))
@@ -329,10 +332,8 @@ class SelfCalibrating(Recursive):
         With ``kept=1`` those of the states are of the last sample alone.
         """
         state = kernel.State(*(part.copy() for part in state))
-        found, parameters = (
-            np.empty((len(samples), 2)),
-            np.empty((kept or len(samples), 2 * kernel.STATES)),
-        )
+        found = np.empty((len(samples), 2))
+        parameters = np.empty((kept or len(samples), 2 * kernel.STATES))
         rows = self.with_ax(samples)
         kernel.scan(*self._constants, self.network, state, rows, found, parameters)
         return found, parameters, state
@@ -350,7 +351,9 @@ class SelfCalibrating(Recursive):
 
     def c_values(self) -> dict[str, Any]:
         """Numbers, priors and the network."""
-        n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank_arrays
+        n = self.numbers()
+        (mean, deviation) = self.prior
+        (grips, start) = self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
         return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
             "numbers": n._asdict()
@@ -376,10 +379,8 @@ class SelfCalibrating(Recursive):
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
-        self.network, self._width = (
-            np.ascontiguousarray(weights["network"]),
-            float(weights["yaw_rate_max"][0]),
-        )
+        self.network = np.ascontiguousarray(weights["network"])
+        self._width = float(weights["yaw_rate_max"][0])
         self.__dict__.pop("_constants", None)
 
 
@@ -404,28 +405,26 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         state: before the first of them.
     """
     _, _, last = estimator.trace(samples, state)
-    best, n, mean, decay = (
-        int(np.argmax(last.log_weights)),
-        estimator.numbers(),
-        estimator.prior[0],
-        estimator.decay,
-    )
+    best = int(np.argmax(last.log_weights))
+    n = estimator.numbers()
+    mean = estimator.prior[0]
+    decay = estimator.decay
     state = kernel.State(*(part.copy() for part in state))
-    rows, before = estimator.with_ax(samples).copy(), state.last.copy()
-    means, covariances = (
-        np.empty((len(rows), kernel.STATES)),
-        np.empty((len(rows), kernel.STATES, kernel.STATES)),
-    )
-    network, turning, scratch = (
-        np.empty(len(rows)),
-        np.empty(len(rows)),
-        (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES))),
-    )
+    rows = estimator.with_ax(samples).copy()
+    before = state.last.copy()
+    means = np.empty((len(rows), kernel.STATES))
+    covariances = np.empty((len(rows), kernel.STATES, kernel.STATES))
+    network = np.empty(len(rows))
+    turning = np.empty(len(rows))
+    scratch = (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
     for k in range(len(rows)):
-        network[k], turning[k] = state.lags[kernel.PREDICTED], -state.lags[kernel.YAW_RATE]
+        network[k] = state.lags[kernel.PREDICTED]
+        turning[k] = -state.lags[kernel.YAW_RATE]
         kernel.scan(*estimator._constants, estimator.network, state, rows[k : k + 1], *scratch)
         turning[k] += state.lags[kernel.YAW_RATE]
-        means[k], covariances[k], rows[k] = state.means[best], state.covariances[best], state.last
+        means[k] = state.means[best]
+        covariances[k] = state.covariances[best]
+        rows[k] = state.last
     middle = (np.vstack([before, rows[:-1]]) + rows) / 2.0  # yaw rate, u, ay, ax
     turn = rows[:, 0] * rows[:, 1]
     turn = (np.append(before[0] * before[1], turn[:-1]) + turn) / 2.0
@@ -433,27 +432,25 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     constant[[kernel.V, kernel.U]] = 0.0
     noise = np.tile(estimator.noise, (len(rows), 1))
     noise[:, kernel.V] += n.dt * (n.noise_delay * turning / n.dt * rows[:, 1]) ** 2
-    x, p = means[-1].copy(), covariances[-1].copy()
+    x = means[-1].copy()
+    p = covariances[-1].copy()
     found = np.empty((len(rows), 3))
     for k in range(len(rows) - 1, -1, -1):
         found[k] = x[kernel.V], x[kernel.REAR], p[kernel.V, kernel.V]
         if k == 0:
             break
         step = np.eye(kernel.STATES)
-        step[kernel.V, kernel.LEAKAGE], step[kernel.V, kernel.OFFSET_Y] = (
-            -n.dt * middle[k, 2],
-            -n.dt,
-        )
-        step[kernel.U, kernel.V], step[kernel.U, kernel.OFFSET_X] = n.dt * middle[k, 0], -n.dt
+        step[kernel.V, kernel.LEAKAGE] = -n.dt * middle[k, 2]
+        step[kernel.V, kernel.OFFSET_Y] = -n.dt
+        step[kernel.U, kernel.V] = n.dt * middle[k, 0]
+        step[kernel.U, kernel.OFFSET_X] = -n.dt
         step *= decay[:, None]
         predicted = step @ means[k - 1] + constant
         predicted[[kernel.V, kernel.U]] += n.dt * (middle[k, 2] - turn[k]), n.dt * middle[k, 3]
         spread = step @ covariances[k - 1] @ step.T + np.diag(noise[k])
         gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
-        x, p = (
-            means[k - 1] + gain @ (x - predicted),
-            covariances[k - 1] + gain @ (p - spread) @ gain.T,
-        )
+        x = means[k - 1] + gain @ (x - predicted)
+        p = covariances[k - 1] + gain @ (p - spread) @ gain.T
     own = found[:, 0] + n.rear_known * (n.rear - found[:, 1]) * rows[:, 0]
     steady = rows[:, 0] * (n.rear - n.compliance * np.square(rows[:, 1]))
     moving = np.clip(rows[:, 1] / n.minimum_speed - 1.0, 0.0, 1.0)

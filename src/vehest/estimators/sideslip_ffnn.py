@@ -28,7 +28,8 @@ class SideslipFfnn(SampleNetworkEstimator):
     estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section IV-C.
     """
 
-    name, title = "sideslip_ffnn", "Feed-forward network"
+    name = "sideslip_ffnn"
+    title = "Feed-forward network"
     trials = (
         Trial(
             8,

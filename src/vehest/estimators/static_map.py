@@ -25,7 +25,8 @@ class StaticMap(Recursive):
     Dynamics, and tyres beyond their linear range, are left out.
     """
 
-    name, title = "static_map", "Static map"
+    name = "static_map"
+    title = "Static map"
     trials = (Trial(0.1, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True

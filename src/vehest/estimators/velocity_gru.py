@@ -44,7 +44,8 @@ class VelocityGruNetwork(VelocityNetwork):
 class VelocityGru(RecurrentVelocityEstimator):
     """GRU of Srinivasan et al. 2020; an ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it."""
 
-    name, title = "velocity_gru", "Velocity GRU"
+    name = "velocity_gru"
+    title = "Velocity GRU"
     trials = (TRIAL,)
     network_type = VelocityGruNetwork
     dropout: float = setting(

@@ -47,12 +47,11 @@ class VelocityLstmNetwork(VelocityNetwork):
             self.dense.weight[:, :n_states],
             self.dense.bias,
         )
-        by_previous, read_out, bias = (
-            self.dense.weight[:, n_states:].t(),
-            self.read_out.weight.t(),
-            self.read_out.bias,
-        )
-        previous, outputs = state[2], []
+        by_previous = self.dense.weight[:, n_states:].t()
+        read_out = self.read_out.weight.t()
+        bias = self.read_out.bias
+        previous = state[2]
+        outputs = []
         for step in driven.unbind(1):
             previous = torch.addmm(
                 bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out
@@ -64,7 +63,8 @@ class VelocityLstmNetwork(VelocityNetwork):
 class VelocityLstm(RecurrentVelocityEstimator):
     """Robust LSTM of Bou Ghosn et al. 2023; the previous estimate starts from ``initial_state``, else from measured velocities."""
 
-    name, title = "velocity_lstm", "Velocity LSTM"
+    name = "velocity_lstm"
+    title = "Velocity LSTM"
     trials = (TRIAL,)
     network_type = VelocityLstmNetwork
     dropout: float = setting(

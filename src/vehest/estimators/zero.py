@@ -14,7 +14,8 @@ from vehest.estimators.recursive import Recursive
 class Zero(Recursive):
     """v = 0 at all times."""
 
-    name, title = "zero", "Zero (v = 0)"
+    name = "zero"
+    title = "Zero (v = 0)"
     trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx",)
     ignores_initial_state = True

@@ -91,7 +91,8 @@ def coverage_intervals(
     own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
-    segments, found = segments_of(parts, rate_hz), {}
+    segments = segments_of(parts, rate_hz)
+    found = {}
     starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
     for name, suffix in SUFFIXES.items():
         errors, half = own[name]
@@ -110,7 +111,8 @@ def figures_by_regime(
     """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only those that have 2 s of samples."""
     found: dict[str, dict[str, float]] = {}
     for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
-        found[regime], inside = {}, np.concatenate([mask[regime] for mask in masks])
+        found[regime] = {}
+        inside = np.concatenate([mask[regime] for mask in masks])
         for name, suffix in SUFFIXES.items():
             errors, half = (values[inside] for values in own[name])
             shown = half[:, LEVELS.index(SHOWN_LEVEL)]
@@ -175,7 +177,8 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
     Source: Korn & Graubard, Confidence intervals for proportions with small expected number of positive counts estimated from survey data,
     Survey Methodology 24 (2), 1998.
     """
-    n_blocks, share = len(sizes), float(sums.sum() / sizes.sum())
+    n_blocks = len(sizes)
+    share = float(sums.sum() / sizes.sum())
     variance = (
         n_blocks
         / (n_blocks - 1)
@@ -187,7 +190,8 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
         tail = 0.5 + CONFIDENCE / 2.0
         fewer = float(scipy.special.ndtri(tail) / scipy.special.stdtrit(n_blocks - 1, tail)) ** 2
         independent = min(share * (1.0 - share) / variance * fewer, float(sizes.sum()))
-    hits, misses = share * independent, (1.0 - share) * independent
+    hits = share * independent
+    misses = (1.0 - share) * independent
     outside = (1.0 - CONFIDENCE) / 2.0
     low = float(scipy.special.betaincinv(hits, misses + 1.0, outside)) if hits > 0 else 0.0
     high = float(scipy.special.betaincinv(hits + 1.0, misses, 1.0 - outside)) if misses > 0 else 1.0

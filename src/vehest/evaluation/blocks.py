@@ -69,10 +69,8 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
 
 def joined(parts: Sequence[Segments]) -> Segments:
     """Segments of several test sets as of one, whose pieces stay apart."""
-    first, columns = (
-        0.0,
-        {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS},
-    )
+    first = 0.0
+    columns = {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS}
     for position, part in enumerate(parts):
         columns["piece"][position] = part.piece + first
         first += float(part.piece.max()) + 1.0
@@ -108,7 +106,8 @@ def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
     length = max(
         math.ceil(politis_white_length([run[row] for run in runs])) for row in range(len(losses))
     )
-    labels, count = np.empty(len(segments), dtype=np.int64), 0
+    labels = np.empty(len(segments), dtype=np.int64)
+    count = 0
     for piece in pieces:
         own = np.flatnonzero(segments.piece == piece)
         n_blocks = max(

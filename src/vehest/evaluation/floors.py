@@ -172,7 +172,9 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
 
     The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which nothing is known.
     """
-    third, explained, longest = [], [], 0
+    third = []
+    explained = []
+    longest = 0
     both = {name for name in ("ay", "yaw_rate") if all(name in drive.inputs for drive in drives)}
     for drive in (drive.scored for drive in drives):
         if len(drive.vy_ref) < 4:
@@ -190,7 +192,8 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
         longest += len(third[-1])
     if longest < LEAST_SAMPLES:
         return None
-    rest, known = np.concatenate(third), np.concatenate(explained)
+    rest = np.concatenate(third)
+    known = np.concatenate(explained)
     if known.shape[1]:
         rest = rest - known @ np.linalg.lstsq(known, rest, rcond=None)[0]
     velocity, speed = _joined(drives)
@@ -335,7 +338,8 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     low, high = (math.exp(-BLOCK_SECONDS / time) for time in SLOW_SECONDS)
     ratio = min(max(lags[2] / lags[1], low), high)
     x = -math.log(ratio)
-    apart, together = 2.0 * (math.cosh(x) - 1.0) / x**2, 2.0 * (x - 1.0 + ratio) / x**2
+    apart = 2.0 * (math.cosh(x) - 1.0) / x**2
+    together = 2.0 * (x - 1.0 + ratio) / x**2
     slow = min(lags[1] / (ratio * apart), lags[0] / together)
     white = min((lags[0] - slow * together) * BLOCK_SECONDS, max(variance - slow, 0.0) / rate_hz)
     return Noise(max(white, 0.0), math.sqrt(slow), BLOCK_SECONDS / x)
@@ -357,7 +361,8 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
-    parts, rate = [drive.scored for drive in drives], drives[0].rate_hz
+    parts = [drive.scored for drive in drives]
+    rate = drives[0].rate_hz
     lateral = longitudinal = rear = front = None
     if "ay" in inputs:
         left = [
@@ -424,7 +429,8 @@ def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
 
 def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
     """Arm, three of the slip angle and, in front, an offset of the steering angle: ω, u a, u dω/dt, u a³, u; (T, 4) or (T, 5)."""
-    u, yaw_rate = drive.inputs["vx"], drive.inputs["yaw_rate"]
+    u = drive.inputs["vx"]
+    yaw_rate = drive.inputs["yaw_rate"]
     a = drive.inputs["ay"] if "ay" in inputs else u * yaw_rate
     change = np.gradient(yaw_rate) * drive.rate_hz if len(u) > 1 else np.zeros_like(u)
     return np.stack([yaw_rate, u * a, u * change, u * a**3, *([u] if front else [])], 1)
@@ -452,9 +458,11 @@ def _model_of(
     The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ: given z, with the gain K = q/(q + r),
     v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 - K) q, and z itself measures (φ - 1) v + τ b with the variance q + r.
     """
-    steps, step = len(drive.vy_ref), drive.step
+    steps = len(drive.vy_ref)
+    step = drive.step
     transition: dict[tuple[int, int], FloatArray | float] = {}
-    noises, priors = list[float](), list[float]()
+    noises = list[float]()
+    priors = list[float]()
     measured: list[
         tuple[dict[int, FloatArray | float], float]
     ] = []  # combinations of states, and the variance of each
@@ -475,13 +483,15 @@ def _model_of(
         white = levels.lateral.density * step + TINY**2
         gain = noise / (noise + white)
         offset = state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
-        transition[v, v], transition[v, offset] = decay - gain * (decay - 1.0), -gain * step
+        transition[v, v] = decay - gain * (decay - 1.0)
+        transition[v, offset] = -gain * step
         noises[v] = noise * (1.0 - gain)
         measured.append(({v: decay - 1.0, offset: step}, noise + white))
     if levels.longitudinal is not None:
         speed = state(1.0, levels.longitudinal.density * step, levels.speed**2)
         pitch = state(*_in_steps(levels.longitudinal, step), levels.longitudinal.deviation**2)
-        transition[speed, v], transition[speed, pitch] = drive.inputs["yaw_rate"] * step, step
+        transition[speed, v] = drive.inputs["yaw_rate"] * step
+        transition[speed, pitch] = step
         measured.append(({speed: 1.0}, levels.speed**2))
     for axle, front in ((levels.rear, False), (levels.front, True)):
         if axle is not None:
@@ -494,8 +504,10 @@ def _model_of(
                 + (LEAST_WHITE * axle.error.deviation) ** 2
             )
             measured.append(({v: 1.0, error: -1.0, stiffness: -slip}, white))
-    n, m = len(noises), max(len(measured), 1)
-    A, C = np.zeros((steps, n, n)), np.zeros((steps, m, n))
+    n = len(noises)
+    m = max(len(measured), 1)
+    A = np.zeros((steps, n, n))
+    C = np.zeros((steps, m, n))
     for (row, column), value in transition.items():
         A[:, row, column] = value
     for row, (of, _) in enumerate(measured):

@@ -32,7 +32,8 @@ def lever_arm_figures(
         metric -> value, with ``lever_arm``, how far ahead of the reference's point the estimates hold [m]; nothing where a reference's
         point is known or undeclared, or a recording has no yaw rate.
     """
-    yaw_rates, speeds = [], []
+    yaw_rates = []
+    speeds = []
     for reference, span in pieces:
         turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
         derived = reference.provenance.get("derived")  # from the data set's declaration
@@ -49,10 +50,8 @@ def lever_arm_figures(
             return {}
     if not yaw_rates:
         return {}
-    error, turns = (
-        np.concatenate([part.vy - part.vy_ref for part in parts]),
-        np.concatenate(yaw_rates),
-    )
+    error = np.concatenate([part.vy - part.vy_ref for part in parts])
+    turns = np.concatenate(yaw_rates)
     power = float(turns @ turns)
     x = float(np.clip(error @ turns / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
     moved = []

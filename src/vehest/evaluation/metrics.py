@@ -268,7 +268,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         )
         return values
 
-    vy, standing = held("vy"), np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
+    vy = held("vy")
+    standing = np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
     measured = {
         name: scored[own]
         for name, own in REFERENCES.items()

@@ -120,6 +120,7 @@ def errors_by_regime(
             Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES))
             for part, mask in chosen
         ]
-        figures, count = accuracy(inside), sum(len(part.time) for part in inside)
+        figures = accuracy(inside)
+        count = sum(len(part.time) for part in inside)
         found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
     return found

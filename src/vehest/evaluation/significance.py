@@ -162,7 +162,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     Source: Holm, Scandinavian Journal of Statistics 6 (2), 1979.
     """
     order = np.argsort(p_values, kind="stable")
-    adjusted, largest = [1.0] * len(p_values), 0.0
+    adjusted = [1.0] * len(p_values)
+    largest = 0.0
     for rank, position in enumerate(order):
         largest = max(largest, min((len(p_values) - rank) * p_values[position], 1.0))
         adjusted[int(position)] = largest
@@ -182,7 +183,8 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
 
     Pairs of as many seeds share their draws, which are those of each pair alone.
     """
-    at_once, drawn = max(DRAWN_AT_ONCE // len(sizes), 1), np.empty((len(pairs), 3, n_resamples))
+    at_once = max(DRAWN_AT_ONCE // len(sizes), 1)
+    drawn = np.empty((len(pairs), 3, n_resamples))
     for numbers in dict.fromkeys((len(first), len(second)) for first, second in pairs):
         generator = np.random.default_rng(0)
         for begin in range(0, n_resamples, at_once):
@@ -219,7 +221,8 @@ def _degrees_of_freedom(
     sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]
 ) -> float:
     """Welch-Satterthwaite over the variance between blocks and that between seeds of either estimator."""
-    n_blocks, difference = len(sizes), means[0].mean() - means[1].mean()
+    n_blocks = len(sizes)
+    difference = means[0].mean() - means[1].mean()
     residuals = (sums[0].mean(axis=0) - sums[1].mean(axis=0) - difference * sizes) / sizes.mean()
     parts = [(float(residuals.var(ddof=1)) / n_blocks, n_blocks - 1)]
     parts += [(float(own.var(ddof=1)) / len(own), len(own) - 1) for own in means if len(own) > 1]

@@ -19,7 +19,8 @@ from vehest.constants import FloatArray
 from vehest.evaluation.metrics import Scored
 
 SETTLED_SECONDS = 3.0
-FAULTED, AFTER = "faulted", "after"
+FAULTED = "faulted"
+AFTER = "after"
 
 UNITS = {
     "rmse_sideslip": "deg",
@@ -78,7 +79,10 @@ def flags_under_fault(
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
     is something for.
     """
-    inside, valid, delays, undetected = [], [], [], []
+    inside = []
+    valid = []
+    delays = []
+    undetected = []
     for part, (band, health), window in zip(parts, flagged, windows, strict=True):
         during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
         error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
@@ -87,10 +91,13 @@ def flags_under_fault(
         valid.append(health[known] == 0)
         at = np.flatnonzero(during)
         if len(at) and (at[0] == 0 or health[at[0] - 1] == 0):
-            flags, onset, end = health > 0, int(at[0]), int(at[-1]) + 1
+            flags = health > 0
+            onset = int(at[0])
+            end = int(at[-1]) + 1
             delays.append(detection_delay(flags, onset, end, rate_hz))
             undetected.append(error_while_undetected(np.degrees(error), flags, onset, end))
-    held, calm = np.concatenate(inside), np.concatenate(valid)
+    held = np.concatenate(inside)
+    calm = np.concatenate(valid)
     found = [delay for delay in delays if math.isfinite(delay)]
     figures = {"coverage_90": float(held.mean())} if len(held) else {}
     figures |= {"coverage_90_unflagged": float(held[calm].mean())} if calm.any() else {}

@@ -102,7 +102,8 @@ class _Step(nn.Module):
     ) -> None:
         super().__init__()
         self.network: Any = network
-        self.outputs, self.starts = outputs, starts
+        self.outputs = outputs
+        self.starts = starts
 
 
 class _WindowStep(_Step):

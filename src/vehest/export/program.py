@@ -136,13 +136,17 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
 
 def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
     """What the templates of the contract are filled in with."""
-    estimator, monitor, guard = stepper.estimator, stepper._monitor, stepper._guard
-    rate, front = float(estimator.settings.rate_hz), stepper._front
+    estimator = stepper.estimator
+    monitor = stepper._monitor
+    guard = stepper._guard
+    rate = float(estimator.settings.rate_hz)
+    front = stepper._front
     top_speed, largest_tan, _, interval = stepper._watch._settings.tolist()
     guards = [(guard_table(guard), "", "Limits at the method's rate.")]
     if front is not None:
         guards.append((guard_table(front._guard), "BUS_", "Limits at the bus's rate."))
-    health, number = health_table(monitor._health), partial(limit, precision=precision)
+    health = health_table(monitor._health)
+    number = partial(limit, precision=precision)
     return {
         "title": ascii_only(title),
         "notes": [ascii_only(note) for note in estimator.notice],
@@ -216,10 +220,8 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
     packed = stepper._monitor._bands
     if packed is None:
         return None
-    head, terms = (
-        packed.numbers[: band_rules._HEAD],
-        packed.numbers[band_rules._HEAD :].reshape(3, -1),
-    )
+    head = packed.numbers[: band_rules._HEAD]
+    terms = packed.numbers[band_rules._HEAD :].reshape(3, -1)
     return {
         "factor_vy": head[0],
         "factor_sideslip": head[1],

@@ -86,9 +86,11 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
 
 def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
     """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that is the same on every machine."""
-    names, limits = list(stepper._channels), stepper._guard._limits[:, :2]
+    names = list(stepper._channels)
+    limits = stepper._guard._limits[:, :2]
     sizes, usual = _sizes(stepper)
-    speed, swerve = 1.0 + 0.2 * np.sin(0.7 * times), np.sin(2.0 * times) * np.sin(0.3 * times)
+    speed = 1.0 + 0.2 * np.sin(0.7 * times)
+    swerve = np.sin(2.0 * times) * np.sin(0.3 * times)
     found = {}
     for number, name in enumerate(names):
         size = sizes[name]
@@ -111,7 +113,8 @@ def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str
 
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
     """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
-    names, table = stepper._channels, health_table(stepper._monitor._health)
+    names = stepper._channels
+    table = health_table(stepper._monitor._health)
     if table is not None:
         return dict(zip(names, table["largest"].tolist(), strict=True)), dict(
             zip(names, table["usual"].tolist(), strict=True)
@@ -133,7 +136,8 @@ def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]
 
 def _noise(n: int, seed: int) -> FloatArray:
     """Uniform between -1 and 1, (n,), by a linear congruential generator (Numerical Recipes, 2007, Section 7.1)."""
-    state, found = (1664525 * seed + 1013904223) % 2**32, np.empty(n)
+    state = (1664525 * seed + 1013904223) % 2**32
+    found = np.empty(n)
     for k in range(n):
         state = (1664525 * state + 1013904223) % 2**32
         found[k] = state / 2**31 - 1.0

@@ -41,7 +41,8 @@ def kalman_scan(
         raise ValueError(
             f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}"
         )
-    (steps, m), n = measurements.shape, model.transition.shape[-1]
+    (steps, m) = measurements.shape
+    n = model.transition.shape[-1]
     shapes = ((n, n), (n,), (n, n), (m, n), (m,), (m,))
     parts = [
         _contiguous(part, (steps, *shape), name)
@@ -56,7 +57,8 @@ def kalman_scan(
     predicted, filtered = (
         Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2)
     )
-    innovation, covariance = np.empty((steps, m)), np.empty((steps, m, m))
+    innovation = np.empty((steps, m))
+    covariance = np.empty((steps, m, m))
     gated = limit, patience, np.zeros(m, np.int64) if refused is None else refused
     failed = _scan(
         *parts, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gated
@@ -100,20 +102,18 @@ def _scan(  # type: ignore[no-untyped-def]
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
-    (prior_mean, prior_cov), (post_mean, post_cov), (steps, m), n = (
-        predicted,
-        filtered,
-        y.shape,
-        A.shape[1],
-    )
-    known, of_states, left, gain = (
-        np.empty(m, np.bool_),
-        np.empty((m, n)),
-        np.empty((n, n)),
-        np.empty(n),
-    )
+    (prior_mean, prior_cov) = predicted
+    (post_mean, post_cov) = filtered
+    (steps, m) = y.shape
+    n = A.shape[1]
+    known = np.empty(m, np.bool_)
+    of_states = np.empty((m, n))
+    left = np.empty((n, n))
+    gain = np.empty(n)
     for k in range(steps):
-        x, P, S = prior_mean[k], prior_cov[k], innovation_cov[k]
+        x = prior_mean[k]
+        P = prior_cov[k]
+        S = innovation_cov[k]
         for i in range(n):
             total = start[0][i] if k == 0 else b[k - 1, i]
             for j in range(n):
@@ -131,7 +131,8 @@ def _scan(  # type: ignore[no-untyped-def]
         if k > 0:
             make_symmetric(P)
         for i in range(m):  # innovations given the samples before, all measurements together
-            error, variance = y[k, i] - d[k, i], R[k, i]
+            error = y[k, i] - d[k, i]
+            variance = R[k, i]
             for j in range(n):
                 of_states[i, j] = _row_times(C[k], i, P, j)
                 error -= C[k, i, j] * x[j]
@@ -142,13 +143,15 @@ def _scan(  # type: ignore[no-untyped-def]
                 and known[i]
                 and refuses(error, variance, limit, patience, refused, i)
             ):
-                y[k, i], known[i] = math.nan, False
+                y[k, i] = math.nan
+                known[i] = False
             innovation[k, i], S[i, i] = (error, variance) if known[i] else (0.0, 1.0)
             for j in range(i):
                 S[i, j] = S[j, i] = (
                     _row_times(of_states, i, C[k], j) if known[i] and known[j] else 0.0
                 )
-        mean, cov = post_mean[k], post_cov[k]
+        mean = post_mean[k]
+        cov = post_cov[k]
         for i in range(n):
             mean[i] = x[i]
             for j in range(n):
@@ -158,7 +161,8 @@ def _scan(  # type: ignore[no-untyped-def]
         ):  # one after the other, since their noise is independent; the yaw rate before ay keeps more digits
             if not known[c]:
                 continue
-            error, variance = y[k, c] - d[k, c], R[k, c]
+            error = y[k, c] - d[k, c]
+            variance = R[k, c]
             for i in range(n):
                 gain[i] = _row_times(C[k], c, cov, i)
                 error -= C[k, c, i] * mean[i]

@@ -152,7 +152,8 @@ def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf)
 def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyped-def]
     constant, weight, offset, scale, least = car
     n = constant.shape[0]
-    lower, factor = np.zeros_like(constant), np.zeros_like(constant)
+    lower = np.zeros_like(constant)
+    factor = np.zeros_like(constant)
     for b in range(first, end):
         entry = 0
         for i in range(n):

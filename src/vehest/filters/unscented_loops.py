@@ -77,7 +77,9 @@ def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
 
 def forward_scratch(tape: Tape) -> tuple[Any, ...]:
     """What `forward` works with: each call has its own, so that no two threads write to one line of a cache at every step."""
-    points, covariance, spread = tape.moved[0], tape.prior_covariance[0], tape.own[0]
+    points = tape.moved[0]
+    covariance = tape.prior_covariance[0]
+    spread = tape.own[0]
     lost = np.empty(points.shape[-1:], np.bool_)
     *drawn, made, made_spread = (
         room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread)
@@ -87,12 +89,10 @@ def forward_scratch(tape: Tape) -> tuple[Any, ...]:
 
 def backward_scratch(tape: Tape) -> tuple[Any, ...]:
     """What `backward` works with, likewise; the last two become the gradients of the initial mean and covariance."""
-    points, expected, mean, covariance = (
-        tape.moved[0],
-        tape.expected[0],
-        tape.post_mean[0],
-        tape.post_covariance[0],
-    )
+    points = tape.moved[0]
+    expected = tape.expected[0]
+    mean = tape.post_mean[0]
+    covariance = tape.post_covariance[0]
     states = (mean, covariance)
     shapes = [
         part.shape
@@ -122,10 +122,8 @@ def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
     return CompileResultWAP(function.overloads[kinds])
 
 
-FORWARD, BACKWARD = (
-    (points_of, moments_of, gate_of, update_of),
-    (points_of, update_adjoint, points_adjoint, moments_adjoint),
-)
+FORWARD = (points_of, moments_of, gate_of, update_of)
+BACKWARD = (points_of, update_adjoint, points_adjoint, moments_adjoint)
 Forward = namedtuple(
     "Forward",
     ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"),
@@ -166,11 +164,14 @@ def forward(  # type: ignore[no-untyped-def]
     ``noise`` is that of the process and that of measurements, (T, k, k, B), or where there is a function ``at…``, what that writes:
     ``at(states, inputs, car, out, first, end)``. What a gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
     """
-    car, rules, (drawn, lost, made_process, made_spread) = calls.car, setting.rules, scratch
+    car = calls.car
+    rules = setting.rules
+    (drawn, lost, made_process, made_spread) = scratch
     for half in range(halves[0], halves[1]):
         k = half // 2
         if half % 2 == 0:
-            mean, inputs = tape.post_mean[k - 1], u[k - 1]
+            mean = tape.post_mean[k - 1]
+            inputs = u[k - 1]
             calls.points_of(
                 mean, tape.post_covariance[k - 1], rules, drawn, tape.repaired[k], first, end
             )
@@ -190,12 +191,10 @@ def forward(  # type: ignore[no-untyped-def]
                 end,
             )
         else:
-            mean, inputs, expected, repaired = (
-                tape.prior_mean[k],
-                u[k],
-                tape.expected[k],
-                tape.repaired[k],
-            )
+            mean = tape.prior_mean[k]
+            inputs = u[k]
+            expected = tape.expected[k]
+            repaired = tape.repaired[k]
             calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
             for b in range(first, end):
                 repaired[b] |= lost[b]
@@ -247,18 +246,20 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
         mean_bar,
         covariance_bar,
     ) = scratch
-    car, rules, points, factor = calls.car, setting.rules, drawn[0], drawn[1]
+    car = calls.car
+    rules = setting.rules
+    points = drawn[0]
+    factor = drawn[1]
     _clear(post_mean_bar, first, end)
     _clear(post_covariance_bar, first, end)
     for k in range(len(y) - 1, -1, -1):
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
-        mean, kept = (
-            tape.prior_mean[k],
-            (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]),
-        )
+        mean = tape.prior_mean[k]
+        kept = (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k])
         calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
-        post_bars, prior_bars = (post_mean_bar, post_covariance_bar), (mean_bar, covariance_bar)
+        post_bars = (post_mean_bar, post_covariance_bar)
+        prior_bars = (mean_bar, covariance_bar)
         other_bars = points_bar, expected_bar, spread_bar[k], y_bar[k]
         calls.update(
             mean,
@@ -300,10 +301,8 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
 
 @compiled
 def _add(total, values, first, end):  # type: ignore[no-untyped-def]
-    rows, added = (
-        total.reshape(-1, total.shape[total.ndim - 1]),
-        values.reshape(-1, total.shape[total.ndim - 1]),
-    )
+    rows = total.reshape(-1, total.shape[total.ndim - 1])
+    added = values.reshape(-1, total.shape[total.ndim - 1])
     for row in range(rows.shape[0]):
         for b in range(first, end):
             rows[row, b] += added[row, b]

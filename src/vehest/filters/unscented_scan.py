@@ -223,10 +223,8 @@ def unscented_scan(
     sequences, steps, m = measurements.shape
     n = initial.mean.shape[-1]
     try:
-        mean, covariance = (
-            initial.mean.expand(sequences, n),
-            initial.covariance.expand(sequences, n, n),
-        )
+        mean = initial.mean.expand(sequences, n)
+        covariance = initial.covariance.expand(sequences, n, n)
     except RuntimeError:
         raise ValueError(
             f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences"
@@ -295,21 +293,22 @@ class UnscentedStepper:
         repair: bool = True,
         gate: Gate | None = None,
     ) -> None:
-        n, dtype = len(mean), mean.dtype.type
-        self._model, self._setting = model, _setting(model, rule, n, dtype, repair, gate)
+        n = len(mean)
+        dtype = mean.dtype.type
+        self._model = model
+        self._setting = _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
         self._tape = tape = tape_of(1, 1, n, measurements, dtype)
         self.prior = Gaussian(tape.prior_mean[0, :, 0], tape.prior_covariance[0, :, :, 0])
         self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
-        self.prior.mean[:], self.prior.covariance[:] = mean, covariance
+        self.prior.mean[:] = mean
+        self.prior.covariance[:] = covariance
         self._inputs: Array | None = None
         self._runs: dict[CompiledNoise | None, Callable[..., None]] = {}
         self._scratch = forward_scratch(tape)
-        self.innovation, self.innovation_covariance, self.gain = (
-            tape.innovation[0, :, 0],
-            tape.own[0, :, :, 0],
-            tape.gain[0, :, :, 0],
-        )
+        self.innovation = tape.innovation[0, :, 0]
+        self.innovation_covariance = tape.own[0, :, :, 0]
+        self.gain = tape.gain[0, :, :, 0]
 
     def step(
         self,
@@ -376,7 +375,8 @@ class _Moved(torch.autograd.Function):
         ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
     ) -> Tensor:
         points, held = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
-        ctx.kept, out = (model, points, held[0]), room(points.shape, points.dtype)
+        ctx.kept = (model, points, held[0])
+        out = room(points.shape, points.dtype)
         with model.working():
             model.entries[0](*ctx.kept[1:], model.car, out, 0, len(states))
         return torch.from_numpy(_apart(out[0]))
@@ -416,16 +416,13 @@ class _Scan(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         ctx.set_materialize_grads(False)
         kept = model.kept * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
-        y, u, noises = (
-            _by_time(measurements),
-            _by_time(inputs, kept),
-            (_by_time(process), _by_time(observation)),
-        )
-        tape.prior_mean[0], tape.prior_covariance[0] = (
-            _beside(mean.detach().numpy()),
-            _beside(covariance.detach().numpy()),
-        )
-        refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
+        y = _by_time(measurements)
+        u = _by_time(inputs, kept)
+        noises = (_by_time(process), _by_time(observation))
+        tape.prior_mean[0] = _beside(mean.detach().numpy())
+        tape.prior_covariance[0] = _beside(covariance.detach().numpy())
+        refused = np.zeros(measurements.shape[::2], np.int64)
+        halves = (1, 2 * len(y))
         run = _forward_by(model, functions, (tape, u[0]))
         with model.working():
             share(
@@ -489,10 +486,14 @@ def _forward_by(
     like: tuple[Tape, Array] | None = None,
 ) -> Any:
     """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs, (p, B), where both are compiled."""
-    entries, at_states = [*model.entries[:2]], [at and at.entry for at in functions]
-    loop, steps = getattr(forward, "py_func", forward), cast(tuple[Any, ...], FORWARD)
+    entries = [*model.entries[:2]]
+    at_states = [at and at.entry for at in functions]
+    loop = getattr(forward, "py_func", forward)
+    steps = cast(tuple[Any, ...], FORWARD)
     if like and model.is_compiled and not config.DISABLE_JIT:
-        (tape, inputs), loop, steps = like, forward, steps_by_address(FORWARD, like[1].dtype)
+        (tape, inputs) = like
+        loop = forward
+        steps = steps_by_address(FORWARD, like[1].dtype)
         given = (tape.moved[0], inputs, model.car), (tape.post_mean[0], inputs)
         entries = [
             by_address(entry, *given[0], out, 0, 0)
@@ -520,7 +521,8 @@ def _backward_by(
             getattr(backward, "py_func", backward),
             Backward._make((*BACKWARD, *model.entries[2:], model.car)),
         ), own
-    points, inputs = tape.moved[0], u[0]
+    points = tape.moved[0]
+    inputs = u[0]
     called = [
         by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)

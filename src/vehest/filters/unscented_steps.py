@@ -48,7 +48,8 @@ piece = numba.njit(
 
 def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
     """An array that vectors may be read beyond, not filled or as ``make`` fills it."""
-    count, size = math.prod(shape), np.dtype(dtype).itemsize
+    count = math.prod(shape)
+    size = np.dtype(dtype).itemsize
     return make(count + BYTES // size, dtype)[:count].reshape(shape)
 
 
@@ -115,9 +116,15 @@ def _any(condition, b, end, scratch):  # type: ignore[no-untyped-def]
 @compiled
 def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
     """Sigma points of ``given`` covariances, factors, and the covariances where what is not positive definite is repaired."""
-    (rule, lower, margin, repair), (points, factor, covariance) = rules, drawn
-    n, count, lanes = mean.shape[0], points.shape[0], width(mean)
-    A, L, P, flags = _rows(n * n, mean), _rows(n * n, mean), _rows(count * n, mean), _rows(1, mean)
+    (rule, lower, margin, repair) = rules
+    (points, factor, covariance) = drawn
+    n = mean.shape[0]
+    count = points.shape[0]
+    lanes = width(mean)
+    A = _rows(n * n, mean)
+    L = _rows(n * n, mean)
+    P = _rows(count * n, mean)
+    flags = _rows(1, mean)
     for b in range(first, end, lanes):
         _read(given, A, b)
         lost = 1 - _cholesky(A, L, n)
@@ -147,20 +154,20 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
 @compiled
 def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `points_of`; what a repair added counts as constant."""
-    n, (rule, lower, _, _) = mean.shape[0], rules
-    L, below, inner, x_bar, A_bar = (
-        _rows(n * n, mean),
-        _rows(n * n, mean),
-        _rows(n * n, mean),
-        _rows(n, mean),
-        _rows(n * n, mean),
-    )
+    n = mean.shape[0]
+    (rule, lower, _, _) = rules
+    L = _rows(n * n, mean)
+    below = _rows(n * n, mean)
+    inner = _rows(n * n, mean)
+    x_bar = _rows(n, mean)
+    A_bar = _rows(n * n, mean)
     for b in range(first, end, width(mean)):
         _read(factor, L, b)
         _read(covariance_bar, A_bar, b)
         nothing = _own(L, 0) * 0
         for i in range(n):
-            c, bar = at_row(mean, i, b), at_row(mean_bar, i, b)
+            c = at_row(mean, i, b)
+            bar = at_row(mean_bar, i, b)
             bar = choose(c >= lower[i], bar + at_row(points_bar, i, b), bar)
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
@@ -201,9 +208,12 @@ def _weighted(one, i, n, other, j, m, rule, centre):  # type: ignore[no-untyped-
 @compiled
 def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ignore[no-untyped-def]
     """Weighted mean and covariance of what became of the points, plus noise."""
-    (count, n), (rule, lower, _, _) = values.shape[:2], rules
+    (count, n) = values.shape[:2]
+    (rule, lower, _, _) = rules
     half = rule.dtype.type(0.5)
-    deviation, x, A = _rows(count * n, values), _rows(n, values), _rows(n * n, values)
+    deviation = _rows(count * n, values)
+    x = _rows(n, values)
+    A = _rows(n * n, values)
     for b in range(first, end, width(values)):
         for i in range(n):
             _put(x, i, most(_deviations(values, b, n, rule, deviation, i), lower[i]))
@@ -220,10 +230,14 @@ def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ign
 @compiled
 def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``."""
-    (count, n), (rule, lower, _, _) = values.shape[:2], rules
-    half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
-    deviation, V_bar = _rows(count * n, values), _rows(count * n, values)
-    through, whole = _rows(n, values), _rows(n * n, values)
+    (count, n) = values.shape[:2]
+    (rule, lower, _, _) = rules
+    half = rule.dtype.type(0.5)
+    two = rule.dtype.type(2.0)
+    deviation = _rows(count * n, values)
+    V_bar = _rows(count * n, values)
+    through = _rows(n, values)
+    whole = _rows(n * n, values)
     for b in range(first, end, width(values)):
         for i in range(n):
             centre = _deviations(values, b, n, rule, deviation, i)
@@ -298,22 +312,30 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
     Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, and the weight of the mean point in
     covariances, (B,), 0 where a negative one took their definiteness.
     """
-    (rule, lower, margin, repair), (points, _, covariance) = rules, drawn
-    (post_mean, post_covariance), (innovation, own, gain, centre) = post, kept
+    (rule, lower, margin, repair) = rules
+    (points, _, covariance) = drawn
+    (post_mean, post_covariance) = post
+    (innovation, own, gain, centre) = kept
     count, m = expected.shape[:2]
-    n, lanes = mean.shape[0], width(mean)
-    error, spread, deviation = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean)
-    cross, factor, K, S, flags = (
-        _rows(n * m, mean),
-        _rows(m * m, mean),
-        _rows(n * m, mean),
-        _rows(m * m, mean),
-        _rows(1, mean),
-    )
-    x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
+    n = mean.shape[0]
+    lanes = width(mean)
+    error = _rows(m, mean)
+    spread = _rows(count * m, mean)
+    deviation = _rows(count * n, mean)
+    cross = _rows(n * m, mean)
+    factor = _rows(m * m, mean)
+    K = _rows(n * m, mean)
+    S = _rows(m * m, mean)
+    flags = _rows(1, mean)
+    x = _rows(n, mean)
+    A = _rows(n * n, mean)
+    tried = _rows(n * n, mean)
+    weight = _rows(1, mean)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
-        around, definite, lifted = at_row(mean, 0, b) * 0 + rule[2], at_row(mean, 0, b) * 0, False
+        around = at_row(mean, 0, b) * 0 + rule[2]
+        definite = at_row(mean, 0, b) * 0
+        lifted = False
         for attempt in range(3):  # as it is, without a negative weight, lifted
             if not lifted:
                 definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
@@ -363,7 +385,8 @@ def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # ty
     count, m = expected.shape[:2]
     n = mean.shape[0]
     for i in range(m):
-        z, centre = at_row(y, i, b), _deviations(expected, b, m, rule, spread, i)
+        z = at_row(y, i, b)
+        centre = _deviations(expected, b, m, rule, spread, i)
         _put(error, i, choose(z == z, z - centre, 0.0))
         for s in range(count):
             _put(spread, s * m + i, choose(z == z, _own(spread, s * m + i), 0.0))
@@ -382,7 +405,8 @@ def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, own, factor):
             _put(cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre))
     for i in range(m):
         for j in range(i + 1):
-            one, other = at_row(y, i, b), at_row(y, j, b)
+            one = at_row(y, i, b)
+            other = at_row(y, j, b)
             bare = _weighted(spread, i, m, spread, j, m, rule, centre)
             noisy = bare + half * (at_row(noise, i * m + j, b) + at_row(noise, j * m + i, b))
             alone = bare + 1 if i == j else bare
@@ -432,38 +456,33 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end
 ):
     """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
-    (rule, lower, _, _), (innovation, own, gain, centre), (post_mean_bar, post_covariance_bar) = (
-        rules,
-        kept,
-        post_bars,
-    )
-    (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = (
-        prior_bars,
-        other_bars,
-    )
+    (rule, lower, _, _) = rules
+    (innovation, own, gain, centre) = kept
+    (post_mean_bar, post_covariance_bar) = post_bars
+    (mean_bar, covariance_bar) = prior_bars
+    (points_bar, expected_bar, noise_bar, y_bar) = other_bars
     count, m = expected.shape[:2]
     n = mean.shape[0]
-    half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
-    off, spread, deviation, error = (
-        _rows(m, mean),
-        _rows(count * m, mean),
-        _rows(count * n, mean),
-        _rows(m, mean),
-    )
-    P, S, K = _rows(n * n, mean), _rows(m * m, mean), _rows(n * m, mean)
-    factor, solved, pulled = _rows(m * m, mean), _rows(m, mean), _rows(m, mean)
-    through, cross_bar, own_bar, R_bar = (
-        _rows(n, mean),
-        _rows(n * m, mean),
-        _rows(m * m, mean),
-        _rows(m * m, mean),
-    )
-    x_bar, z_bar, V_bar, E_bar = (
-        _rows(n, mean),
-        _rows(m, mean),
-        _rows(count * n, mean),
-        _rows(count * m, mean),
-    )
+    half = rule.dtype.type(0.5)
+    two = rule.dtype.type(2.0)
+    off = _rows(m, mean)
+    spread = _rows(count * m, mean)
+    deviation = _rows(count * n, mean)
+    error = _rows(m, mean)
+    P = _rows(n * n, mean)
+    S = _rows(m * m, mean)
+    K = _rows(n * m, mean)
+    factor = _rows(m * m, mean)
+    solved = _rows(m, mean)
+    pulled = _rows(m, mean)
+    through = _rows(n, mean)
+    cross_bar = _rows(n * m, mean)
+    own_bar = _rows(m * m, mean)
+    R_bar = _rows(m * m, mean)
+    x_bar = _rows(n, mean)
+    z_bar = _rows(m, mean)
+    V_bar = _rows(count * n, mean)
+    E_bar = _rows(count * m, mean)
     for b in range(first, end, width(mean)):
         _spread(expected, points, mean, y, b, rule, off, spread, deviation)
         _read(innovation, error, b)
@@ -486,7 +505,8 @@ def update_adjoint(  # type: ignore[no-untyped-def]
         _cholesky(S, factor, m)
         _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
-            pull, known = _own(through, 0) * 0, at_row(y, c, b)
+            pull = _own(through, 0) * 0
+            known = at_row(y, c, b)
             for i in range(n):
                 pull += _own(K, i * m + c) * _own(through, i)
             _put(pulled, c, pull)
@@ -506,7 +526,8 @@ def update_adjoint(  # type: ignore[no-untyped-def]
                     for j in range(n):
                         bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
                 _put(own_bar, c * m + d, bar)
-                one, other = at_row(y, c, b), at_row(y, d, b)
+                one = at_row(y, c, b)
+                other = at_row(y, d, b)
                 _put(
                     R_bar,
                     c * m + d,
@@ -577,7 +598,8 @@ def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
 @compiled
 def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
     """Lift the matrix (n · n, W) of a lane and write its factor, or NaN where that fails; whether its values were finite."""
-    own, factor = np.empty((n, n), A.dtype), np.zeros((n, n), A.dtype)
+    own = np.empty((n, n), A.dtype)
+    factor = np.zeros((n, n), A.dtype)
     for i in range(n):
         for j in range(n):
             own[i, j] = A[i * n + j, lane]

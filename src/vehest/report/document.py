@@ -205,7 +205,8 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
     shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
-    columns, numeric = [], []
+    columns = []
+    numeric = []
     for name, column in shown.items():
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
@@ -253,7 +254,8 @@ def png_of(figure: MatplotlibFigure) -> bytes:
     """A figure as pixels, in as few colours as look the same: a third of the size."""
     from PIL import Image
 
-    buffer, small = io.BytesIO(), io.BytesIO()
+    buffer = io.BytesIO()
+    small = io.BytesIO()
     with paper_style():
         figure.savefig(buffer, format="png", dpi=PNG_DPI)
     with Image.open(buffer) as image:

@@ -42,7 +42,8 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
         Name -> lowest value and the step between two codes, in the order of the data; and the data, base64 of zlib: of each column the low
         bytes, then the high bytes, of differences between neighbouring codes.
     """
-    described, parts = {}, []
+    described = {}
+    parts = []
     for name, values in columns.items():
         known = np.isfinite(values)
         low, high = (
@@ -66,7 +67,8 @@ def reckoned_course(
 
     ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two samples.
     """
-    x, y = np.full(len(vx), np.nan), np.full(len(vx), np.nan)
+    x = np.full(len(vx), np.nan)
+    y = np.full(len(vx), np.nan)
     known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
     for first, end in true_runs(known).tolist():
         own = slice(first, end)

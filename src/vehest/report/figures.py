@@ -99,7 +99,8 @@ def zoom_figure(
     heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
     with new_figure(DOUBLE_COLUMN, 1.25 * sum(heights)) as figure:
         all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
-        (top, middle, below), bottom = all_axes[:3], all_axes[-1]
+        (top, middle, below) = all_axes[:3]
+        bottom = all_axes[-1]
         for source in (*reversed(estimates), reference):
             looks = {
                 "color": source.line.colour,
@@ -238,7 +239,8 @@ class Reliability:
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
     """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal bands say what they hold."""
-    nominal, aside = np.array(levels), SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
+    nominal = np.array(levels)
+    aside = SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
     with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
         axes = figure.add_subplot()
         axes.plot([0.0, 1.0], [0.0, 1.0], color=REFERENCE.colour, linewidth=0.7)
@@ -291,7 +293,8 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
 
 def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
     """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
-    placed, last = [0.0] * len(heights), top + step
+    placed = [0.0] * len(heights)
+    last = top + step
     for position in np.argsort([-height for height in heights], kind="stable"):
         last = min(heights[position], last - step)
         placed[int(position)] = last

@@ -71,7 +71,8 @@ def override_of(alignment: Alignment) -> str:
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
     """All figures as plain values, SI units throughout."""
-    drive, correlation = alignment.recording, alignment.correlation
+    drive = alignment.recording
+    correlation = alignment.correlation
     return {
         "recording": drive.id,
         "kind": drive.kind,

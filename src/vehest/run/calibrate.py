@@ -98,7 +98,10 @@ def learn_trust(
     Training ranges give scales, limits and relations between channels; validation ranges give factors of bands and, together with the
     others, thresholds of health.
     """
-    bands, guard, health, notes = None, None, None, []
+    bands = None
+    guard = None
+    health = None
+    notes = []
     try:
         bands = calibrated(
             _pieces(estimator, train),

@@ -88,12 +88,10 @@ def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) 
         "wheelbase": record.wheelbase,
         "cg_to_rear_axle": record.cg_to_rear_axle,
     }
-    base, leakage, rear, point = (
-        with_settings(model, changed),
-        record.leakage,
-        record.rear_axle,
-        record.cg_to_rear_axle,
-    )
+    base = with_settings(model, changed)
+    leakage = record.leakage
+    rear = record.rear_axle
+    point = record.cg_to_rear_axle
     if leakage.identified_on:
         changed |= {
             "leakage": leakage.value,

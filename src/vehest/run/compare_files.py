@@ -115,7 +115,8 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
                     written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
                 )
                 found.setdefault(quantity, {"column": name, "unit": unit or USUAL_UNITS[quantity]})
-    time, channel = found.pop("time", None), next(iter(found), None)
+    time = found.pop("time", None)
+    channel = next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
         raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
@@ -163,10 +164,8 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> di
         {"method": "polyphase", "transforms": []},
     )
     start, stop = _in_common(reference, estimates)
-    span, protocol = (
-        Span("", drive.id, start, stop),
-        Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0),
-    )
+    span = Span("", drive.id, start, stop)
+    protocol = Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
     candidates = {**estimates, **_baselines(reference, start, stop)}
     scored = {
         (name, ""): score(estimate, reference, span, protocol)
@@ -209,10 +208,8 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
     }
     if empty := [name for name, own in times.items() if not len(own)]:
         raise DataError(f"{empty[0]} has no value at all")
-    start, stop = (
-        max(float(own[0]) for own in times.values()),
-        min(float(own[-1]) for own in times.values()),
-    )
+    start = max(float(own[0]) for own in times.values())
+    stop = min(float(own[-1]) for own in times.values())
     if stop - start < LEAST_SECONDS:
         ranges = ", ".join(
             f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items()
@@ -242,7 +239,8 @@ def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Est
 
 def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
     """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
-    middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
+    middle = 0.5 * (start + stop)
+    vy = np.zeros(len(reference))
     for fitted, held_out in (
         ((start, middle), reference.time >= middle),
         ((middle, stop), reference.time < middle),

@@ -82,11 +82,13 @@ class Comparison:
 
         Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
         """
-        usable, names = self.usable, dict[Any, Any]()
+        usable = self.usable
+        names = dict[Any, Any]()
         self._print_failures(self.jobs, runner)
         evaluated = "evaluation" in usable[0].config
         try:
-            split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
+            split = runner.split(usable[0].config)
+            contents = runner.contents(usable[0].config)
             notes = dict.fromkeys(
                 note for job in usable for note in _fit_to_recordings(job, split, contents)
             )
@@ -202,7 +204,9 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
     """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
-    rate, key, lowest = config.get(group, {}).get("rate_hz"), f"{group}.rate_hz", limit.rate_hz
+    rate = config.get(group, {}).get("rate_hz")
+    key = f"{group}.rate_hz"
+    lowest = limit.rate_hz
     if not isinstance(rate, int | float) or not rate > lowest * (1.0 + TOLERANCE):
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"

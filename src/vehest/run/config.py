@@ -125,7 +125,8 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
 
 def _check(override: Override) -> None:
     """Refuse what Hydra would take, or answer with less help."""
-    group, text = override.key_or_group, _shortened(override.input_line)
+    group = override.key_or_group
+    text = _shortened(override.input_line)
     if override.is_sweep_override():
         raise ConfigurationError(
             f"'{text}' names several values; one is wanted here (pipelines and sweeps take several)"
@@ -208,7 +209,8 @@ def _values(override: Override) -> list[str]:
     """An override once for each of its values, but for at most ``limits.jobs`` + 1 of them."""
     if not override.is_sweep_override():
         return [str(override.input_line)]
-    text, value = _shortened(override.input_line), override.value()
+    text = _shortened(override.input_line)
+    value = override.value()
     try:
         found = (
             value.filter(choices(override.key_or_group))

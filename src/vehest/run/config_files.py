@@ -16,7 +16,8 @@ def packaged(name: str) -> Path:
 
 def conf_folders() -> list[Path]:
     """Folders of configuration, the first one searched first: ./conf, if there is one, the packaged folder, that of the papers' studies."""
-    local, ours = Path("conf"), packaged("conf")
+    local = Path("conf")
+    ours = packaged("conf")
     own = [local] if local.is_dir() and local.resolve() != ours.resolve() else []
     return [*own, ours, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
 

@@ -76,7 +76,8 @@ def resampled_parts(
             yield found.part(slice(done, len(found)))
         elif begin > 0:
             yield found.part(slice(done, int((begin + reach) * ratio)))
-            whole, done = whole.part(slice(begin, len(whole))), int(reach * ratio)
+            whole = whole.part(slice(begin, len(whole)))
+            done = int(reach * ratio)
         kept = [whole]
 
 

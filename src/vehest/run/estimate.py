@@ -54,7 +54,8 @@ SHARPEST_TURN = (
 )
 LARGEST_FROUDE = 400.0  # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
-PRETRAINED, SELF_CALIBRATING = "pretrained", "self_calibrating"
+PRETRAINED = "pretrained"
+SELF_CALIBRATING = "self_calibrating"
 """Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
 WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
 
@@ -119,11 +120,9 @@ def estimate_file(
         VehestError: model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
-    name, file, overrides = (
-        (words[0] if n_names == 2 else SELF_CALIBRATING),
-        Path(words[n_names - 1]),
-        words[n_names:],
-    )
+    name = words[0] if n_names == 2 else SELF_CALIBRATING
+    file = Path(words[n_names - 1])
+    overrides = words[n_names:]
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(
             f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv"
@@ -141,7 +140,8 @@ def estimate_file(
     folder, model, trust = open_model(name, Path(config["output"]), note)
     with use_limits(limits_from_config(config["limits"])):
         dataset = _without_references(config["dataset"])
-        accepted, source = dataset.get("accept") or (), source_of_file(dataset, file)
+        accepted = dataset.get("accept") or ()
+        source = source_of_file(dataset, file)
         parts = (
             (part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file)
         )
@@ -169,10 +169,8 @@ def estimate_file(
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
-        run, log = (
-            GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first)),
-            out.suffix.lower() in LOGS,
-        )
+        run = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first))
+        log = out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
@@ -267,7 +265,8 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 
 def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     """Options of a data set without its reference channels; not validated yet."""
-    channels, transforms = dataset.get("channels"), dataset.get("transforms")
+    channels = dataset.get("channels")
+    transforms = dataset.get("transforms")
     if isinstance(channels, dict):
         channels = {
             name: entry
@@ -324,15 +323,14 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
-    speed, yaw_rate = recording["vx"], np.abs(recording["yaw_rate"])
+    speed = recording["vx"]
+    yaw_rate = np.abs(recording["yaw_rate"])
     moving = (speed > 1.0) & np.isfinite(yaw_rate)
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what, remedy = (
-        f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size",
-        "give estimator.wheelbase",
-    )
+    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    remedy = "give estimator.wheelbase"
     if wheelbase * turn > SHARPEST_TURN:
         return [
             Finding(
@@ -354,10 +352,8 @@ def estimate_recording(
     model: Estimator, recording: Recording, trust: Trust | None = None
 ) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
-    needed, run = (
-        prepared_recording(model, recording),
-        GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording)),
-    )
+    needed = prepared_recording(model, recording)
+    run = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
     return require_estimate(model, recording, run(needed.channels, needed))
 
 
@@ -431,7 +427,9 @@ class _Report:
     def __init__(
         self, model: Estimator, trust: Trust | None, accepted: Sequence[str], strict: str | None
     ) -> None:
-        self.model, self.accepted, self.strict = model, accepted, strict
+        self.model = model
+        self.accepted = accepted
+        self.strict = strict
         self.health = trust.health if trust is not None else None
         self.findings: list[list[Finding]] = []
         self.outside: Any = 0
@@ -458,7 +456,8 @@ class _Report:
     def counted(self, parts: Iterable[Estimate]) -> Iterator[Estimate]:
         """The parts of the estimate, once they count; raises `DataError` where all are empty."""
         for part in parts:
-            self.last, known = part, ~np.isnan(part["vy"])
+            self.last = part
+            known = ~np.isnan(part["vy"])
             degrees = np.degrees(part["sideslip"])
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
             self.samples, self.estimated = (
@@ -471,7 +470,8 @@ class _Report:
                     .astype(np.float32)
                     .tobytes()
                 )
-            status, reasons = part["health"][known], part["health_reason"][known]
+            status = part["health"][known]
+            reasons = part["health_reason"][known]
             self.invalid += int((status > 0).sum())
             found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
             self.reasons.update(dict(zip(found.tolist(), counts.tolist(), strict=True)))

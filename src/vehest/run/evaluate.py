@@ -189,7 +189,8 @@ def scored_spans(split: Split) -> list[Span]:
 
 def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path) -> None:
     """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
-    estimator, protocol = load_model(model.folder), how.protocol
+    estimator = load_model(model.folder)
+    protocol = how.protocol
     without_fit = (
         model.outputs and FIT_METRICS not in model.outputs
     )  # such as a model that was saved from Python
@@ -247,7 +248,9 @@ def _rows_of_parts(
     bands: Bands | None,
 ) -> list[dict[str, Any]]:
     """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
-    protocol, masks, turns = how.protocol, [], []
+    protocol = how.protocol
+    masks = []
+    turns = []
     for reference, piece in pieces_of(spans, how.reference, protocol):
         masks.append(regimes_of(reference, piece, protocol))
         turns.append(
@@ -288,7 +291,8 @@ def _rows_under_faults(
         for piece in sequences(spans, how.reference, how.protocol)
     ]
     other_vehicle = head["test_set"] in how.protocol.sets_elsewhere
-    score, rate_hz = partial(how.score, spans), how.protocol.rate_hz
+    score = partial(how.score, spans)
+    rate_hz = how.protocol.rate_hz
     for fault in how.faults:
         for subset, own in errors_under(
             fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle

@@ -56,10 +56,8 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
 
     ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter, ``estimator.KEY=VALUE``.
     """
-    files, overrides = (
-        [Path(word) for word in words if is_file_name(word)],
-        [word for word in words if not is_file_name(word)],
-    )
+    files = [Path(word) for word in words if is_file_name(word)]
+    overrides = [word for word in words if not is_file_name(word)]
     if not files or out.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigurationError(
             f"'{out}' must end in .yaml"
@@ -165,7 +163,8 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
 
 def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float]:
     """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
-    logs, weights = np.log(model.grips), np.exp(log_weights[: len(model.grips)] - log_weights.max())
+    logs = np.log(model.grips)
+    weights = np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
     return mean, math.sqrt(
         weights @ (np.square(logs - mean) + np.square(np.gradient(logs) / 2.0)) / weights.sum()

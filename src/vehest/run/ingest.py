@@ -97,7 +97,8 @@ def write_ingest(
     ):  # while the first process compiles the plant, for which others wait
         tasks.insert(1, compile_health)
         missing.insert(1, "")
-    done, failures = len(ids) - len(missing) + missing.count(""), []
+    done = len(ids) - len(missing) + missing.count("")
+    failures = []
 
     def begun(at: int, _: object) -> None:
         report(done, len(ids), missing[at])

@@ -32,10 +32,8 @@ from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_i
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.tabular import unused_columns
 
-EARLIEST_UNIX, LATEST_UNIX = (
-    6e8,
-    4e9,
-)  # s, 1989 to 2096: time stamps of recordings in between count from 1970
+EARLIEST_UNIX = 6e8
+LATEST_UNIX = 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 MOST_COLUMNS = 40  # of a table that are listed
 SPREAD = ("min", "mean", "max", "std")
 
@@ -126,7 +124,8 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
         )
     if not recordings:
         raise DataError(f"'{source}' holds no recordings")
-    rows, missing = all_usabilities(recordings), absent_channels(SCORED, recordings).to_estimate
+    rows = all_usabilities(recordings)
+    missing = absent_channels(SCORED, recordings).to_estimate
     lines = usable_in_words(rows)
     if missing:
         lines.append(f"every estimate is scored by {' and '.join(missing)}")

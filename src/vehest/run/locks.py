@@ -35,7 +35,8 @@ class Lock:
     """A lock of an output root, by a stage and a name that is unique in it; it ends with the process that holds it."""
 
     def __init__(self, output: Path, stage: str, name: str) -> None:
-        self.stage, self.name = stage, name
+        self.stage = stage
+        self.name = name
         self._path = output / LOCKS / file_name(f"{stage}-{name}", ".lock")
         self._lock = FileLock(
             self._path, fallback_to_soft=False

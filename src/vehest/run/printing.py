@@ -176,7 +176,8 @@ def summary_of_leaderboard(
 ) -> TerminalSummary:
     """The leaderboard of a study, a table a test set, with the study's verdict."""
     header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
-    tables, notes = [], []
+    tables = []
+    notes = []
     for test_set, rows in board.groupby("test_set", sort=False):
         given = (
             " (estimates start at the reference state)"
@@ -245,7 +246,8 @@ def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
 
 def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
     """Cells of a ranked estimate under `SCORE_HEADER`."""
-    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    low = row["rmse_sideslip_low"]
+    high = row["rmse_sideslip_high"]
     interval = f"{low:.3f} … {high:.3f}" if low > 0 else "–"
     return (
         f"{row['rmse_sideslip']:.3f}",

@@ -28,8 +28,11 @@ from vehest.run.train import STAGE as TRAIN
 from vehest.run.versions import VERSIONS, code_of
 
 CHECKPOINTS = "checkpoints"
-OUTDATED, DAMAGED, ORPHANED = "its code has changed", "it is damaged", "its inputs are gone"
-SUPERFLUOUS, LEFT_OVER = "its model is there, or listed", "left by a process that was killed"
+OUTDATED = "its code has changed"
+DAMAGED = "it is damaged"
+ORPHANED = "its inputs are gone"
+SUPERFLUOUS = "its model is there, or listed"
+LEFT_OVER = "left by a process that was killed"
 
 
 def unused_artefacts(output: Path) -> list[dict[str, Any]]:

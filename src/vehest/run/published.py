@@ -34,7 +34,9 @@ from vehest.sources.base import kind_of
 Keys = dict[str, dict[str, str]]
 """What is made, for example ``scheme_1: train ksnn`` -> ``code``, ``configuration`` and, of an ingest, ``data`` -> version or hash."""
 
-CODE, CONFIGURATION, DATA = "code", "configuration", "data"
+CODE = "code"
+CONFIGURATION = "configuration"
+DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
 
@@ -196,18 +198,19 @@ def _pipeline_of(study: str) -> Study | None:
 
 
 def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
-    published, state, changes, note = (
-        published_in(RESULTS / study),
-        "not known",
-        [("pipeline", CONFIGURATION)],
-        "",
-    )
+    published = published_in(RESULTS / study)
+    state = "not known"
+    changes = [("pipeline", CONFIGURATION)]
+    note = ""
     if published is None:
-        changes, note = [], f"there is nothing in '{RESULTS / study}' that vehest published"
+        changes = []
+        note = f"there is nothing in '{RESULTS / study}' that vehest published"
     elif not published.keys:
-        changes, note = [], "published before keys were recorded; run it again"
+        changes = []
+        note = "published before keys were recorded; run it again"
     elif pipeline is None:
-        changes, note = [], f"there is no pipeline that publishes '{study}'"
+        changes = []
+        note = f"there is no pipeline that publishes '{study}'"
     else:
         try:
             changes, note = _changes(pipeline, jobs_of(pipeline, overrides), published)
@@ -229,12 +232,14 @@ def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple
         Messages(quiet=True),
         StopSignals(),
     )
-    ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
+    ingests = _ingests(study, jobs, published.absent, runner)
+    inputs = {}
     for name, config in ingests.items():
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
-    then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
+    then = published.keys
+    today = keys_of_study(study, jobs, published.absent, runner, inputs)
     changes = [
         (what, cause)
         for what in then

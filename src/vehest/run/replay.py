@@ -47,7 +47,8 @@ def replay_log(
     quiet: bool = True,
 ) -> dict[str, Any]:
     """Replay a log and let a model estimate; returns its figures. The options are those of ``vehest replay``; raises `VehestError`."""
-    bus, estimates = Bus(interface, channel, _speed(speed)), EstimateFrames(_identifier(identifier))
+    bus = Bus(interface, channel, _speed(speed))
+    estimates = EstimateFrames(_identifier(identifier))
     if bus.speed is None and interface != "virtual":
         raise ConfigurationError(
             f"--speed max needs the virtual bus, not '{interface}'; give --speed 1"

@@ -52,7 +52,8 @@ from vehest.studies.reference_minutes import start_in_words
 from vehest.studies.registry import study_module
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build
 
-STAGE, SWEEP = "report", "sweep"
+STAGE = "report"
+SWEEP = "sweep"
 OVERVIEW = "tables/overview.csv"
 SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
@@ -159,7 +160,8 @@ def _write(
             f"the study module '{name}' gives no table 'overview', which the terminal shows"
         )
     if artefacts.parts:
-        table, kept = artefacts.metrics, getattr(module, "METRICS", None)
+        table = artefacts.metrics
+        kept = getattr(module, "METRICS", None)
         if kept is not None:
             table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
         for file, written in ((METRICS, table), (TIMINGS, of_parts(timings))):
@@ -200,7 +202,8 @@ def _recordings(
 
 
 def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
-    models, tables = [], []
+    models = []
+    tables = []
     for member in part.members:
         assert member.model is not None
         assert member.evaluation is not None

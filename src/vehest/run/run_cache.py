@@ -78,11 +78,9 @@ class RunCache:
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
-        self._words, self._overrides, self._pipeline = (
-            (command, name, *overrides),
-            overrides,
-            name if command == "run" else "",
-        )
+        self._words = (command, name, *overrides)
+        self._overrides = overrides
+        self._pipeline = name if command == "run" else ""
         named = [
             override.removeprefix("output=")
             for override in overrides
@@ -123,7 +121,8 @@ class RunCache:
         found = None if options.force else self.load()
         if found is None:
             return None
-        (record, (*made, report)), messages = found, Messages(quiet=options.quiet)
+        (record, (*made, report)) = found
+        messages = Messages(quiet=options.quiet)
         for line in (
             *record.notes,
             *(("skip", own.stage, own.label, "up to date") for own in (*made, report)),
@@ -141,7 +140,8 @@ class RunCache:
         publication: Publication | None,
     ) -> None:
         """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: stamps from before reading."""
-        tracker, output = runner.tracker, runner.output
+        tracker = runner.tracker
+        output = runner.output
         if (
             self.file is None
             or not self.key

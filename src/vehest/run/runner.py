@@ -163,7 +163,8 @@ class Runner:
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
         """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
-        split, protocol = self.split(config), protocol_from_config(config["evaluation"])
+        split = self.split(config)
+        protocol = protocol_from_config(config["evaluation"])
         references = self.data_for(
             split,
             protocol.rate_hz,
@@ -217,10 +218,8 @@ class Runner:
             waiting += [replace(group, jobs=missing)] if missing else []
         failures: dict[str, Failure] = {}
         if waiting and self.train_first:
-            plans, reason = (
-                [job.plan for group in waiting for job in group.jobs],
-                f"run '{self.train_first}' first",
-            )
+            plans = [job.plan for group in waiting for job in group.jobs]
+            reason = f"run '{self.train_first}' first"
             if not members:
                 raise MissingError(f"{plans[0].label} has not been trained and evaluated; {reason}")
             failure = Failure(
@@ -237,7 +236,8 @@ class Runner:
                 for ended, done in enumerate(
                     self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report), start=1
                 ):
-                    group, outcome = waiting[done.position], done.outcome
+                    group = waiting[done.position]
+                    outcome = done.outcome
                     bars.close(group.name)
                     bars.step(ALL, ended, len(waiting))
                     if not isinstance(outcome, Failure):

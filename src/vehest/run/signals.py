@@ -70,7 +70,8 @@ class TimeLimit:
     """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s]; None for no limit."""
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:
-        self._stop, self._until = stop, until
+        self._stop = stop
+        self._until = until
         self.deferred = stop.deferred
 
     def requested(self) -> bool:

@@ -53,7 +53,9 @@ def open_runner(
     config: Config, options: RunOptions, stages: Collection[str], study: str = ""
 ) -> Iterator[Runner]:
     """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
-    messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
+    messages = Messages(quiet=options.quiet)
+    stop = StopSignals()
+    output = Path(config["output"])
     tracker = Tracker(
         config["tracking"] if options.track or study else {},
         output,
@@ -255,7 +257,8 @@ def _error_of(
         if failure.detail:
             runner.messages.warn(f"{name}:\n{failure.detail}")
         reasons.setdefault(failure.message, []).append(name)
-    jobs, error = [job for own in comparisons for job in own.jobs], None
+    jobs = [job for own in comparisons for job in own.jobs]
+    error = None
     if reasons:
         listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
         n_failed = sum(job.failure is not None for job in jobs)
@@ -320,7 +323,8 @@ def evaluate_one(
                     f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first"
                 )
             assert group.evaluation is not None
-            trained, how = found, group.evaluation
+            trained = found
+            how = group.evaluation
         calibration = _calibration(trained, split, how.data, runner)
         artefact = runner.ensure(*how.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
@@ -336,7 +340,8 @@ def _calibration(
     model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner
 ) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
-    learnt, found = learnt_spans(model), None
+    learnt = learnt_spans(model)
+    found = None
     if model.status == "complete" and (
         not learnt or set(learnt) == {*split.train, *split.validation}
     ):

@@ -27,13 +27,11 @@ from vehest.studies.artefacts import read_frame
 STORE = "mlflow.db"
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
-KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = (
-    "vehest.key",
-    "vehest.stage",
-    "vehest.digest",
-    "vehest.output",
-    "vehest.study",
-)
+KEY_TAG = "vehest.key"
+STAGE_TAG = "vehest.stage"
+DIGEST_TAG = "vehest.digest"
+OUTPUT_TAG = "vehest.output"
+STUDY_TAG = "vehest.study"
 METRICS: Mapping[str, Callable[[Path], Mapping[str, float]]] = {
     "train": read_fit_metrics,
     "calibrate": calibration_figures,
@@ -79,10 +77,8 @@ class Tracker:
     def _log(self, artefact: Artefact) -> None:
         from mlflow.entities import Metric, Param
 
-        client, tags = (
-            self._client,
-            {KEY_TAG: artefact.key, STAGE_TAG: artefact.stage, DIGEST_TAG: artefact.digest},
-        )
+        client = self._client
+        tags = {KEY_TAG: artefact.key, STAGE_TAG: artefact.stage, DIGEST_TAG: artefact.digest}
         found = self._runs(tags)
         if any(run.info.status != "RUNNING" for run in found):
             return
@@ -97,10 +93,8 @@ class Tracker:
                 tags | ({"mlflow.parentRunId": self._parent()} if self.study else {}),
             )
         )
-        run_id, time = (
-            str(run.info.run_id),
-            run.info.start_time,
-        )  # metrics with the same time are kept once
+        run_id = str(run.info.run_id)
+        time = run.info.start_time  # metrics with the same time are kept once
         parameters = [Param(key, value) for key, value in _flattened(artefact.config).items()]
         points = [
             Metric(key, value, time, 0)

@@ -65,7 +65,8 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
     """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
-    estimator, seed = new_estimator(config["estimator"]), config["seed"]
+    estimator = new_estimator(config["estimator"])
+    seed = config["seed"]
     settings_from_config(estimator.training_type, config["training"], "training")
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {seed!r}")
@@ -110,7 +111,8 @@ def _plain(span: Span) -> dict[str, str]:
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
     """Train the jobs of one group together, each as if it were alone; raises `DataError` where recordings do not fit the estimator."""
-    first, members = jobs[0], [new_estimator(job.estimator) for job in jobs]
+    first = jobs[0]
+    members = [new_estimator(job.estimator) for job in jobs]
     for member, job in zip(members, jobs, strict=True):
         member.seed(job.seed)
     training: Any = settings_from_config(members[0].training_type, first.training, "training")

@@ -110,7 +110,8 @@ def usability(
 ) -> Usability:
     """Whether the estimator of a configuration can be trained on recordings and used on them."""
     to_estimate = recordings if to_estimate is None else to_estimate
-    both, own = [*recordings, *to_estimate], str(config["estimator"]["name"])
+    both = [*recordings, *to_estimate]
+    own = str(config["estimator"]["name"])
     try:
         estimator, training = _built(config)
     except ConfigurationError as error:
@@ -122,10 +123,8 @@ def usability(
         estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
     )
     own_rate = estimator.settings.rate_hz
-    rate, gappy = (
-        min([own_rate, *(one.rate_hz for one in both)]),
-        {name for one in both for name in one.gappy},
-    )
+    rate = min([own_rate, *(one.rate_hz for one in both)])
+    gappy = {name for one in both for name in one.gappy}
     gaps = tuple(
         channel
         for channel in estimator.channels
@@ -217,10 +216,8 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         [replace(own, channels=own.channels | made) for own in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)
     )
-    found, by_scores = (
-        usability(estimator.name, config, to_train, to_estimate),
-        absent_channels(SCORED, scored),
-    )
+    found = usability(estimator.name, config, to_train, to_estimate)
+    by_scores = absent_channels(SCORED, scored)
     parts = (
         (found.missing.to_train, to_train),
         (found.missing.to_estimate, to_estimate),
@@ -293,10 +290,8 @@ def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[s
 def _with_supplies(
     read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> Missing:
-    held, gappy = (
-        common_channels(recordings),
-        frozenset(name for own in recordings for name in own.gappy),
-    )
+    held = common_channels(recordings)
+    gappy = frozenset(name for own in recordings for name in own.gappy)
     rate = min((own.rate_hz for own in recordings), default=0.0)
     supplies = {name: derivation_of(name, held, gappy, rate) for name in (*read, *learnt)}
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
@@ -328,7 +323,9 @@ def _settings_without(
         )
         if len(left) >= len(missing):
             break
-        missing, config, found[key] = left, changed, value
+        missing = left
+        config = changed
+        found[key] = value
     settings = tuple(
         f"estimator.{key}=" + (f"[{','.join(own)}]" if isinstance(own, list) else f"{own}")
         for key, own in found.items()

@@ -74,7 +74,8 @@ class PublishedWeights:
 
     def write(self, key: str, folder: Path) -> None:
         """Write a model into the folder of its training, byte for byte as that did, but without times."""
-        files, prefix = self._models[key].files, f"{key}/"
+        files = self._models[key].files
+        prefix = f"{key}/"
         for name in FILES:
             if name in files:
                 (folder / name).write_bytes(files[name].encode())

@@ -211,12 +211,13 @@ class _Ride:
         control: StabilityControl | None,
         stint: Stint | None,
     ) -> None:
-        self._car, self._controller, self._stint = car_of(plant), controller, stint
-        self._half_width, self._longest = (
-            float(getattr(manoeuvre, "half_width", math.inf)),
-            manoeuvre.longest,
-        )
-        self.stability_control, self.stability = control, StabilityState()
+        self._car = car_of(plant)
+        self._controller = controller
+        self._stint = stint
+        self._half_width = float(getattr(manoeuvre, "half_width", math.inf))
+        self._longest = manoeuvre.longest
+        self.stability_control = control
+        self.stability = StabilityState()
         self.state = plant.initial_state(*controller.start)
         self.inputs = np.zeros(5)
         self.decision = Command(0.0, 0.0)
@@ -239,7 +240,8 @@ class _Ride:
         self._judge(time, decision)
         if self._is_over(time, decision):
             return False
-        steering_velocity, acceleration = decision.steering_velocity, decision.acceleration
+        steering_velocity = decision.steering_velocity
+        acceleration = decision.acceleration
         if self.gave_up_at is not None:
             steering_velocity = max(-0.5, min(0.5, -seen.steer / 0.3)) * self._car.steering_rate
             acceleration = -STOPPING_SHARE * self._car.grip * decision.friction
@@ -292,12 +294,12 @@ class _Ride:
             self.bank = self.grade = 0.0
             return 0.0, 0.0
         along_road, across_road = road_gravity(decision.bank, decision.grade)
-        sine, cosine = math.sin(yaw - decision.heading), math.cos(yaw - decision.heading)
-        along, across = (
-            along_road * cosine + across_road * sine,
-            across_road * cosine - along_road * sine,
-        )
-        self.bank, self.grade = math.asin(-across / GRAVITY), math.asin(along / GRAVITY)
+        sine = math.sin(yaw - decision.heading)
+        cosine = math.cos(yaw - decision.heading)
+        along = along_road * cosine + across_road * sine
+        across = across_road * cosine - along_road * sine
+        self.bank = math.asin(-across / GRAVITY)
+        self.grade = math.asin(along / GRAVITY)
         return along, across
 
     def keep_sample(self) -> None:

@@ -65,7 +65,8 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
     if not variations:
         return vehicle
     overrides = deepcopy(dict(vehicle.overrides))
-    published, rear = library_parameters(vehicle), rear_tyre(vehicle)
+    published = library_parameters(vehicle)
+    rear = rear_tyre(vehicle)
     for name, factors in _drawn(variations, seed).items():
         *group, last = name.split(".")
         holder: Any = published

@@ -91,7 +91,9 @@ def drive_freely(
     stride = int(np.gcd(per_command, per_sample))
     driver = manoeuvre.controller(plant.car, surface, seed)
     first_sample = round(SETTLING_TIME / plant.step)
-    state, kept, acting = plant.initial_state(), [], []
+    state = plant.initial_state()
+    kept = []
+    acting = []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):
         if now % per_command == 0:
             inputs = driver.inputs(

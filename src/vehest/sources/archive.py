@@ -21,10 +21,8 @@ from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9
-SMALL, MOST_EXPANSION = (
-    64 * 2**20,
-    250,
-)  # bytes; times its packed size that a larger archive may unpack to
+SMALL = 64 * 2**20
+MOST_EXPANSION = 250  # bytes; times its packed size that a larger archive may unpack to
 MOST_FILES = 10_000
 
 _UNSOUND = (
@@ -63,10 +61,8 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
-                size, most = (
-                    sum(entry.file_size for entry in entries),
-                    min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size)),
-                )
+                size = sum(entry.file_size for entry in entries)
+                most = min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size))
                 if len(entries) > MOST_FILES or size > most:
                     limits = f"more than the limit of {MOST_FILES} entries and {most / 1e9:.3g} GB; unpack it by hand"
                     raise DataError(
@@ -108,7 +104,8 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
-    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
+    name = entry.filename
+    kind = stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))
     leaves = (
         path.is_absolute()

@@ -69,7 +69,8 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 def origin_in_words(recording: Recording) -> list[str]:
     """Where a recording's channels were measured and which were derived, by its data set, a line each."""
-    declared, lines = recording.provenance.get(DERIVED) or {}, []
+    declared = recording.provenance.get(DERIVED) or {}
+    lines = []
     if point := declared.get("reference_point"):
         moved = ", moved to it" if declared.get("moved_to_centre_of_gravity") else ""
         lines.append(f"reference measured {_point_in_words(point)}{moved}")
@@ -87,7 +88,8 @@ def origin_in_words(recording: Recording) -> list[str]:
 def _point_in_words(point: Any) -> str:
     if point == "unknown":
         return "at a point that is not known"
-    x, y = float(point.get("x", 0.0)), float(point.get("y", 0.0))
+    x = float(point.get("x", 0.0))
+    y = float(point.get("y", 0.0))
     parts = [f"{abs(x):g} m {'ahead of' if x > 0 else 'behind'}"] if x else []
     parts += [f"{abs(y):g} m to the {'left' if y > 0 else 'right'} of"] if y else []
     return f"{' and '.join(parts) or 'at'} the centre of gravity"
@@ -187,9 +189,11 @@ class Source(ABC):
             return recording
         for transform in self.transforms:
             recording = transform(recording)
-        point, moved = self.reference_point, False
+        point = self.reference_point
+        moved = False
         if isinstance(point, Point) and (point.x or point.y) and "vy_ref" in recording:
-            recording, moved = ReferenceLever(point.x, point.y)(recording), True
+            recording = ReferenceLever(point.x, point.y)(recording)
+            moved = True
         declared = {
             key: self.dataset[key]
             for key in ("transforms", "reference_point", "imu_point")

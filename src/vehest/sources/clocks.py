@@ -97,7 +97,8 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
 def unevenness(stamps: FloatArray) -> str:
     """Gaps, jitter or drift of increasing time stamps [s], in words; empty where they are even."""
     steps = np.diff(stamps)
-    step, longest = float(np.median(steps)), int(np.argmax(steps))
+    step = float(np.median(steps))
+    longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
         gaps = f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
         return f"{gaps} (interval {step:.6g} s)"
@@ -113,7 +114,8 @@ def unevenness(stamps: FloatArray) -> str:
 
 def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
     """Raise `DataError` for samples, (T,), that are not finite or whose increasing times [s] lie further apart than ``longest`` [s]."""
-    bad, steps = np.flatnonzero(~np.isfinite(values)), np.diff(times)
+    bad = np.flatnonzero(~np.isfinite(values))
+    steps = np.diff(times)
     if len(bad):
         what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
         raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
@@ -169,7 +171,9 @@ def uniform_clock(
     hold more samples than the limits allow.
     """
     require_clock(stamps, where, may_repeat=policy == "uniform")
-    start, elapsed, steps = float(stamps[0]), float(stamps[-1] - stamps[0]), np.diff(stamps)
+    start = float(stamps[0])
+    elapsed = float(stamps[-1] - stamps[0])
+    steps = np.diff(stamps)
     if policy == "interpolate":
         rate = plain_rate(1.0 / mean_step(steps), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
@@ -179,12 +183,11 @@ def uniform_clock(
             f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples",
         )
         return Clock(start, rate, n_samples, stamps)
-    rate, deviation = len(steps) / elapsed, MOST_DRIFT
+    rate = len(steps) / elapsed
+    deviation = MOST_DRIFT
     if policy == "uniform":
-        nominal, deviation = (
-            plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE),
-            MOST_STRETCH,
-        )
+        nominal = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE)
+        deviation = MOST_STRETCH
         times, rate, _ = uniform_times(
             stamps,
             nominal,
@@ -201,24 +204,27 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
     """The `uniform_clock` of stamps (T,) that come in blocks, where these are surely strict and even; else None."""
     lines: list[tuple[int, int, float, float, float]] = []
     intervals: list[float] = []
-    count, before = 0, np.empty(0)
+    count = 0
+    before = np.empty(0)
     for block in blocks:
         if not (np.abs(block) <= LATEST_TIME).all():
             return None
-        steps, own = (
-            np.diff(block, prepend=before),
-            float(block[-1] - block[0]) / max(len(block) - 1, 1),
-        )
+        steps = np.diff(block, prepend=before)
+        own = float(block[-1] - block[0]) / max(len(block) - 1, 1)
         intervals += [float(steps.min(initial=math.inf)), float(steps.max(initial=0.0))]
         most = float(
             np.abs(block - block[0] - own * np.arange(len(block))).max()
         )  # away from the block's own line
         lines.append((count, len(block) - 1, float(block[0]), own, most))
-        count, before = count + len(block), block[-1:]
+        count = count + len(block)
+        before = block[-1:]
     if not FEWEST < count < MOST_STEPS:
         return None
-    low, high, start = min(intervals), max(intervals), lines[0][2]
-    elapsed, n_steps = float(before[0]) - start, count - 1
+    low = min(intervals)
+    high = max(intervals)
+    start = lines[0][2]
+    elapsed = float(before[0]) - start
+    n_steps = count - 1
     step = elapsed / n_steps
     away = max(
         abs(first - start - at * step) + abs(own - step) * reach + most
@@ -287,7 +293,8 @@ def uniform_times(
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
     """Slope and intercept, points beyond three standard deviations left out."""
-    middle, origin = number.mean(), stamps[0]
+    middle = number.mean()
+    origin = stamps[0]
     kept = np.ones(len(stamps), dtype=bool)
     slope = offset = 0.0
     for _ in range(10):
@@ -302,11 +309,10 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
 
 def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
     """Time that all spans [s] have in common; their keys name them in messages; raises `DataError` where there is none."""
-    late, early = (
-        max(spans, key=lambda name: spans[name][0]),
-        min(spans, key=lambda name: spans[name][1]),
-    )
-    begin, end = spans[late][0], spans[early][1]
+    late = max(spans, key=lambda name: spans[name][0])
+    early = min(spans, key=lambda name: spans[name][1])
+    begin = spans[late][0]
+    end = spans[early][1]
     if begin >= end:
         what = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
         raise DataError(

@@ -100,15 +100,14 @@ class Download:
     def _outcome(self, name: str, progress: Progress | None) -> Outcome:
         import pooch
 
-        path, recorded, found = (
-            self.folder / name,
-            name in _read_checksums(self.folder),
-            self._checked(name),
-        )
+        path = self.folder / name
+        recorded = name in _read_checksums(self.folder)
+        found = self._checked(name)
         if found is not None:
             _record(self.folder, name, found)
             return Outcome(name, "matched" if recorded else "recorded", found, path.stat().st_size)
-        address, under_way = self.address(name), self.folder / UNDER_WAY
+        address = self.address(name)
+        under_way = self.folder / UNDER_WAY
         downloader = ResumingDownloader(under_way / f"{name}.part", progress)
         pooch.get_logger().setLevel("WARNING")
         try:
@@ -139,7 +138,8 @@ class Download:
 
     def _checked(self, name: str) -> str | None:
         """Checksum of a file that is there and has the expected one; None where it is not there."""
-        path, expected = self.folder / name, self._expected(name)
+        path = self.folder / name
+        expected = self._expected(name)
         if not path.is_file() or not path.stat().st_size:
             return None
         found = sha256_of(path)

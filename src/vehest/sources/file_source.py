@@ -73,7 +73,8 @@ class FileSource(Source):
 
     def _wanted_runs(self, file: Path) -> Mapping[int | None, slice]:
         """All runs, or the one that the option ``run`` names; a source has them in the cache ``_runs_of``."""
-        runs, wanted = self._runs(file), getattr(self.options, "run", None)
+        runs = self._runs(file)
+        wanted = getattr(self.options, "run", None)
         if not runs or (wanted is not None and wanted not in runs):
             named = "between its pauses" if wanted is None else wanted
             raise DataError(f"'{file}' holds no run {named} ({listed([str(run) for run in runs])})")

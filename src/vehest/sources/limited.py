@@ -59,10 +59,8 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
         for part in (file.rglob("*") if file.is_dir() else [file])
         if part.is_file()
     )
-    seconds, memory = (
-        SECONDS + SECONDS_PER_BYTE * size,
-        current_limits().memory + MEMORY_PER_BYTE * size,
-    )
+    seconds = SECONDS + SECONDS_PER_BYTE * size
+    memory = current_limits().memory + MEMORY_PER_BYTE * size
     order = {
         "reader": reader,
         "file": str(file),
@@ -124,7 +122,8 @@ def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
 def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
     """What the reader returns within memory and processor time, without writing a file, or the error that it raises."""
     module, _, name = order["reader"].partition(":")
-    file, read = Path(order["file"]), getattr(importlib.import_module(module), name)
+    file = Path(order["file"])
+    read = getattr(importlib.import_module(module), name)
     with suppress(ImportError):
         import resource
 

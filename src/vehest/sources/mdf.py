@@ -62,7 +62,8 @@ def read_measurement(
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)
-    signals, skipped = {}, list(reading.summary["skipped"])
+    signals = {}
+    skipped = list(reading.summary["skipped"])
     groups = {place["group"] for place in reading.summary["signals"].values()}
     faults = {
         group: clock_fault(

@@ -67,13 +67,12 @@ class PoseOptions:
             deriv=1,
             delta=interval,
         )
-        velocity_x, velocity_y, yaw_rate = (
-            derivative(positions[:, 0]),
-            derivative(positions[:, 1]),
-            derivative(yaw),
-        )
+        velocity_x = derivative(positions[:, 0])
+        velocity_y = derivative(positions[:, 1])
+        yaw_rate = derivative(yaw)
         heading = scipy.signal.savgol_filter(yaw, self.window, self.order) + turned
-        cosine, sine = np.cos(heading), np.sin(heading)
+        cosine = np.cos(heading)
+        sine = np.sin(heading)
         made = {
             "vx_ref": cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
             "vy_ref": -sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,

@@ -42,11 +42,9 @@ class ResumingDownloader:
     """
 
     def __init__(self, part: Path, progress: Progress | None = None) -> None:
-        self.part, self.version, self.progress = (
-            part,
-            part.with_name(f"{part.name}.version"),
-            progress,
-        )
+        self.part = part
+        self.version = part.with_name(f"{part.name}.version")
+        self.progress = progress
         self.resumed_at = 0
 
     def __call__(
@@ -59,7 +57,8 @@ class ResumingDownloader:
         """
         from requests import exceptions
 
-        failures, most = 0, -1
+        failures = 0
+        most = -1
         while True:
             try:
                 self._attempt(url)
@@ -93,7 +92,8 @@ class ResumingDownloader:
         }  # offsets are those of the file itself
         headers |= {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUTS) as response:
-            status, about = response.status_code, response.headers
+            status = response.status_code
+            about = response.headers
             begins = status == 206 and about.get("Content-Range", "").startswith(f"bytes {have}-")
             resumed = begins and _validator(about) in ("", validator)
             if status in CHANGED and not resumed:

@@ -67,7 +67,8 @@ class SampleAndHold:
         times = (ticks if clock.stamps is None else clock.stamps)[rows]
         found = {}
         for name, column in columns.items():
-            samples, taken = column.to_si(values[column.column], channel(name).unit)[rows], times
+            samples = column.to_si(values[column.column], channel(name).unit)[rows]
+            taken = times
             if self.updated is None:
                 samples, taken = _with_repeats(samples, times)
             found[name] = np.interp(

@@ -123,16 +123,15 @@ class SignalSource(FileSource):
         times = np.unique(np.concatenate(known))
         for stamps in known:
             edges = np.concatenate([[-np.inf], stamps, [np.inf]])
-            after, before = (
-                np.searchsorted(edges, times),
-                np.searchsorted(edges, times, side="right") - 1,
-            )
+            after = np.searchsorted(edges, times)
+            before = np.searchsorted(edges, times, side="right") - 1
             times = times[edges[after] - edges[before] <= longest]
         return times
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
-        (signals, provenance), number = self._signals(file), {} if run is None else {"run": run}
+        (signals, provenance) = self._signals(file)
+        number = {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():
                 where = self._signal_name(name, signal, file)
@@ -216,7 +215,8 @@ class SignalSource(FileSource):
         near = SLACK / rate_hz
         first = max(int(np.searchsorted(signal.stamps, ticks[0] + near, side="right")) - 1, 0)
         last = int(np.searchsorted(signal.stamps, ticks[-1] - near, side="left"))
-        times, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
+        times = signal.stamps[first : last + 1]
+        values = signal.values[first : last + 1]
         declared = self.channels[name]
         require_samples(
             values, times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where

@@ -83,7 +83,8 @@ class SimulatedSource(Source):
         from vehest.simulation.sensors.config import sensor_levels_from_config
 
         super().__init__(dataset)
-        options, rate_hz = self.options, self.options.rate_hz
+        options = self.options
+        rate_hz = self.options.rate_hz
         self.vehicles = self._vehicles()
         self.drives = self._drives()
         try:
@@ -136,7 +137,8 @@ class SimulatedSource(Source):
         from vehest.simulation.road.surface import surface_from_config
         from vehest.simulation.sensors.config import sensor_levels_from_config
 
-        drive, seed = self.drives[drive_id], self.seed_of(drive_id)
+        drive = self.drives[drive_id]
+        seed = self.seed_of(drive_id)
         name = (
             next(iter(self.vehicles))
             if drive.vehicle is None and len(self.vehicles) == 1
@@ -171,7 +173,8 @@ class SimulatedSource(Source):
         )
 
     def _vehicles(self) -> dict[str, Mapping[str, Any]]:
-        one, several = self.dataset.get("vehicle"), self.options.vehicles
+        one = self.dataset.get("vehicle")
+        several = self.options.vehicles
         if isinstance(one, Mapping) and not several:
             return {"": one}
         if (
@@ -187,7 +190,8 @@ class SimulatedSource(Source):
     def _drives(self) -> dict[str, Drive]:
         drives: dict[str, Drive] = {}
         for entry in self.options.drives or ():
-            where, name = f"{self.where}: drive '{entry.id}'", str(entry.id)
+            where = f"{self.where}: drive '{entry.id}'"
+            name = str(entry.id)
             if not 0 < len(name) <= 100:
                 raise ConfigurationError(f"{where}: an id is a name of 1 to 100 characters")
             check_name(name, f"{where}: id")

@@ -138,16 +138,20 @@ def column_parts(
             else:
                 options = _options(layout, _conversion(wanted, layout))
                 batches = iter(pc.open_csv(opened.enter_context(table_stream(file)), **options))
-            batch, at = next(batches, None), 0
+            batch = next(batches, None)
+            at = 0
             for length in lengths:
-                values, done = {name: np.empty(length) for name in wanted}, 0
+                values = {name: np.empty(length) for name in wanted}
+                done = 0
                 while batch is not None and done < length:
                     own = batch.slice(at, length - done)
                     for name in wanted:
                         values[name][done : done + own.num_rows] = numbers_of(own.column(name))
-                    at, done = at + own.num_rows, done + own.num_rows
+                    at = at + own.num_rows
+                    done = done + own.num_rows
                     if at == batch.num_rows:
-                        batch, at = next(batches, None), 0
+                        batch = next(batches, None)
+                        at = 0
                 for column in values.values():
                     column.flags.writeable = False  # so that a recording shares it
                 yield (
@@ -210,7 +214,8 @@ def table_stream(file: Path) -> pa.NativeFile:
     stream = pa.input_stream(open(file, "rb"), compression=packed)  # noqa: SIM115 (pyarrow opens no name that is not UTF-8)
     if packed is None:
         return stream
-    blocks, size = [], 0
+    blocks = []
+    size = 0
     with stream:
         while block := stream.read(BLOCK):
             blocks.append(block)
@@ -241,10 +246,8 @@ def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) 
         r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", str(error), re.DOTALL
     )
     if cell is not None and layout is not None:
-        name, above = (
-            column_names(file, layout)[int(cell[1])],
-            layout.skip_rows + layout.rows_below_names + (layout.names is None),
-        )
+        name = column_names(file, layout)[int(cell[1])]
+        above = layout.skip_rows + layout.rows_below_names + (layout.names is None)
         where = f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row {int(cell[2]) - above}"
         return DataError(f"'{file}': {where}; numbers are needed")
     problem = (

@@ -92,7 +92,8 @@ class TabularSource(FileSource):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        options, where = self.options, self.where
+        options = self.options
+        where = self.where
         self.columns = (
             None if options.channels is None else columns_from_config(options.channels, self.name)
         )
@@ -130,7 +131,8 @@ class TabularSource(FileSource):
 
     def file_parts(self, file: Path) -> Iterator[Recording]:
         """`read_file` in parts, of a large table whose clock is even and whose rows can be read one after another."""
-        options, time = self.options, self.time
+        options = self.options
+        time = self.time
         apart = not (
             self._cuts
             or options.runs
@@ -199,7 +201,8 @@ class TabularSource(FileSource):
 
     def _columns_of(self, file: Path) -> Mapping[str, Column]:
         """Column of each channel: those of the data set, else those that are named like channels."""
-        names, columns = column_names(file, self.layout), self.columns
+        names = column_names(file, self.layout)
+        columns = self.columns
         if columns is None:
             columns = {
                 name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS
@@ -270,7 +273,8 @@ class TabularSource(FileSource):
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
         found = super()._files()
-        stems, patterns = {file.stem for file in found}, self.options.exclude or ()
+        stems = {file.stem for file in found}
+        patterns = self.options.exclude or ()
         for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
             for name in named:
                 if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):

@@ -36,16 +36,20 @@ class TextLogSource(TabularSource):
     version = "2"
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
-        time, clock = dataset.get("time"), None
+        time = dataset.get("time")
+        clock = None
         if isinstance(time, Mapping) and time.get("unit") == CLOCK:
-            dataset, clock = {**dataset, "time": {**time, "unit": "s"}}, str(time.get("column"))
+            dataset = {**dataset, "time": {**time, "unit": "s"}}
+            clock = str(time.get("column"))
         super().__init__(dataset)
-        below, missing = self.options.rows_below_names, self.options.missing or ()
+        below = self.options.rows_below_names
+        missing = self.options.missing or ()
         self.layout = replace(self.layout, rows_below_names=below, missing=missing, clock=clock)
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out, and without gaps that are short enough."""
-        values, longest = super()._values(file, wanted), self.options.bridge
+        values = super()._values(file, wanted)
+        longest = self.options.bridge
         if longest is None:
             return values
         clock = self.time.column if self.time is not None else None

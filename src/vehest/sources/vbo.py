@@ -39,7 +39,8 @@ UNITS = {
 }  # units that the format has without saying so
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
-FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels says nothing
+FASTEST_STILL = 5.0
+LEAST_TURN = 0.05  # m/s, rad/s: below, slip at two wheels says nothing
 FEWEST = 100  # samples that turn
 LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
 SLIP_CHECK = "slip_offsets"
@@ -105,23 +106,20 @@ class VboSource(FileSource):
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a log; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
-        log, rows, number = (
-            self._log(file),
-            self._runs_of(file)[run],
-            {} if run is None else {"run": run},
-        )
+        log = self._log(file)
+        rows = self._runs_of(file)[run]
+        number = {} if run is None else {"run": run}
         used = [column.column for column in self.columns.values()]
         require_columns(file, list(log.columns), used)
         if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (
             self.dataset.get("accept") or []
         ):
             require_slip_offsets(log, f"'{file}'")
-        clock, channels = uniform_clock(log.seconds[rows], f"'{file}'", self.options.clock), {}
+        clock = uniform_clock(log.seconds[rows], f"'{file}'", self.options.clock)
+        channels = {}
         for name, column in self.columns.items():
-            unit, where = (
-                channel(name).unit,
-                f"'{file}': column '{column.column}', for channel '{name}',",
-            )
+            unit = channel(name).unit
+            where = f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
             channels[name] = clock.align(
                 column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy
@@ -156,7 +154,8 @@ def read_log(file: Path) -> Log:
     seconds = _seconds(columns.pop("time"), file)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
-        columns, seconds = {name: own[:-1] for name, own in columns.items()}, seconds[:-1]
+        columns = {name: own[:-1] for name, own in columns.items()}
+        seconds = seconds[:-1]
 
     own, modules = (
         _of_last_columns(names, sections.get(title, ""))
@@ -205,7 +204,8 @@ def require_slip_offsets(log: Log, where: str) -> None:
     if not {"FL", "RL"} <= set(log.offsets) or not set(needed) <= set(log.columns):
         return
     front, rear, yaw_rate, speed = (log.columns[name] for name in needed)
-    yaw_rate, speed = np.radians(yaw_rate), speed / KMH
+    yaw_rate = np.radians(yaw_rate)
+    speed = speed / KMH
     turns = (speed > FASTEST_STILL) & (np.abs(yaw_rate) > LEAST_TURN)
     if turns.sum() < FEWEST:
         return
@@ -225,11 +225,9 @@ def require_slip_offsets(log: Log, where: str) -> None:
 def _seconds(stamps: FloatArray, file: Path) -> FloatArray:
     """Clock times hhmmss.ss as seconds since midnight, going on past it."""
     milliseconds = np.rint(np.where(np.isfinite(stamps), stamps, -1.0) * 1000.0)  # hh mm ss.sss
-    hours, minutes, seconds = (
-        milliseconds // 1e7,
-        milliseconds // 1e5 % 100.0,
-        milliseconds % 1e5 / 1000.0,
-    )
+    hours = milliseconds // 1e7
+    minutes = milliseconds // 1e5 % 100.0
+    seconds = milliseconds % 1e5 / 1000.0
     odd = np.flatnonzero(
         ~((milliseconds >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0))
     )

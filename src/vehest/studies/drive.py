@@ -119,10 +119,12 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     initial state over, else ``own``.
     Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
     """
-    runs, start = runs_of(artefacts), "reference" if artefacts.protocol.initial_state else "own"
+    runs = runs_of(artefacts)
+    start = "reference" if artefacts.protocol.initial_state else "own"
     rows: list[dict[str, object]] = []
     for test_set in artefacts.split.tests:
-        ranking, placed = ranking_of(artefacts, test_set), list[tuple[float, dict[str, object]]]()
+        ranking = ranking_of(artefacts, test_set)
+        placed = list[tuple[float, dict[str, object]]]()
         for name, models in by_name(artefacts.models).items():
             seeds = sorted(model.seed for model in models)
             seed = chosen_seed(seeds, name, runs)
@@ -289,11 +291,14 @@ def how_it_was_made(
 
 def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     """A range; of a recording in unix time, seconds after its start."""
-    file, begin = artefacts.references.get((span.dataset, span.recording)), 0.0
+    file = artefacts.references.get((span.dataset, span.recording))
+    begin = 0.0
     bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
     if file is not None and bounds and min(bounds) >= EARLIEST_UNIX:
         begin = read_recording(file, ["vx"]).start_time
-    start, stop, after = span.start - begin, span.stop - begin, " after its start" if begin else ""
+    start = span.start - begin
+    stop = span.stop - begin
+    after = " after its start" if begin else ""
     if span.start == -math.inf:
         return "all of it" if span.stop == math.inf else f"up to {stop:.7g} s{after}"
     return (
@@ -383,7 +388,8 @@ def _leaderboard_table(
 ) -> list[Block]:
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
-    decimals, has_bound = decimals_for(frame["rmse_sideslip"].tolist()), frame[_BOUND].notna().any()
+    decimals = decimals_for(frame["rmse_sideslip"].tolist())
+    has_bound = frame[_BOUND].notna().any()
     bound = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
     frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
@@ -482,12 +488,17 @@ def _gap_of(parts: Sequence[Scored]) -> int:
 
 def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[float, float]:
     """Times between which the mean square of the reference sideslip is largest, within one range."""
-    best, first, length, offset = -math.inf, 0, 1, 0
+    best = -math.inf
+    first = 0
+    length = 1
+    offset = 0
     for part in parts:
         n = min(round(ZOOM_SECONDS / step), len(part.time))
         power = np.convolve(np.square(part.sideslip_ref), np.full(n, 1.0 / n), mode="valid")
         if power.max() > best:
-            best, first, length = float(power.max()), offset + int(power.argmax()), n
+            best = float(power.max())
+            first = offset + int(power.argmax())
+            length = n
         offset += len(part.time) + _gap_of(parts)
     return float(time[first]), float(time[first + length - 1])
 
@@ -504,9 +515,11 @@ def _figures_of(
     parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
     step = 1.0 / artefacts.protocol.rate_hz
     drives = {name: _joined(own, step) for name, own in parts.items()}
-    first, drive = next(iter(parts.values())), next(iter(drives.values()))
+    first = next(iter(parts.values()))
+    drive = next(iter(drives.values()))
     label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
-    zoom, start = _busiest(first, drive.time, step), float(drive.time[0])
+    zoom = _busiest(first, drive.time, step)
+    start = float(drive.time[0])
     begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
     axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
     reference = figures.Traces("measured", REFERENCE, drive.vy_ref, np.degrees(drive.sideslip_ref))

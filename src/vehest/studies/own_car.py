@@ -118,7 +118,8 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     model = _to_go_on_with(part, ranking)
     name = model.name
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
-    best, level = titles[ranking.order[0]], [titles[own] for own in ranking.not_told_apart]
+    best = titles[ranking.order[0]]
+    level = [titles[own] for own in ranking.not_told_apart]
     if ranking.winner is not None:
         words = f"**Use {titles[name]}.** Expected {expected}."
     elif ranking.order[0][0] in PLAIN:
@@ -171,7 +172,8 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
     """The winner, or a plain estimator of the lowest error; else the lowest RMSE(v) on validation of those level with the lowest error."""
     alone = ranking.winner is not None or ranking.order[0][0] in PLAIN
     names = [ranking.order[0], *([] if alone else ranking.not_told_apart)]
-    runs, groups = runs_of(part), by_name(part.models)
+    runs = runs_of(part)
+    groups = by_name(part.models)
     chosen = []
     for name in names:
         seeds = sorted(model.seed for model in groups[name])
@@ -188,13 +190,14 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
 
 def _counted(part: PartArtefacts, test_set: str) -> str:
     """How much of a test the score counts, and the sideslip that the start of each range hides."""
-    protocol, scored, hidden, standing = part.protocol, list[FloatArray](), list[FloatArray](), 0
+    protocol = part.protocol
+    scored = list[FloatArray]()
+    hidden = list[FloatArray]()
+    standing = 0
     ranges = pieces_of(part.split.tests[test_set], part.reference, protocol)
     for recording, piece in ranges:
-        begin, (first, end) = (
-            recording.index_range(piece.start, piece.stop)[0],
-            scored_range(recording, piece, protocol),
-        )
+        begin = recording.index_range(piece.start, piece.stop)[0]
+        (first, end) = scored_range(recording, piece, protocol)
         still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed
         sideslip = np.degrees(
             np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"])))
@@ -202,7 +205,8 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
         standing += int(still[first:end].sum())
         hidden.append(sideslip[begin:first])
         scored.append(sideslip[first:end])
-    counted, left_out = np.concatenate(scored), np.concatenate(hidden)
+    counted = np.concatenate(scored)
+    left_out = np.concatenate(hidden)
     share = 100.0 * len(counted) / max(len(counted) + len(left_out), 1)
     most, most_hidden = (
         float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out)
@@ -225,7 +229,8 @@ def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) 
     ]
     if not models:
         return []
-    name, dataset = models[0][0].model_folder.name, models[0][1]
+    name = models[0][0].model_folder.name
+    dataset = models[0][1]
     return [
         f"vehest estimate {name} YOUR_LOG dataset={dataset} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name} -o on_the_car    # the same in C99",

@@ -121,7 +121,8 @@ def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
 def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
-        named, there = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name), minutes_of(part)
+        named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
+        there = minutes_of(part)
         wanted = (
             float(named[1]) if named is not None else math.nan
         )  # by split.minutes, which the split's name then ends in
@@ -189,10 +190,12 @@ def minutes_of(part: PartArtefacts) -> float:
     """Minutes of training and validation ranges together."""
     seconds = 0.0
     for span in (*part.split.train, *part.split.validation):
-        start, stop = span.start, span.stop
+        start = span.start
+        stop = span.stop
         if not (math.isfinite(start) and math.isfinite(stop)):
             recording = part.reference(span, ["vx"])
-            start, stop = max(start, recording.start_time), min(stop, recording.end_time)
+            start = max(start, recording.start_time)
+            stop = min(stop, recording.end_time)
         seconds += stop - start
     return seconds / 60.0
 
@@ -278,12 +281,11 @@ def _figure(curve: Curve) -> MatplotlibFigure:
         axes = figure.subplots()
         drawn = _lines(curve)
         for shift, own in enumerate(drawn):
-            line, start = line_of(own[0].estimator, own[0].variant), own[0].start
+            line = line_of(own[0].estimator, own[0].variant)
+            start = own[0].start
             apart = 1.03 ** (shift - len(drawn) / 2)
-            minutes, errors = (
-                [point.minutes * apart for point in own],
-                [ranking.rmse[point.name] for point in own],
-            )
+            minutes = [point.minutes * apart for point in own]
+            errors = [ranking.rmse[point.name] for point in own]
             dash = "solid" if start == SCRATCH else "dashed"
             label = own[0].title + ("" if start == SCRATCH else f", {start}")
             axes.plot(

@@ -31,7 +31,8 @@ from vehest.studies.drive import data_sentence, how_it_was_made
 
 CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
-DONE, FAILED = "done", "failed"
+DONE = "done"
+FAILED = "failed"
 LOGARITHMIC_FROM = 20.0
 MOST_COLUMNS_SIDE_BY_SIDE = 6
 CELL_HEIGHT = 0.42  # in
@@ -136,7 +137,8 @@ def interval(values: FloatArray) -> tuple[float, float]:
 
 def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
     """A summary as a terminal shows it: headers, and rows of cells; the chosen combination has a star."""
-    names, table = short_names(artefacts.keys), artefacts.table
+    names = short_names(artefacts.keys)
+    table = artefacts.table
     header = ["", *(names.values() or ["estimator"]), "parameters", "seeds", *artefacts.sets]
     decimals = {name: decimals_for(table[f"{METRIC}.{name}"].tolist()) for name in artefacts.sets}
     rows = []
@@ -242,7 +244,8 @@ def heat_map(
 
     values = np.concatenate([mean.ravel() for _, mean, *_ in panels])
     finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
-    low, high = float(finite.min()), float(finite.max())
+    low = float(finite.min())
+    high = float(finite.max())
     scale = (
         LogNorm(low, high)
         if low > 0 and high / low > LOGARITHMIC_FROM
@@ -288,7 +291,8 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     )
     axes.set_facecolor(NO_VALUE)
     for row, column in np.ndindex(means.shape):
-        mean, half = float(means[row, column]), float(halves[row, column])
+        mean = float(means[row, column])
+        half = float(halves[row, column])
         words = fixed(mean, decimals) + (
             f"\n±{fixed(half, decimals)}" if math.isfinite(half) else ""
         )
@@ -340,7 +344,8 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     ]
     seeds = int(row["n_seeds"])
     words += f", with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
-    mean, half = float(row[f"{METRIC}.{VALIDATION}"]), float(row[f"{METRIC}_half.{VALIDATION}"])
+    mean = float(row[f"{METRIC}.{VALIDATION}"])
+    half = float(row[f"{METRIC}_half.{VALIDATION}"])
     if len(table) > 1 and math.isfinite(half):
         close = int((table[f"{METRIC}.{VALIDATION}"] <= mean + half).sum()) - 1
         words += f" {close} of the other {len(table) - 1} combinations have a mean on the validation range within its interval."
@@ -352,7 +357,8 @@ def _set_in_words(name: str) -> str:
 
 
 def _with_interval(row: pd.Series, name: str) -> str:
-    mean, half = float(row[f"{METRIC}.{name}"]), float(row[f"{METRIC}_half.{name}"])
+    mean = float(row[f"{METRIC}.{name}"])
+    half = float(row[f"{METRIC}_half.{name}"])
     return mean_and_half(mean, half, decimals_for([mean])) + "°"
 
 
@@ -388,7 +394,8 @@ INTERVAL_AND_CHOICE = (
 
 
 def _table(artefacts: SweepArtefacts) -> Table:
-    names, table = short_names(artefacts.keys), artefacts.table
+    names = short_names(artefacts.keys)
+    table = artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
     columns |= {
         "n_parameters": Column("params", decimals=0),

@@ -151,7 +151,8 @@ def carried_over(board: pd.DataFrame) -> str:
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     tested = board[~board["estimator"].isin(BASELINES)]
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
-    lines, everywhere = [], []
+    lines = []
+    everywhere = []
     for title, own in tested.groupby("estimator_title", sort=False):
         names = beaten[beaten["estimator_title"] == title]
         where = [_place(row, board) for row in names.to_dict("records")]
@@ -199,7 +200,8 @@ def _cell(row: Mapping[Any, Any]) -> str:
         return MISSING
     decimals = decimals_for([row["rmse_sideslip"]])
     mark = " *" if row["beats_zero"] == row["beats_static_map"] == "yes" else ""
-    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    low = row["rmse_sideslip_low"]
+    high = row["rmse_sideslip_high"]
     interval = f" [{fixed(low, decimals)}, {fixed(high, decimals)}]" if math.isfinite(low) else ""
     return f"{fixed(row['rmse_sideslip'], decimals)}{interval}{mark}"
 

@@ -27,11 +27,9 @@ class Adam:
     def __init__(
         self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0
     ) -> None:
-        self.parameters, self.learning_rate, self.weight_decay = (
-            list(parameters),
-            learning_rate,
-            weight_decay,
-        )
+        self.parameters = list(parameters)
+        self.learning_rate = learning_rate
+        self.weight_decay = weight_decay
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
     def zero_grad(self) -> None:

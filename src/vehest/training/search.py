@@ -143,10 +143,12 @@ def optuna_search(
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     rows: list[FloatArray] = []
-    own, width = list(box), 1.0
+    own = list(box)
+    width = 1.0
     for stage in range(stages):
         if rows:
-            best, width = _record(rows, len(rows), False).best, width * shrink
+            best = _record(rows, len(rows), False).best
+            width = width * shrink
             widths = [
                 width * (high - low) for low, high in box
             ]  # of ranges about the best, moved inside the bounds

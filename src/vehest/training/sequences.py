@@ -240,13 +240,16 @@ class _Run:
             self._save_now_and_then(self.position == len(self.phases))
 
     def _is_over(self) -> bool:
-        epochs, settings = self.now.epochs, self.phase.settings
+        epochs = self.now.epochs
+        settings = self.phase.settings
         waited = epochs - self.now.best_epoch if epochs % settings.validate_every == 0 else 0
         return epochs >= settings.max_epochs or 0 < settings.patience <= waited
 
     def _train_epoch(self, started: float) -> None:
         """One pass over the batches, then the validation; an epoch that is stopped leaves no trace but the checkpoint before it."""
-        phase, settings, now = self.phase, self.phase.settings, self.now
+        phase = self.phase
+        settings = self.phase.settings
+        now = self.now
         if not now.validated:
             if self.context.should_stop():
                 self._stop(self._checkpoint())
@@ -254,7 +257,8 @@ class _Run:
             if phase.prepare is not None:
                 with torch.no_grad():
                     phase.prepare()
-            now.start_loss, now.validated = self._validate(), True
+            now.start_loss = self._validate()
+            now.validated = True
         before = self._checkpoint()
         if settings.schedule == "cosine":
             self.adam.learning_rate = (
@@ -262,14 +266,16 @@ class _Run:
                 * 0.5
                 * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
             )
-        total, taken = 0.0, 0
+        total = 0.0
+        taken = 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
             if self.context.should_stop():
                 self._stop(before)
                 return
             loss = self._step(batch, f"epoch {now.epochs + 1}, step {number}")
             if loss is not None:
-                total, taken = total + loss, taken + 1
+                total = total + loss
+                taken = taken + 1
         now.train_loss.append(total / taken if taken else math.nan)
         judged = now.epochs % settings.validate_every == 0 or now.epochs == settings.max_epochs
         now.validation_loss.append(self._validate() if judged else math.nan)
@@ -295,7 +301,8 @@ class _Run:
     def _step(self, batch: Any, where: str) -> float | None:
         """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
         self.adam.zero_grad()
-        loss, now = self.phase.loss(batch), self.now
+        loss = self.phase.loss(batch)
+        now = self.now
         value = float(loss.detach())
         if math.isfinite(value):
             loss.backward()
@@ -322,7 +329,8 @@ class _Run:
         with torch.no_grad():
             loss = float(self.phase.validation())
         if loss < self.now.best_loss:
-            self.now.best_loss, self.now.best_epoch = loss, self.now.epochs
+            self.now.best_loss = loss
+            self.now.best_epoch = self.now.epochs
             self.best = _copies(self.state)
         return loss
 
@@ -360,10 +368,8 @@ class _Run:
         checkpoint = load_checkpoint(self.folders[0]) if self.folders else None
         if checkpoint is None or not self._fits(checkpoint):
             return
-        finished, records = (
-            checkpoint.values["finished"],
-            [PhaseRecord(**record) for record in checkpoint.values["phases"]],
-        )
+        finished = checkpoint.values["finished"]
+        records = [PhaseRecord(**record) for record in checkpoint.values["phases"]]
         best = _named(checkpoint, "best.")
         _put_back(self.state, best if finished else _named(checkpoint, "now."))
         self._begin(len(records) if finished else len(records) - 1)

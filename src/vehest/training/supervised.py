@@ -159,7 +159,9 @@ class _Run:
 
     def _descend(self, batches: Tensor) -> Tensor:
         """The same for several batches by compiled code."""
-        own, flat, state = self.settings, self.flat.detach(), self.adam.state[self.flat]
+        own = self.settings
+        flat = self.flat.detach()
+        state = self.adam.state[self.flat]
         if not state:
             state |= {
                 "step": torch.tensor(0.0),
@@ -171,7 +173,8 @@ class _Run:
         moments = state | ({"average": self.average} if own.averaging else {})
         bounds = flat.new_tensor([[-math.inf], [math.inf]]).repeat(1, flat.shape[1])
         constrain(self.network, self.layout.views(bounds))
-        starts, targets = self.train.starts[batches], self.train.targets[batches]
+        starts = self.train.starts[batches]
+        targets = self.train.targets[batches]
         numbers = own.batch_size, own.learning_rate, bounds, own.averaging
         losses: Tensor = self.network.compiled_descent(
             flat, moments, self.train.series, starts, targets, *numbers
@@ -186,7 +189,8 @@ class _Run:
         if self.average is None:
             self.average = self.flat.detach().clone()
             return
-        decay, step = self.settings.averaging, float(self.adam.state[self.flat]["step"])
+        decay = self.settings.averaging
+        step = float(self.adam.state[self.flat]["step"])
         self.average.lerp_(self.flat.detach(), (1.0 - decay) / (1.0 - decay**step))
 
     def _batch_seeds(self) -> list[int]:
@@ -295,10 +299,8 @@ class _Run:
             return
         for member, (tensors, values) in enumerate(checkpoints):
             self.best[member] = tensors["best"]
-            self.best_loss[member], self.best_epoch[member] = (
-                values["best_loss"],
-                values["best_epoch"],
-            )
+            self.best_loss[member] = values["best_loss"]
+            self.best_epoch[member] = values["best_epoch"]
             self.history[member] = (values["train_loss"], values["validation_loss"])
         self.active = torch.tensor(unfinished, dtype=torch.int64)
         self.epoch = (

@@ -126,7 +126,8 @@ def one_step_phase(
 
     def loss(batch: tuple[Tensor, Tensor]) -> Tensor:
         rows, turned = batch
-        states, own = torch.where(turned, signs[0], 1.0), torch.where(turned, signs[1], 1.0)
+        states = torch.where(turned, signs[0], 1.0)
+        own = torch.where(turned, signs[1], 1.0)
         return _weighted(
             filtering.moved(states * before[rows], own * inputs[rows]) - states * after[rows],
             weights.one_step,
@@ -185,7 +186,8 @@ def filter_phases(
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
             drives, start = batch
-            truncated, kept = settings.truncate_steps or None, slice(settings.drop_steps, None)
+            truncated = settings.truncate_steps or None
+            kept = slice(settings.drop_steps, None)
             estimated, covariance = filtering.estimated(drives, start, truncated)
             error = (estimated - drives.states)[:, kept]
             squares = _weighted(error, weights.training)
@@ -225,7 +227,8 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
     """As many sequences of each drive as fit into it, each at a random place."""
     starts = []
     for drive in drives:
-        count, room = len(drive.states) // steps, len(drive.states) - steps + 1
+        count = len(drive.states) // steps
+        room = len(drive.states) - steps + 1
         starts += [(drive, int(torch.randint(room, (), generator=generator))) for _ in range(count)]
     return _stacked(starts, steps)
 

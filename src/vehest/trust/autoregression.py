@@ -57,11 +57,10 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
         raise DataError(
             f"{len(targets)} samples without gaps are too few for an autoregression of order {max_order} in {n_channels} channels"
         )
-    centre, spread = targets.mean(0), np.maximum(targets.std(0), 1e-12)
-    regressors, targets = (
-        (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order),
-        (targets - centre) / spread,
-    )
+    centre = targets.mean(0)
+    spread = np.maximum(targets.std(0), 1e-12)
+    regressors = (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order)
+    targets = (targets - centre) / spread
     kept = np.ones(len(targets), dtype=bool)
     for _ in range(2):
         left = _least_squares(regressors[kept], targets[kept], max_order * n_channels)
@@ -78,7 +77,8 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
         )
         odd = (np.abs(residual) > OUTLIER * robust).any(1)
         kept = ~odd if odd.mean() < 0.02 else kept
-    chosen, lowest = left, math.inf
+    chosen = left
+    lowest = math.inf
     for order in range(1, max_order + 1):
         fitted = _least_squares(regressors[kept], targets[kept], order * n_channels)
         residual = (
@@ -89,7 +89,9 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
             np.linalg.slogdet(covariance)[1]
         ) + fitted.size * math.log(len(residual))
         if criterion < lowest:
-            lowest, chosen, best = criterion, fitted, covariance
+            lowest = criterion
+            chosen = fitted
+            best = covariance
     coefficients = (
         chosen[1:].reshape(-1, n_channels, n_channels).transpose(0, 2, 1) * spread[:, None] / spread
     )
@@ -130,7 +132,8 @@ def learn_noise_levels(
         outliers cut off, between which straight lines hold.
     """
     known = np.isfinite(innovations).all(1) & np.isfinite(speed)
-    own, speed = innovations[known] / np.sqrt(np.diag(covariance)), np.abs(speed[known])
+    own = innovations[known] / np.sqrt(np.diag(covariance))
+    speed = np.abs(speed[known])
     bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)
     speeds = np.array([float(np.median(speed[rows])) for rows in bins])
     factors = np.array(

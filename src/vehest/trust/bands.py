@@ -114,7 +114,8 @@ class Bands:
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
-        which, wider = LEVELS.index(SHOWN_LEVEL), OTHER_VEHICLE if elsewhere else 1.0
+        which = LEVELS.index(SHOWN_LEVEL)
+        wider = OTHER_VEHICLE if elsewhere else 1.0
         head = [
             self.vy.factors[which] * wider,
             self.sideslip.factors[which] * wider,
@@ -164,13 +165,16 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
             continue
         vx = rows[k, columns[0]] if columns[0] >= 0 else math.nan
         terms[0] = math.sqrt(variance[k]) if variance[k] >= 0.0 else math.nan
-        terms[1], terms[2] = 1.0, vx
+        terms[1] = 1.0
+        terms[2] = vx
         terms[3] = rows[k, columns[1]] if columns[1] >= 0 else math.nan
         terms[4] = rows[k, columns[2]] if columns[2] >= 0 else math.nan
         terms[5] = rows[k, columns[3]] * vx if columns[3] >= 0 else math.nan
         terms[6] = rows[k, columns[4]] * vx if columns[4] >= 0 else math.nan
         terms[7] = vy[k]
-        squared_vy, squared_sideslip, wider = 0.0, 0.0, 1.0
+        squared_vy = 0.0
+        squared_sideslip = 0.0
+        wider = 1.0
         for j in range(n_terms):
             largest = numbers[_HEAD + 2 * n_terms + j]
             size = abs(terms[j])
@@ -364,19 +368,22 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
     Returns:
         c, (J,), of terms f, (N, J), and errors (N,); and the floor of s.
     """
-    squares, targets = np.square(terms), np.square(errors)
+    squares = np.square(terms)
+    targets = np.square(errors)
     mean = float(targets.mean())
     floor = max(LEAST_SCALE * math.sqrt(mean), 1e-9)
     columns = np.sqrt(np.mean(np.square(squares), axis=0))
     columns[columns == 0] = 1.0
-    predicted, weights = np.full(len(targets), max(mean, floor**2)), np.zeros(terms.shape[1])
+    predicted = np.full(len(targets), max(mean, floor**2))
+    weights = np.zeros(terms.shape[1])
     for _ in range(FITS):
         whitened = squares / columns / predicted[:, None]
         triangle: FloatArray = np.asarray(
             np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r")
         )  # few rows
         weights = scipy.optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
-        former, predicted = predicted, np.maximum(squares @ weights, floor**2)
+        former = predicted
+        predicted = np.maximum(squares @ weights, floor**2)
         if np.allclose(predicted, former, rtol=1e-6):
             break
     return np.asarray(weights), floor
@@ -399,7 +406,8 @@ def pooled_quantile(
     Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4 (design effect).
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
-    n_blocks, order = len(counts), np.argsort(scores, kind="stable")
+    n_blocks = len(counts)
+    order = np.argsort(scores, kind="stable")
     below = np.cumsum(1.0 / (n_blocks * counts[label[order]]))
 
     def quantile(share: float) -> float:
@@ -422,7 +430,8 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
     International Statistical Review 54 (1), 1986, for groups of unlike sizes.
     """
     _, own, sizes = np.unique(labels, return_inverse=True, return_counts=True)
-    groups, n = len(sizes), len(values)
+    groups = len(sizes)
+    n = len(values)
     if groups < 2 or n <= groups:
         return float("nan")
     means = np.bincount(own, weights=values) / sizes
@@ -440,7 +449,8 @@ def block_labels(
 
     A range without yaw rate [rad/s] is one block.
     """
-    found, count = [], 0
+    found = []
+    count = 0
     kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"
     for yaw_rate, length in zip(yaw_rates, lengths, strict=True):
         whole = kind == "range" or yaw_rate is None

@@ -50,7 +50,8 @@ FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, Val
 
 NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
 MOTION = ("vx", "yaw_rate", "ay")
-RATE_INTERVALS, RATE_TOLERANCE = 20, 0.2
+RATE_INTERVALS = 20
+RATE_TOLERANCE = 0.2
 """Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
 
 
@@ -79,12 +80,11 @@ class GuardedRun:
         *,
         elsewhere: bool = False,
     ) -> None:
-        limits, rate, kind = (
-            limits_for(estimator, trust),
-            estimator.settings.rate_hz,
-            type(estimator),
-        )
-        self.estimator, self.initial_state = estimator, initial_state
+        limits = limits_for(estimator, trust)
+        rate = estimator.settings.rate_hz
+        kind = type(estimator)
+        self.estimator = estimator
+        self.initial_state = initial_state
         self.guard = Guard(
             estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator)
         )
@@ -96,7 +96,8 @@ class GuardedRun:
             and kind.run is not Estimator.run
         )
         self.takes_parts = self._has_state or estimator.warm_up_steps > 0
-        self._begun, self._speed = False, np.full(1, np.nan)
+        self._begun = False
+        self._speed = np.full(1, np.nan)
         self._state: Any = None  # of the estimator after the last row
         self._window = np.empty(
             (0, len(estimator.channels))
@@ -130,8 +131,10 @@ class GuardedRun:
         self.recording, self.cleaned, steps = recording, self.guard(rows), len(rows)
         verdict = self.monitor.before(rows, self.cleaned)
         self.motion = motion_of(estimator.channels, self.cleaned)
-        self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
-        self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
+        self.out = np.full(steps, np.nan)
+        self.marks = np.zeros(steps, np.int8)
+        self.vx = np.full(steps, np.nan)
+        self.variance = np.full(steps, np.nan)
         self.others = {name: np.full(steps, np.nan) for name in self.others}
         if self.covariance is not None:
             self.covariance = np.full((steps, *self.covariance.shape[1:]), np.nan)
@@ -146,7 +149,8 @@ class GuardedRun:
 
         After a loss the next attempt is short at first, so that an estimator that is lost again and again takes no quadratic time.
         """
-        flow, lost = self.cleaned.flow, self.watch.state[5] > 0
+        flow = self.cleaned.flow
+        lost = self.watch.state[5] > 0
         ends = np.flatnonzero(flow[start + 1 :] != (flow[start] if flow[start] == WAIT else USE))
         end = start + 1 + int(ends[0]) if len(ends) else len(flow)
         if flow[start] == WAIT:
@@ -174,7 +178,8 @@ class GuardedRun:
         )
         watched = self.watch(raw, np.ascontiguousarray(motion), self.cleaned.flow[start:end])
         done = start + len(watched.vy)
-        self.out[start:done], self.marks[start:done] = watched.vy, watched.marks
+        self.out[start:done] = watched.vy
+        self.marks[start:done] = watched.marks
         return done, watched.lost
 
     def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
@@ -191,7 +196,8 @@ class GuardedRun:
                 strict=True,
             )
         )
-        r, rate = self.recording, self.estimator.settings.rate_hz
+        r = self.recording
+        rate = self.estimator.settings.rate_hz
         piece = Recording(
             r.id,
             r.vehicle,
@@ -259,7 +265,9 @@ class GuardedRun:
 
     def _estimate(self, verdict: Health) -> Estimate:
         """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
-        r, horizon, monitor = self.recording, self.estimator.horizon_steps, self.monitor
+        r = self.recording
+        horizon = self.estimator.horizon_steps
+        monitor = self.monitor
         vx = np.concatenate(
             [self._speed, np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])]
         )
@@ -335,12 +343,11 @@ class GuardedStepper(Stepper):
         *,
         elsewhere: bool = False,
     ) -> None:
-        self.estimator, self._channels = estimator, tuple(estimator.channels)
-        self._stepper, self._fresh, self.horizon_steps = (
-            estimator.online(),
-            True,
-            estimator.horizon_steps,
-        )
+        self.estimator = estimator
+        self._channels = tuple(estimator.channels)
+        self._stepper = estimator.online()
+        self._fresh = True
+        self.horizon_steps = estimator.horizon_steps
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
         self._front = (
@@ -355,8 +362,11 @@ class GuardedStepper(Stepper):
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
         filtered = bus_rate_hz is not None and bus_rate_hz > rate * (1 + 1e-6)
         self._monitor = Monitor(estimator, trust, elsewhere=elsewhere, behind_front_end=filtered)
-        self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)
-        self._raw, self._vx, self._variance = np.empty(1), np.full(1, np.nan), np.full(1, np.nan)
+        self._row = np.empty((1, len(estimator.channels)))
+        self._motion = np.full((1, 3), np.nan)
+        self._raw = np.empty(1)
+        self._vx = np.full(1, np.nan)
+        self._variance = np.full(1, np.nan)
         self._places = [
             estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
         ]
@@ -409,7 +419,8 @@ class GuardedStepper(Stepper):
         cleaned = self._guard(row)
         verdict = self._monitor.before(row, cleaned)
         self._raw[0], vx, self._variance[0], failed = self._estimated(cleaned)
-        motion, flow = self._motion, cleaned.flow[0]
+        motion = self._motion
+        flow = cleaned.flow[0]
         for column, at in enumerate(self._places):
             known = at >= 0 and (flow != WAIT or cleaned.measured[0, at])
             motion[0, column] = cleaned.rows[0, at] if known else math.nan
@@ -417,8 +428,10 @@ class GuardedStepper(Stepper):
             motion[0, 0] = vx
         watched = self._watch(self._raw, motion, cleaned.flow)
         if watched.lost or failed:
-            self._stepper, self._fresh = self.estimator.online(), True
-        self.marks, vy = int(watched.marks[0]), float(watched.vy[0])
+            self._stepper = self.estimator.online()
+            self._fresh = True
+        self.marks = int(watched.marks[0])
+        vy = float(watched.vy[0])
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
@@ -429,8 +442,10 @@ class GuardedStepper(Stepper):
             "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx),
         }
         if self._monitor.has_bands:
-            found["band_vy"], found["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
-        found["health"], found["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
+            found["band_vy"] = float(bands[0, 0])
+            found["band_sideslip"] = float(bands[0, 1])
+        found["health"] = float(verdict.status[0])
+        found["health_reason"] = float(verdict.reason[0])
         return found
 
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float, bool]:
@@ -458,7 +473,8 @@ class _Clock:
     """Times of samples: finds repeated and missing ones, and warns once of another rate."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._rate, self._last = rate_hz, math.nan
+        self._rate = rate_hz
+        self._last = math.nan
         self._gaps: list[float] = []
 
     def skipped(self, time: float) -> int:

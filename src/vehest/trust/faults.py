@@ -31,7 +31,8 @@ Sizes = tuple[float, float, float]
 DEGREE = math.pi / 180.0
 PIECE_SECONDS = 0.2  # of losses in pieces
 LOSS_SECONDS = 0.2  # until a wheel is locked or spins
-SPIKE_SHARE, HUGE_SHARE = 0.02, 0.05  # of the samples
+SPIKE_SHARE = 0.02
+HUGE_SHARE = 0.05  # of the samples
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {
@@ -148,7 +149,9 @@ def applies(kind: str, channel: str) -> bool:
 
 def size_of(kind: str, channel: str, severity: Severity) -> float:
     """Size of a fault, as in the module's tables; offsets of wheels and motor are shares of the largest speed."""
-    own, at, sizes = CHANNELS[channel], SEVERITIES.index(severity), KINDS[kind].sizes
+    own = CHANNELS[channel]
+    at = SEVERITIES.index(severity)
+    sizes = KINDS[kind].sizes
     if sizes is None:
         return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[own.unit])[at]
     if isinstance(sizes, tuple):
@@ -190,7 +193,10 @@ class FaultedChannel:
     def __init__(
         self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float
     ) -> None:
-        self.values, self.first, self.end, self.rate_hz = values, first, end, rate_hz
+        self.values = values
+        self.first = first
+        self.end = end
+        self.rate_hz = rate_hz
         self.inside = values[first:end]
         self.seconds = np.arange(end - first) / rate_hz
         self.range = _range(CHANNELS[fault.channel])
@@ -257,12 +263,10 @@ class Kind(NamedTuple):
     effect: Callable[[FaultedChannel], FloatArray]
 
 
-ANY, SHARE, POSITIVE, FACTOR = (
-    "a number other than 0",
-    "a share above 0, up to 1",
-    "a positive number",
-    "a factor from 0 on",
-)
+ANY = "a number other than 0"
+SHARE = "a share above 0, up to 1"
+POSITIVE = "a positive number"
+FACTOR = "a factor from 0 on"
 OWN_SIZES: dict[str, Callable[[float], bool]] = {
     ANY: lambda size: math.isfinite(size) and size != 0,
     SHARE: lambda size: 0 < size <= 1,

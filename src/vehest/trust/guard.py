@@ -46,16 +46,12 @@ STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steerin
 
 ENDLESS = 1e300  # stops of channels that have none
 
-STANDSTILL_SPEED, STANDSTILL_YAW_RATE = (
-    0.5,
-    0.05,
-)  # m/s, rad/s: below both, nothing is expected to move
+STANDSTILL_SPEED = 0.5
+STANDSTILL_YAW_RATE = 0.05  # m/s, rad/s: below both, nothing is expected to move
 
-USE, WAIT, RESTART = (
-    0,
-    1,
-    2,
-)  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
+USE = 0
+WAIT = 1
+RESTART = 2  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
 
 
 @dataclass(frozen=True)
@@ -98,14 +94,13 @@ def learn_limits(
     """
     found = {}
     for name in channels:
-        usual, table = _usual(name, rate_hz), CHANNELS[name]
+        usual = _usual(name, rate_hz)
+        table = CHANNELS[name]
         having = [recording for recording in recordings if name in recording]
         own = [recording[name] for recording in having]
-        stops, size, jump = (
-            stops_of(own, name),
-            _largest(own),
-            _largest([np.diff(part) for part in own]),
-        )
+        stops = stops_of(own, name)
+        size = _largest(own)
+        jump = _largest([np.diff(part) for part in own])
         found[name] = ChannelLimits(
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
@@ -136,7 +131,8 @@ def _usual(name: str, rate_hz: float) -> ChannelLimits:
     table = CHANNELS[name]
     size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
     if name.startswith(FREE):
-        size, noise = math.inf, 0.0
+        size = math.inf
+        noise = 0.0
     return ChannelLimits(
         max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + noise
     )
@@ -254,11 +250,9 @@ class Guard:
 
     def __call__(self, rows: FloatArray) -> Cleaned:
         """Go on with further rows, (T, C)."""
-        clean, measured, flow = (
-            np.empty_like(rows),
-            np.empty(rows.shape, np.bool_),
-            np.empty(len(rows), np.int8),
-        )
+        clean = np.empty_like(rows)
+        measured = np.empty(rows.shape, np.bool_)
+        flow = np.empty(len(rows), np.int8)
         guard_rows(
             rows, self.state, self._limits, self._skippable, self._settings, clean, measured, flow
         )
@@ -287,7 +281,10 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
             and abs(state[vx_at, 0]) < STANDSTILL_SPEED
             and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
         )
-        most_needed, least_skippable, any_skippable, jumped = 0.0, math.inf, False, False
+        most_needed = 0.0
+        least_skippable = math.inf
+        any_skippable = False
+        jumped = False
         for c in range(n_channels):
             x = rows[k, c]
             own = state[c]
@@ -305,7 +302,10 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
                     accepted = own[5] >= persists
                     jumped = jumped or accepted
             if accepted:
-                own[0], own[1], own[4], own[5] = x, 0.0, math.nan, 0.0
+                own[0] = x
+                own[1] = 0.0
+                own[4] = math.nan
+                own[5] = 0.0
             else:
                 own[1] += 1.0
             measured[k, c] = accepted

@@ -40,7 +40,9 @@ from vehest.trust.relations import (
     without_glitches,
 )
 
-VALID, DEGRADED, INVALID = 0, 1, 2
+VALID = 0
+DEGRADED = 1
+INVALID = 2
 
 HOLD_SECONDS = 1.0  # for which a flag stays after the last statistic went down
 BRIDGED_SECONDS = 0.5  # from which on a missing channel makes the estimate invalid
@@ -83,7 +85,9 @@ NUMBERS = {
 }  # number of a channel in a reason's code
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
-NO_ESTIMATE, BEYOND_SPEED, TOO_WIDE = 30, 31, 32
+NO_ESTIMATE = 30
+BEYOND_SPEED = 31
+TOO_WIDE = 32
 """Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
 
 SLOW_KERNEL = "vehest.trust.health_kernel:health_kernel"  # compiles for tens of seconds
@@ -186,7 +190,8 @@ class HealthModel:
     ] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
 
     def __post_init__(self) -> None:
-        channels, relations = len(self.channels), len(self.relations)
+        channels = len(self.channels)
+        relations = len(self.relations)
         for name in ("healthy", "heaviest"):
             object.__setattr__(self, name, getattr(self, name)[:1])
         for name in ("limits", "limits_behind_front_end"):
@@ -253,12 +258,12 @@ class HealthModel:
             behind_front_end: whether rows come through the filter from a faster bus.
         """
         limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
-        layout, statistics, names = self.layout, self.statistics, list(self.channels)
-        tables, step, coefficients = (
-            allocated(Model, layout),
-            1.0 / self.rate_hz,
-            np.array(self.coefficients),
-        )
+        layout = self.layout
+        statistics = self.statistics
+        names = list(self.channels)
+        tables = allocated(Model, layout)
+        step = 1.0 / self.rate_hz
+        coefficients = np.array(self.coefficients)
         model, _ = views(Model, tables, layout)
 
         seconds = (
@@ -275,10 +280,8 @@ class HealthModel:
         ):
             place[...] = value
         for row, relation in enumerate(self.relations):
-            model.target[row], model.versus[row] = (
-                names.index(relation.target),
-                names.index(relation.partner),
-            )
+            model.target[row] = names.index(relation.target)
+            model.versus[row] = names.index(relation.partner)
             model.involved[row] = [relation.involves(name, speed_channel(names)) for name in names]
             for feature, value in relation.terms.items():
                 if feature == RATE:
@@ -291,29 +294,30 @@ class HealthModel:
         model.largest[:] = np.maximum(self.largest, 1e-12)
         model.settled_gain[:] = (np.eye(layout.channels) - coefficients.sum(0)).T
         model.steps[:], model.step_power[:] = self._step_filter()
-        model.healthy[:], model.heaviest[:] = (
-            self.healthy[0] if self.healthy else 0.0,
-            self.heaviest[0] if self.heaviest else math.inf,
-        )
+        model.healthy[:] = self.healthy[0] if self.healthy else 0.0
+        model.heaviest[:] = self.heaviest[0] if self.heaviest else math.inf
         model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
         model.limits.every[:] = limits or math.inf
         model.inverse.every[:] = 1.0 / model.limits.every
         model.modelled[:] = np.diag(self.precision) > 0.0
         for i, name in enumerate(names):
-            model.rests[i], model.code[i] = CHANNELS[name].rests, NUMBERS[name]
+            model.rests[i] = CHANNELS[name].rests
+            model.code[i] = NUMBERS[name]
             model.wheel[i] = name.startswith("wheel_speed") and model.instant[i].any()
             model.gap_limit[i] = round(self.longest_gap[i] * self.rate_hz)
         for name in ("constant", "precision", "deviation", "usual", "speeds", "levels"):
             getattr(model, name)[:] = getattr(self, name)
         for k, statistic in enumerate(statistics):
-            model.kind[k], model.priority[k] = statistic.kind, REASONS[statistic.kind][1]
+            model.kind[k] = statistic.kind
+            model.priority[k] = REASONS[statistic.kind][1]
             model.accused[k] = names.index(statistic.channel)
             model.partner[k] = names.index(statistic.partner) if statistic.partner else -1
         return tables
 
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
         """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the latest first, and their power, (C, C)."""
-        coefficients, precision = np.array(self.coefficients), np.array(self.precision)
+        coefficients = np.array(self.coefficients)
+        precision = np.array(self.precision)
         left = np.eye(len(self.channels)) - np.concatenate(
             [np.zeros((1, *coefficients.shape[1:])), coefficients[:-1]]
         ).cumsum(0)
@@ -330,7 +334,8 @@ def _present_limits(limits: Sequence[float], channels: int, relations: int) -> t
     }.get(len(limits))
     if forms is None:
         return tuple(limits)
-    given, times = np.array(limits), 4 if forms == 7 * channels else 3
+    given = np.array(limits)
+    times = 4 if forms == 7 * channels else 3
     values, means = np.split(given[len(given) - 4 * channels - times * relations :], [4 * channels])
     offsets = given[forms : forms + 4 * channels].reshape(channels, 4)[:, 2]
     kept = [
@@ -360,7 +365,8 @@ _NO_STATISTICS = np.empty((0, 0))
 
 def compile_health(*_: object) -> None:
     """Compile the kernel, for later processes to load."""
-    rows, flat = _NO_STATISTICS, np.empty(0)
+    rows = _NO_STATISTICS
+    flat = np.empty(0)
     health_kernel.compile(tuple(map(numba.typeof, (rows, rows > 0, flat, flat, rows, rows))))
 
 
@@ -387,7 +393,8 @@ def learn_health(
         [without_glitches(recording, names) for recording in part] for part in (train, validation)
     )
     joined = {name: np.concatenate([recording[name] for recording in train]) for name in names}
-    speed, least_speed = speed_channel(names), least_speed_of(train, names)
+    speed = speed_channel(names)
+    least_speed = least_speed_of(train, names)
     usable = [name for name in names if name in MODELLED or name.startswith("wheel_speed")]
     if not usable:
         raise DataError(
@@ -450,24 +457,23 @@ def learn_health(
         for recording in (*train, *validation)
     ]
     plain, behind = (block_maxima(found, drives) for drives in ([*train, *validation], filtered))
-    statistics, step = found.statistics, 1.0 / rate_hz
-    limits, limits_behind = (
-        limits_from(plain, statistics, step),
-        limits_from(np.maximum(plain, behind), statistics, step),
-    )
+    statistics = found.statistics
+    step = 1.0 / rate_hz
+    limits = limits_from(plain, statistics, step)
+    limits_behind = limits_from(np.maximum(plain, behind), statistics, step)
     return replace(found, limits=limits, limits_behind_front_end=limits_behind)
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:
     """The autoregression as one of all channels, those that it does not hold being zero in it."""
-    places, n = [names.index(name) for name in usable], len(names)
-    constant, coefficients, precision, deviation = (
-        np.zeros(n),
-        np.zeros((model.order, n, n)),
-        np.zeros((n, n)),
-        np.ones(n),
-    )
-    constant[places], deviation[places] = model.constant, np.sqrt(np.diag(model.covariance))
+    places = [names.index(name) for name in usable]
+    n = len(names)
+    constant = np.zeros(n)
+    coefficients = np.zeros((model.order, n, n))
+    precision = np.zeros((n, n))
+    deviation = np.ones(n)
+    constant[places] = model.constant
+    deviation[places] = np.sqrt(np.diag(model.covariance))
     coefficients[np.ix_(range(model.order), places, places)] = model.coefficients
     precision[np.ix_(places, places)] = np.linalg.inv(model.covariance)
     parts = {
@@ -488,7 +494,8 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
-        memory, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
+        memory = model.start()
+        rows = np.ascontiguousarray(recording.stack(model.channels))
         health_rows(packed, rows, np.isfinite(rows), memory)
         state, _ = views(State, memory, model.layout)
         total += state.ratio_sum
@@ -500,10 +507,13 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
     """Largest value of each statistic in blocks of `BLOCK_SECONDS`, (B, K), while nothing limits any."""
-    packed, n_statistics = replace(model, limits=()).packed(), len(model.statistics)
-    length, found = max(round(BLOCK_SECONDS * model.rate_hz), 1), []
+    packed = replace(model, limits=()).packed()
+    n_statistics = len(model.statistics)
+    length = max(round(BLOCK_SECONDS * model.rate_hz), 1)
+    found = []
     for recording in recordings:
-        state, samples = model.start(), np.ascontiguousarray(recording.stack(model.channels))
+        state = model.start()
+        samples = np.ascontiguousarray(recording.stack(model.channels))
         for begin in range(0, len(samples), length):
             part = samples[begin : begin + length]
             statistics = np.empty((len(part), n_statistics))

@@ -40,10 +40,8 @@ CLEAR = 0.95  # times its limit, below which a statistic has to stay
 BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather than lost
 SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
-REVERSED, HOLDS = (
-    -0.5,
-    0.7,
-)  # correlations below which a relation is one of the wrong sign, above which it holds
+REVERSED = -0.5
+HOLDS = 0.7  # correlations below which a relation is one of the wrong sign, above which it holds
 SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
@@ -248,7 +246,9 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
 
     The last value stands for one that was not measured. A channel that is back has p rows to settle in.
     """
-    first, longest, absent = state.rows[0] == 0.0, 0.0, -1
+    first = state.rows[0] == 0.0
+    longest = 0.0
+    absent = -1
     for i in range(model.layout.channels):
         value = rows[k, i]
         known = measured[k, i] and abs(value) <= PLAUSIBLE * model.largest[i]  # false for NaN
@@ -272,7 +272,8 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
             state.gap[i] = max(state.gap[i], 0.0) + 1.0
             beyond = state.gap[i] - model.gap_limit[i]
             if beyond > longest:
-                longest, absent = beyond, i
+                longest = beyond
+                absent = i
         state.x[i] = state.last[i]
     return absent
 
@@ -285,11 +286,17 @@ def _value(state, column):  # type: ignore[no-untyped-def]
 @part()
 def _describe(model, state):  # type: ignore[no-untyped-def]
     """Features with their derivatives, y = x - W φ(x) and the noise at this speed; returns whether the car stands."""
-    columns, settings, speeds = model.layout, model.settings, model.speeds
-    r, u = _value(state, columns.yaw_rate), _value(state, columns.speed)
-    ay, ax = _value(state, columns.ay), _value(state, columns.ax)
-    speed, turning = abs(u), u * r
-    w, bent = max(speed, settings.least_speed), 0.03 * turning * turning
+    columns = model.layout
+    settings = model.settings
+    speeds = model.speeds
+    r = _value(state, columns.yaw_rate)
+    u = _value(state, columns.speed)
+    ay = _value(state, columns.ay)
+    ax = _value(state, columns.ax)
+    speed = abs(u)
+    turning = u * r
+    w = max(speed, settings.least_speed)
+    bent = 0.03 * turning * turning
     values = (
         1.0,
         r,
@@ -316,8 +323,10 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
         -r / (u * speed) if speed > settings.least_speed else 0.0,
     )
     for f in range(INSTANT_FEATURES):
-        state.by_yaw_rate[f], state.by_speed[f] = by_yaw_rate[f], by_speed[f]
-    at, share = 0, 0.0
+        state.by_yaw_rate[f] = by_yaw_rate[f]
+        state.by_speed[f] = by_speed[f]
+    at = 0
+    share = 0.0
     while at < N_LEVELS - 2 and speed > speeds[at + 1]:
         at += 1
     if speeds[at + 1] > speeds[at]:
@@ -344,7 +353,8 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
 @part()
 def _predictable(i, model, state):  # type: ignore[no-untyped-def]
     """Whether channel i was measured, and so was what its relation is made of, for long enough to be predicted."""
-    r, u = model.layout.yaw_rate, model.layout.speed
+    r = model.layout.yaw_rate
+    u = model.layout.speed
     if state.rows[0] < model.layout.settling or model.modelled[i] == 0 or state.gap[i] != 0.0:
         return False
     for f in range(1, INSTANT_FEATURES):
@@ -359,7 +369,8 @@ def _predictable(i, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _predict(model, state):  # type: ignore[no-untyped-def]
     """Innovations, scaled and clipped, and their scores S⁻¹ε; zero where nothing can be predicted."""
-    C, p = model.layout.channels, model.layout.order
+    C = model.layout.channels
+    p = model.layout.order
     for i in range(C):
         state.error[i] = model.constant[i]
     for lag in range(p):
@@ -376,19 +387,24 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
             if state.gap[i] > 0.0 and state.rows[0] >= p:
                 state.y[i] = state.error[i]
             state.error[i] = 0.0
-        own, deviation = state.error[i] / state.level[i], model.deviation[i]
+        own = state.error[i] / state.level[i]
+        deviation = model.deviation[i]
         state.scaled[i] = own
         state.clipped[i] = min(max(own, -CLIP * deviation), CLIP * deviation)
         state.innovation[0, i] = min(max(own, -STEP_CLIP * deviation), STEP_CLIP * deviation)
     for i in range(C):
-        score, clipped, stepped = 0.0, 0.0, 0.0
+        score = 0.0
+        clipped = 0.0
+        stepped = 0.0
         for j in range(C):
             score += model.precision[i, j] * state.scaled[j]
             clipped += model.precision[i, j] * state.clipped[j]
         for lag in range(p):
             for j in range(C):
                 stepped += model.steps[lag, i, j] * state.innovation[lag, j]
-        state.score[i], state.clipped_score[i], state.stepped[i] = score, clipped, stepped
+        state.score[i] = score
+        state.clipped_score[i] = clipped
+        state.stepped[i] = stepped
 
 
 @part()
@@ -413,7 +429,8 @@ def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
 @part()
 def _slope(i, model, state):  # type: ignore[no-untyped-def]
     """J = ∂y/∂xᵢ."""
-    r, u = model.layout.yaw_rate, model.layout.speed
+    r = model.layout.yaw_rate
+    u = model.layout.speed
     for m in range(model.layout.channels):
         total = 1.0 if m == i else 0.0
         if i in (r, u):
@@ -427,7 +444,9 @@ def _slope(i, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
     """A step in channel i that began p samples ago."""
-    C, step, power = model.layout.channels, 0.0, 0.0
+    C = model.layout.channels
+    step = 0.0
+    power = 0.0
     for m in range(C):
         if state.slope[m] != 0.0:
             own = state.slope[m] / state.level[m]
@@ -440,7 +459,9 @@ def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
     """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations."""
-    C, top, weight = model.layout.channels, 0.0, 0.0
+    C = model.layout.channels
+    top = 0.0
+    weight = 0.0
     for j in range(C):
         effect = 0.0
         for m in range(C):
@@ -453,18 +474,22 @@ def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
             inner += model.precision[m, j] * state.effect[j]
         weight += state.effect[m] * inner
     share = min(model.heaviest[i] / weight, 1.0) if counts and weight > 0.0 else 0.0
-    top, weight = share * top, share * weight
+    top = share * top
+    weight = share * weight
     keep = 1.0 - model.settings.forget_offset
     above = keep * state.ratio_sum[i] + top - model.healthy[i] * weight
     below = keep * keep * state.ratio_weight[i] + weight
-    state.ratio_sum[i], state.ratio_weight[i] = above, below
+    state.ratio_sum[i] = above
+    state.ratio_weight[i] = below
     state.statistics.offset[i] = abs(above) / math.sqrt(below) if below > 0.0 else 0.0
 
 
 @part()
 def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
     """Steps and offsets of each channel."""
-    C, found, highest = model.layout.channels, state.statistics.offset, 0.0
+    C = model.layout.channels
+    found = state.statistics.offset
+    highest = 0.0
     for i in range(C):
         _slope(i, model, state)
         counts = (
@@ -484,7 +509,8 @@ def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_at_values(still, model, state):  # type: ignore[no-untyped-def]
     """Runs and shares of equal samples, range, slip; returns how many wheels are slow."""
-    slow, found = 0, state.statistics
+    slow = 0
+    found = state.statistics
     fast = abs(_value(state, model.layout.speed)) > model.settings.least_speed
     for i in range(model.layout.channels):
         quiet = still or model.rests[i] == 1
@@ -503,12 +529,10 @@ def _look_at_values(still, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
     """Means of the residuals of relations; that of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f."""
-    u, step, short, longer = (
-        _value(state, model.layout.speed),
-        model.settings.step,
-        model.settings.forget_short,
-        model.settings.forget_relation,
-    )
+    u = _value(state, model.layout.speed)
+    step = model.settings.step
+    short = model.settings.forget_short
+    longer = model.settings.forget_relation
     state.mean_ax[0] += model.settings.forget_ax * (
         _value(state, model.layout.ax) - state.mean_ax[0]
     )
@@ -521,13 +545,15 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         state.mean_speed[t] += forget * (u - state.mean_speed[t])
     for j in range(model.layout.relations):
         target = state.x[model.target[j]]
-        left, small = target, 0.0
+        left = target
+        small = 0.0
         for f in range(N_FEATURES):
             own = model.average[j, f] * state.feature[f]
             left -= own
             small += own if f >= FIRST_SMALL else 0.0
         if still:
-            left, small = 0.0, 0.0
+            left = 0.0
+            small = 0.0
         gain = 0.0 if still else model.rate_gain[j]
         if complete:
             state.left[j] += short * (
@@ -546,7 +572,8 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         if complete:
             state.average[j] += longer * (left - state.average[j])
         change = gain * (u - state.mean_speed[1]) * longer / ((1.0 - longer) * step)
-        size, roof = abs(state.average[j] - change), CAP * model.limits.relation[j]
+        size = abs(state.average[j] - change)
+        roof = CAP * model.limits.relation[j]
         if size > roof:
             state.average[j] = change + (state.average[j] - change) * roof / size
             size = roof
@@ -557,39 +584,49 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
 def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
     """Kind, channel and partner of the weightiest statistic beyond its limit, and the largest statistic over its limit."""
     every = state.statistics.every
-    highest, weightiest, best = 0.0, -1.0, -1
+    highest = 0.0
+    weightiest = -1.0
+    best = -1
     for m in range(len(every)):
         over = every[m] * model.inverse.every[m]
         highest = max(highest, over)
         if over >= 1.0:
             weight = model.priority[m] + 0.5 * over / (1.0 + over)
             if weight > weightiest:
-                weightiest, best = weight, m
+                weightiest = weight
+                best = m
     if best < 0:
         return FREE, 0, -1, highest
-    kind, channel, partner = model.kind[best], model.accused[best], model.partner[best]
+    kind = model.kind[best]
+    channel = model.accused[best]
+    partner = model.partner[best]
     if kind in (
         JUMP,
         OFFSET,
     ):  # likelihood ratios of the same form compare with each other as they are
-        C, likeliest = model.layout.channels, -1.0
+        C = model.layout.channels
+        likeliest = -1.0
         for i in range(C):
             ratio = state.ratio[i] if best < C else every[best // C * C + i]
             if ratio > likeliest:
-                likeliest, channel = ratio, i
+                likeliest = ratio
+                channel = i
     if kind == LOCKED:
         kind = _wheel(channel, slow, state)
     elif kind in (OFFSET, CONTRADICTION):
         turned, culprit, against = _contradiction(model, state)
         if turned != FREE:
-            kind, channel, partner = turned, culprit, against
+            kind = turned
+            channel = culprit
+            partner = against
     return kind, channel, partner, highest
 
 
 @part()
 def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
     """Status and reason from all statistics, and the largest of these over its limit."""
-    layout, settings = model.layout, model.settings
+    layout = model.layout
+    settings = model.settings
     kind, channel, partner, highest = _find_reason(slow, model, state)
     level = 0.0
     if kind != FREE:
@@ -604,12 +641,17 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
         state.spinning[0] + 1.0 if spins and state.since_jump[0] > 5.0 * layout.spinning else 0.0
     )
     if state.spinning[0] > layout.spinning:
-        level, kind, channel, partner = 2.0, SPIN, layout.yaw_rate, -1
+        level = 2.0
+        kind = SPIN
+        channel = layout.yaw_rate
+        partner = -1
     if absent >= 0:
         level = (
             2.0 if state.gap[absent] - model.gap_limit[absent] > layout.bridged else max(level, 1.0)
         )
-        kind, channel, partner = MISSING, absent, -1
+        kind = MISSING
+        channel = absent
+        partner = -1
     reason = 0.0
     if level > 0.0:
         reason = (
@@ -617,10 +659,13 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
             + model.code[channel] * 100.0
             + (model.code[partner] if partner >= 0 else 0)
         )
-        state.hold[0], state.reason[0], state.status[0] = float(layout.hold), reason, level
+        state.hold[0] = float(layout.hold)
+        state.reason[0] = reason
+        state.status[0] = level
     elif state.hold[0] > 0.0:
         state.hold[0] = state.hold[0] - 1.0 if highest < CLEAR else float(layout.hold)
-        level, reason = state.status[0], state.reason[0]
+        level = state.status[0]
+        reason = state.reason[0]
     return level, reason, highest
 
 
@@ -635,7 +680,9 @@ def _wheel(channel, slow, state):  # type: ignore[no-untyped-def]
 @part()
 def _relation_kind(j, model, state):  # type: ignore[no-untyped-def]
     """Of the last second: `FREE` if a relation holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small."""
-    product, expected, shown = state.product[j], state.expected_power[j], state.shown_power[j]
+    product = state.product[j]
+    expected = state.expected_power[j]
+    shown = state.shown_power[j]
     roof = model.limits.relation[j]
     if max(expected, shown) < roof * roof:
         return -1
@@ -652,7 +699,10 @@ def _contradiction(model, state):  # type: ignore[no-untyped-def]
 
     Channels that only ever occur together in failing relations contradict each other; which of them is wrong cannot be decided.
     """
-    suspects, culprit, kind, failed = 0, -1, FREE, -1
+    suspects = 0
+    culprit = -1
+    kind = FREE
+    failed = -1
     for j in range(model.layout.relations):
         found = _relation_kind(j, model, state)
         if found > FREE:
@@ -663,11 +713,13 @@ def _contradiction(model, state):  # type: ignore[no-untyped-def]
     for i in range(model.layout.channels):
         explains = True
         for j in range(model.layout.relations):
-            found, involved = _relation_kind(j, model, state), model.involved[j, i]
+            found = _relation_kind(j, model, state)
+            involved = model.involved[j, i]
             if (found > FREE and involved == 0) or (found == FREE and involved == 1):
                 explains = False
         if explains:
-            suspects, culprit = suspects + 1, i
+            suspects = suspects + 1
+            culprit = i
     if suspects == 1:
         return kind, culprit, -1
     return CONTRADICTION, model.target[failed], model.versus[failed]

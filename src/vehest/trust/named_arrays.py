@@ -65,7 +65,8 @@ class Views(types.Type):  # type: ignore[misc]
 
     def __init__(self, kind: Any, sizes: Any) -> None:
         super().__init__(f"views({kind.__qualname__}, {sizes})")
-        self.kind, self.sizes = kind, sizes
+        self.kind = kind
+        self.sizes = sizes
 
 
 @register_model(Views)
@@ -97,10 +98,8 @@ class _Attributes(AttributeTemplate):  # type: ignore[misc]
 
 @lower_getattr_generic(Views)  # type: ignore[untyped-decorator]
 def _opened_field(context: Any, builder: Any, own: Views, value: Any, name: str) -> Any:
-    proxy, whole = (
-        context.make_helper(builder, own, value),
-        partial(context.get_constant, types.intp),
-    )
+    proxy = context.make_helper(builder, own, value)
+    whole = partial(context.get_constant, types.intp)
 
     def lengths(declared: Any) -> list[Any]:
         words = declared[1] or ()
@@ -131,7 +130,8 @@ def _opened_field(context: Any, builder: Any, own: Views, value: Any, name: str)
     of = _compiled_type(fields[name], own.sizes)
     if not isinstance(of, types.Array):
         return _loaded(context, builder, of, data, proxy.sizes)
-    array, shape = make_array(of)(context, builder), lengths(fields[name])
+    array = make_array(of)(context, builder)
+    shape = lengths(fields[name])
     strides = list(accumulate(reversed(shape[1:]), builder.mul, initial=whole(8)))[::-1]
     populate_array(
         array,
@@ -162,7 +162,8 @@ def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
     """Views, a tuple of numbers or a number that begins at ``data``."""
     if isinstance(of, Views):
         own = context.make_helper(builder, of)
-        own.data, own.sizes = data, sizes
+        own.data = data
+        own.sizes = sizes
         return own._getvalue()
     if isinstance(of, types.BaseTuple):
         places = [

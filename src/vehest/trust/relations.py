@@ -114,7 +114,8 @@ def speed_channel(channels: Sequence[str]) -> str | None:
 
 def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...], bool]]:
     """Target, partner, features and whether it holds at each instant, of every relation that these channels allow."""
-    speed, has = speed_channel(channels), set(channels)
+    speed = speed_channel(channels)
+    has = set(channels)
     found: list[tuple[str, str, tuple[str, ...], bool]] = []
     if speed is None:
         return found
@@ -232,7 +233,8 @@ def learn_relations(
     """Coefficients of every relation, from drives at one rate [Hz]; NaN and samples below ``least_speed`` are left out."""
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
-    parts, used = [], []
+    parts = []
+    used = []
     for recording in recordings:
         own = {name: _held(recording[name]) for name in channels}
         known = np.isfinite(recording.stack(channels)).all(1)
@@ -292,7 +294,8 @@ def _held(samples: FloatArray) -> FloatArray:
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least squares, reweighted ten times by Huber's function of the residual over its median size."""
     size = np.maximum(np.sqrt(np.mean(np.square(design), axis=0)), 1e-300)
-    scaled, weight = design / size, np.ones(len(target))
+    scaled = design / size
+    weight = np.ones(len(target))
     coefficients = np.zeros(design.shape[1])
     for _ in range(10):
         gram = (scaled * weight[:, None]).T @ scaled + 1e-9 * len(target) * np.eye(design.shape[1])

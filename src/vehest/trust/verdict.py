@@ -150,19 +150,24 @@ def isolate_rows(  # type: ignore[no-untyped-def]
         state: whether there was a fault since health was last valid, and for how many samples one in a needed channel, (2,).
     """
     for k in range(rows.shape[0]):
-        kind, channel = int(reason[k]) // 10000, int(reason[k]) % 10000 // 100
+        kind = int(reason[k]) // 10000
+        channel = int(reason[k]) % 10000 // 100
         at_fault = status[k] == INVALID
         for other in NO_FAULTS:
             at_fault = at_fault and kind != other
         if at_fault:
-            state[0], needs = 1.0, True
+            state[0] = 1.0
+            needs = True
             for c in range(rows.shape[1]):
                 if skippable[c] and numbers[c] == channel:
-                    rows[k, c], measured[k, c], needs = math.nan, False, False
+                    rows[k, c] = math.nan
+                    measured[k, c] = False
+                    needs = False
             if needs and state[1] == 0.0:
                 state[1] = 1.0
         elif status[k] == VALID and state[0] > 0.0:
-            state[0], state[1] = 0.0, 0.0
+            state[0] = 0.0
+            state[1] = 0.0
             if starts_anew and flow[k] == USE:
                 flow[k] = RESTART
         if state[1] > 0.0:
@@ -178,17 +183,23 @@ def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  #
     ``needed`` are channels that the estimator cannot do without, ``numbers`` those in codes, (C,).
     """
     for k in range(vy.shape[0]):
-        found, why = int(status[k]), int(reason[k])
+        found = int(status[k])
+        why = int(reason[k])
         for c in range(measured.shape[1]):
             if needed[c] and not measured[k, c] and why == 0:
-                found, why = max(found, DEGRADED), kernel.MISSING * 10000 + numbers[c] * 100
+                found = max(found, DEGRADED)
+                why = kernel.MISSING * 10000 + numbers[c] * 100
         if marks[k] & SPINNING and found == VALID:
-            found, why = DEGRADED, kernel.SPIN * 10000
+            found = DEGRADED
+            why = kernel.SPIN * 10000
         if marks[k] & CLIPPED:
-            found, why = INVALID, BEYOND_SPEED * 10000 if why == 0 else why
+            found = INVALID
+            why = BEYOND_SPEED * 10000 if why == 0 else why
         if marks[k] & EXTRAPOLATED or flow[k] == WAIT or not math.isfinite(vy[k]):
-            found, why = INVALID, NO_ESTIMATE * 10000 if why == 0 else why
-        status[k], reason[k] = found, why
+            found = INVALID
+            why = NO_ESTIMATE * 10000 if why == 0 else why
+        status[k] = found
+        reason[k] = why
 
 
 @entry(nogil=True)
@@ -208,4 +219,5 @@ def widen_rows(status, reason, marks, vy, vx, farthest, bands):  # type: ignore[
             if math.isfinite(speed):
                 bands[k, 1] = max(bands[k, 1], min(math.atan(reach / speed), math.pi))
         if bands[k, 1] > WIDEST:
-            status[k], reason[k] = INVALID, TOO_WIDE * 10000 if reason[k] == 0.0 else reason[k]
+            status[k] = INVALID
+            reason[k] = TOO_WIDE * 10000 if reason[k] == 0.0 else reason[k]

@@ -19,7 +19,10 @@ REMEMBERED_SECONDS = 3.0  # for which a spinning car is taken to be as fast as b
 LOST_SECONDS = 0.3  # beyond the bound, after which an estimator starts anew
 FADE_SECONDS = 1.0  # time constant with which v goes to 0 where there is no estimate
 
-EXTRAPOLATED, CLIPPED, SPINNING, STARTED = 1, 2, 4, 8
+EXTRAPOLATED = 1
+CLIPPED = 2
+SPINNING = 4
+STARTED = 8
 """Marks of a sample: no estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew at it."""
 
 
@@ -51,7 +54,8 @@ class Watch:
 
         ``motion`` holds accepted vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3), NaN if unknown; ``flow`` is of the guard, (T,).
         """
-        out, marks = np.empty(len(vy)), np.zeros(len(vy), np.int8)
+        out = np.empty(len(vy))
+        marks = np.zeros(len(vy), np.int8)
         done, lost = watch_rows(vy, motion, flow, self.state, self._settings, out, marks)
         return Watched(out[:done], marks[:done], bool(lost))
 
@@ -75,7 +79,9 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         if begins:
             marks[k] += STARTED
             state[3] = 0.0
-        u, r, ay = motion[k, 0], motion[k, 1], motion[k, 2]
+        u = motion[k, 0]
+        r = motion[k, 1]
+        ay = motion[k, 2]
         spins = abs(ay - u * r) > SPIN_RATE  # false where one is not known
         state[2] = min(state[2] + step, 2.0 * SPIN_SECONDS) if spins else max(state[2] - step, 0.0)
         remembered = (
@@ -88,7 +94,8 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         bound = largest_tan * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)
         if state[2] > SPIN_SECONDS:
             marks[k] += SPINNING
-        value, lost = math.nan, False
+        value = math.nan
+        lost = False
         if flow[k] != WAIT:
             if math.isfinite(vy[k]):
                 value = vy[k]

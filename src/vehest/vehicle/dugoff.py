@@ -115,7 +115,9 @@ class DugoffTrack:
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""
-        vx, steer, ax = inputs[..., 0].clamp(min=self.minimum_speed), inputs[..., 1], inputs[..., 2]
+        vx = inputs[..., 0].clamp(min=self.minimum_speed)
+        steer = inputs[..., 1]
+        ax = inputs[..., 2]
         load_front, load_rear = self.car.loads(ax)
         course_front = (states[..., 0] + self.car.cg_to_front_axle * states[..., 1]) / vx
         course_rear = (states[..., 0] - self.car.cg_to_rear_axle * states[..., 1]) / vx
@@ -127,7 +129,8 @@ class DugoffTrack:
     def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
         """States one step later, (..., 2) under inputs (..., 3)."""
         front, rear = self.forces(states, inputs)
-        car, vx = self.car, inputs[..., 0]
+        car = self.car
+        vx = inputs[..., 0]
         rates = torch.stack(
             [
                 (front + rear) / car.mass - vx * states[..., 1],

@@ -214,7 +214,8 @@ class TyreNetworkCar(Dynamics):
 
 def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
     """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and known ones as `KNOWN`; 0 and 1 where a car has none."""
-    car, tyres = getattr(dynamics, "car", None), getattr(dynamics, "tyres", None)
+    car = getattr(dynamics, "car", None)
+    tyres = getattr(dynamics, "tyres", None)
     if not isinstance(car, PlanarCar):
         return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(KNOWN)
     learnt = torch.stack([car.learnt[name] for name in LEARNT])
@@ -228,7 +229,9 @@ def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
 
 def _kinematic(state: Tensor, rates: Tensor) -> Motion:
     """Motion of given rates: ax = dvx/dt - vy r, ay = dvy/dt + vx r."""
-    vx, vy, yaw_rate = state[..., 0], state[..., 1], state[..., 2]
+    vx = state[..., 0]
+    vy = state[..., 1]
+    yaw_rate = state[..., 2]
     return Motion(rates, rates[..., 0] - vy * yaw_rate, rates[..., 1] + vx * yaw_rate)
 
 

@@ -89,7 +89,8 @@ class PlanarCar(nn.Module):
         p = self.learnt
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
         steer, current = inputs.unbind(-1)
-        sine, cosine = torch.sin(steer), torch.cos(steer)
+        sine = torch.sin(steer)
+        cosine = torch.cos(steer)
         drag = (
             p["drag_constant"] * torch.sign(vx)
             + p["drag_linear"] * vx

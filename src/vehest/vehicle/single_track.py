@@ -35,13 +35,12 @@ class LateralModel(NamedTuple):
 def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
     """The model at forward speeds u, positive (...) [m/s]; it is continuous."""
     u = np.asarray(vx, np.float64)
-    front, rear, lf, lr = (
-        car.cornering_stiffness_front,
-        car.cornering_stiffness_rear,
-        car.cg_to_front_axle,
-        car.cg_to_rear_axle,
-    )
-    moment, same = lf * front - lr * rear, np.ones_like(u)
+    front = car.cornering_stiffness_front
+    rear = car.cornering_stiffness_rear
+    lf = car.cg_to_front_axle
+    lr = car.cg_to_rear_axle
+    moment = lf * front - lr * rear
+    same = np.ones_like(u)
     per_momentum = 1.0 / (car.mass * u)
     A = [
         -(front + rear) * per_momentum,

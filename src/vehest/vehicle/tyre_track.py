@@ -46,7 +46,8 @@ class TyreTrack:
     def axles(self, states: Tensor, inputs: Tensor) -> tuple[AxleForce, AxleForce]:
         """Forces of the front and the rear axle, of states (..., n) and inputs (..., 2)."""
         c1_front, c2_front, c1_rear, c2_rear, friction = self.parameters(states)
-        sideslip, turn = states[..., 0], states[..., 1] / inputs[..., 0]
+        sideslip = states[..., 0]
+        turn = states[..., 1] / inputs[..., 0]
         front = inputs[..., 1] - sideslip - self.car.cg_to_front_axle * turn
         rear = -sideslip + self.car.cg_to_rear_axle * turn
         return rational_axle(front, c1_front, c2_front, friction), rational_axle(

@@ -27,7 +27,8 @@ UNCLAIMED = "not in it"  # in the place of the paper's figure, where it claims n
 HEADERS = {MSE: "MSE", MSE_NL: "MSE_nl", ME: "ME", ME_NL: "ME_nl"}
 WEAK = ("braking in the turn", "J-turn", "skidpad")
 AROUND_PEAK = 10  # samples before and after
-HIGH, LOW = 5.0, 1.0  # deg of |β|
+HIGH = 5.0
+LOW = 1.0  # deg of |β|
 OutputsOf = Mapping[
     str, Sequence[Sequence[Outputs]]
 ]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
@@ -179,7 +180,8 @@ def on_parts(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:
 def on_networks(main: ManoeuvreErrors, outputs: OutputsOf, data: str) -> list[Statement | Claim]:
     """Figure 8: distrust and process noise."""
     found: list[Statement | Claim] = []
-    correlations, words = [], []
+    correlations = []
+    words = []
     for hybrid in paper.HYBRIDS:
         value, low, high = _over_samples(main, outputs[hybrid], _rank_correlation)
         correlations.append((low, high))
@@ -254,8 +256,10 @@ def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
     unpaired = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
     changes = [own.change(paper.CNN, paper.DEEP, MSE_NL) for own in unpaired]
     verdicts = [verdict_below(*own.ends(), 1.0) for own in changes]
-    below, above = verdicts.count("reproduced"), verdicts.count("not reproduced")
-    low, high = min(own.ends()[0] for own in changes), max(own.ends()[1] for own in changes)
+    below = verdicts.count("reproduced")
+    above = verdicts.count("not reproduced")
+    low = min(own.ends()[0] for own in changes)
+    high = max(own.ends()[1] for own in changes)
     ours = f"below in {below}, above in {above} of {len(changes)}; −{short(100 * (1 - low))} to {short(100 * (high - 1))} %"
     entries.append(
         Claim(
@@ -271,10 +275,8 @@ def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
         own = ManoeuvreErrors(
             {"tuned": found.tuned, "as trained": found.stiffness[0][paper.DEEP]}, "test"
         )
-        words, tests = (
-            "MSE_nl lower with p₁, p₂ tuned anew where stiffness is off by −10 %",
-            own.change("tuned", "as trained", MSE_NL),
-        )
+        words = "MSE_nl lower with p₁, p₂ tuned anew where stiffness is off by −10 %"
+        tests = own.change("tuned", "as trained", MSE_NL)
         entries.append(Statement(words, "IV-C", data, [Compared("", tests)]))
     return entries
 
@@ -351,10 +353,8 @@ def level(words: str, known: str, data: str, change: Change) -> Claim:
 
 def _level(change: Change) -> Verdict:
     low, high = change.ends()
-    within, without = (
-        low >= 1.0 - LEVEL and high <= 1.0 + LEVEL,
-        high < 1.0 - LEVEL or low > 1.0 + LEVEL,
-    )
+    within = low >= 1.0 - LEVEL and high <= 1.0 + LEVEL
+    without = high < 1.0 - LEVEL or low > 1.0 + LEVEL
     return "reproduced" if within else "not reproduced" if without else "undecided"
 
 
@@ -436,7 +436,8 @@ def _nearest_zero(main: ManoeuvreErrors, data: str) -> Claim:
         name: 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
         for name, (_, low, high) in means.items()
     }
-    largest, least = farthest.pop(paper.CNN), nearest.pop(paper.CNN)
+    largest = farthest.pop(paper.CNN)
+    least = nearest.pop(paper.CNN)
     verdict: Verdict = "undecided"
     if largest < min(nearest.values()) or least > min(farthest.values()):
         verdict = "reproduced" if largest < min(nearest.values()) else "not reproduced"
@@ -510,7 +511,8 @@ def _peaks(main: ManoeuvreErrors, data: str) -> Statement:
 
 def _difference(worst: ManoeuvreErrors, nominal: ManoeuvreErrors, candidate: str) -> Measured:
     """By how much a candidate's worst MSE exceeds its MSE as identified, drawn together."""
-    one, other = worst.get(candidate, MSE), nominal.get(candidate, MSE)
+    one = worst.get(candidate, MSE)
+    other = nominal.get(candidate, MSE)
     draws = np.log(np.maximum(np.exp(one.draws) - np.exp(other.draws), 1e-9))
     each = np.log(np.maximum(np.exp(one.of_each) - np.exp(other.of_each), 1e-9))
     return Measured(max(one.value - other.value, 1e-9), draws, each, one.n_blocks)
@@ -528,7 +530,8 @@ def _over_samples(
     statistic: Callable[[Sequence[Outputs]], float],
 ) -> tuple[float, float, float]:
     """A figure of all samples, mean over seeds, with its interval over 200 resamples of manoeuvres and seeds."""
-    generator, count = np.random.default_rng(0), len(main.manoeuvres)
+    generator = np.random.default_rng(0)
+    count = len(main.manoeuvres)
     value = float(np.mean([statistic(seed) for seed in outputs]))
     drawn = []
     for _ in range(200):
@@ -552,10 +555,8 @@ def _thinned(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 def _rank_correlation(outputs: Sequence[Outputs]) -> float:
-    distrust, error = (
-        _thinned([own.distrust for own in outputs]),
-        _thinned([np.abs(own.error) for own in outputs]),
-    )
+    distrust = _thinned([own.distrust for own in outputs])
+    error = _thinned([np.abs(own.error) for own in outputs])
     return float(stats.spearmanr(distrust, error).statistic) if np.ptp(distrust) > 0 else 0.0
 
 
@@ -565,12 +566,14 @@ def _decades(outputs: Sequence[Outputs]) -> float:
 
 
 def _rise_of_yaw_rate(outputs: Sequence[Outputs]) -> float:
-    values, angle = _process(outputs, 1), np.abs(_thinned([own.sideslip for own in outputs]))
+    values = _process(outputs, 1)
+    angle = np.abs(_thinned([own.sideslip for own in outputs]))
     return _ratio(values[angle >= HIGH], values[angle < LOW])
 
 
 def _rise_of_vy(outputs: Sequence[Outputs]) -> float:
-    values, beyond = _process(outputs, 0), np.concatenate([own.nonlinear[::10] for own in outputs])
+    values = _process(outputs, 0)
+    beyond = np.concatenate([own.nonlinear[::10] for own in outputs])
     return _ratio(values[beyond], values[~beyond])
 
 

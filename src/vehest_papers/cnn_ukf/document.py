@@ -46,7 +46,11 @@ from vehest_papers.kit.claims import claims_table
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.kit.statements import decided
 
-FULL, BEFORE, FREE, STANDARD, LIMITED = "full", "before", "free", "standard", "limited"
+FULL = "full"
+BEFORE = "before"
+FREE = "free"
+STANDARD = "standard"
+LIMITED = "limited"
 RENAMED = {
     BEFORE: {paper.CNN: paper.BEFORE},
     FREE: {paper.SMOOTH: paper.FREE, paper.CNN: paper.CNN_FREE},
@@ -118,7 +122,8 @@ def _report(
     prepared: Mapping[str, Prepared],
 ) -> Document:
     kind = words_of_kinds(artefacts.parts[FULL])
-    main, own = ManoeuvreErrors(runs, "test"), prepared[FULL]
+    main = ManoeuvreErrors(runs, "test")
+    own = prepared[FULL]
     filters_with_networks = ("ensemble_ukf", "cnn_ukf")
     hybrids = [
         name
@@ -221,7 +226,8 @@ def _asked(
             f"**Training through the filter** changes CNN-UKF's MSE_nl by {change.in_percent()}."
         )
     if paper.FREE in main:
-        change, name = main.change(paper.CNN, paper.FREE, MSE_NL), titles[paper.CNN]
+        change = main.change(paper.CNN, paper.FREE, MSE_NL)
+        name = titles[paper.CNN]
         sentences.append(
             f"**A filter alone** whose process noise is free, as no row of the paper is, has {main.in_words(paper.FREE, MSE_NL)} deg²: "
             f"{name} against it {change.in_percent()}."
@@ -257,7 +263,8 @@ def _results(
     titles: Mapping[str, str],
     drawn: Mapping[str, Run],
 ) -> list[Block]:
-    part, own = artefacts.parts[FULL], prepared[FULL]
+    part = artefacts.parts[FULL]
+    own = prepared[FULL]
     kind = words_of_kinds(part).upper()
     slalom = traces.manoeuvre_of(part, own, "slalom")
     four = {
@@ -346,8 +353,10 @@ def _appendices(
     drawn: Mapping[str, Run],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    part, own = artefacts.parts[FULL], prepared[FULL]
-    kind, title = words_of_kinds(part).upper(), artefacts.titles[FULL].lower()
+    part = artefacts.parts[FULL]
+    own = prepared[FULL]
+    kind = words_of_kinds(part).upper()
+    title = artefacts.titles[FULL].lower()
     shown = {
         titles[name]: runs[name]
         for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
@@ -382,7 +391,9 @@ def _appendices(
 def _limited(
     artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str
 ) -> list[Block]:
-    part, words, runs = artefacts.parts[LIMITED], kind.upper(), learnt.comparison.runs
+    part = artefacts.parts[LIMITED]
+    words = kind.upper()
+    runs = learnt.comparison.runs
     drawn = {
         name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH
     }
@@ -418,7 +429,8 @@ def _limited(
 def _networks_and_oracles(
     parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str
 ) -> list[Block]:
-    words, blocks = kind.upper(), list[Block]()
+    words = kind.upper()
+    blocks = list[Block]()
     if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(
         map(search.is_point, parts)
     ):
@@ -519,7 +531,8 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
         "Both hybrids have the paper's constant levels of process noise, from which CNN-UKF's heads start; what sensors measure is taken "
         "for ten times more uncertain than it is, since behind a low-pass of 5 Hz it is alike over ten samples.",
     ]
-    deep, own = trainings.get(paper.DEEP), trainings.get(paper.CNN)
+    deep = trainings.get(paper.DEEP)
+    own = trainings.get(paper.CNN)
     if deep is not None:
         phase = deep["phase"]
         assert isinstance(phase, Mapping)

@@ -31,7 +31,8 @@ class Limited:
     )
 
 
-AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full set"
+AS_TUNED = "tuned on the limited set"
+OF_THE_FULL_SET = "p₁, p₂ of the full set"
 
 
 def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
@@ -64,10 +65,8 @@ def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
 
 def _with_scaling_of(other: Run, run: Run, prepared: Prepared) -> Run:
     """A DE-UKF with p₁ and p₂ (Eq. 11) of another one, on the test."""
-    changed, known = (
-        copy.deepcopy(load_model(run.model.model_folder)),
-        load_model(other.model.model_folder),
-    )
+    changed = copy.deepcopy(load_model(run.model.model_folder))
+    known = load_model(other.model.model_folder)
     assert isinstance(changed, EnsembleUkf)
     assert isinstance(known, EnsembleUkf)
     changed.scaling = known.scaling.copy()

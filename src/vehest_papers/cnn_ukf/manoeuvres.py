@@ -118,7 +118,8 @@ def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> 
         raise DataError(
             f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False"
         )
-    first, last = np.floor(errors.min() / BIN), np.floor(errors.max() / BIN) + 1
+    first = np.floor(errors.min() / BIN)
+    last = np.floor(errors.max() / BIN) + 1
     edges = BIN * np.arange(first, last + 1)
     counts = np.bincount(
         (np.floor(errors / BIN) - first).astype(np.int64), minlength=len(edges) - 1

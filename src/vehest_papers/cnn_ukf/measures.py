@@ -17,7 +17,10 @@ from vehest_papers.kit.sampled import SampledErrors, resampled
 from vehest_papers.kit.statements import Change, Measured, short
 
 N_RESAMPLES = 4000
-MSE, MSE_NL, ME, ME_NL = "mse", "mse_nonlinear", "max_error", "max_error_nonlinear"
+MSE = "mse"
+MSE_NL = "mse_nonlinear"
+ME = "max_error"
+ME_NL = "max_error_nonlinear"
 BALANCED = "balanced"  # mean over manoeuvres of their RMSE, by which seeds and settings are chosen
 
 Sums = tuple[FloatArray, FloatArray]  # of each manoeuvre a sum and what it is divided by, (M,) each
@@ -70,7 +73,8 @@ class ManoeuvreErrors(SampledErrors):
         if key not in self._known:
             pieces = [sums_of(run.test, indicator) for run in self.runs[candidate]]
             kept = np.array([group in ("", own) for own in self.groups], dtype=np.float64)
-            sums, sizes = np.stack([own for own, _ in pieces]) * kept, pieces[0][1] * kept
+            sums = np.stack([own for own, _ in pieces]) * kept
+            sizes = pieces[0][1] * kept
             self._known[key] = self.measured(sums, sizes, int(np.count_nonzero(kept)))
         return self._known[key]
 
@@ -95,7 +99,8 @@ class ManoeuvreErrors(SampledErrors):
         self, candidate: str, statistic: Callable[[Sequence[Run], FloatArray], float]
     ) -> tuple[float, float, float]:
         """Any figure of a candidate's seeds and how often each manoeuvre counts, with the 2.5 and 97.5 % of 500 resamples."""
-        runs, generator = self.runs[candidate], np.random.default_rng(self._seed)
+        runs = self.runs[candidate]
+        generator = np.random.default_rng(self._seed)
         found = []
         for number, counts in enumerate(self._counts[:501]):
             picked = (

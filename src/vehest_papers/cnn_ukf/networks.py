@@ -64,7 +64,8 @@ def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
 
 def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     """Outputs of a hybrid's network on each test manoeuvre."""
-    drives, spans = prepared.seen(TEST), prepared.spans(TEST)
+    drives = prepared.seen(TEST)
+    spans = prepared.spans(TEST)
     found = []
     for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
         (part,) = run.test[span.recording]
@@ -96,7 +97,9 @@ def filtered_with(
 
 def shift_of(run: Run, prepared: Prepared) -> float:
     """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over scored samples."""
-    fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
+    fitted = hybrid_of(run)
+    drives = prepared.seen(TEST)
+    spans = prepared.spans(TEST)
     pseudo = fitted.pseudo_measurements(drives)
     moved = [own._replace(sideslip=own.sideslip + math.radians(1.0)) for own in pseudo]
     shifts = []
@@ -115,7 +118,9 @@ def shift_of(run: Run, prepared: Prepared) -> float:
 
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
     """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no estimator."""
-    fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
+    fitted = hybrid_of(run)
+    drives = prepared.seen(TEST)
+    spans = prepared.spans(TEST)
     pseudo = []
     for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):
         whole = prepared.recording(span.dataset, span.recording).cut(

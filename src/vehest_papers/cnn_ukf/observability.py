@@ -85,8 +85,10 @@ def observability_table(found: pd.DataFrame) -> Table:
 
 def claims(found: pd.DataFrame) -> list[Claim]:
     """Rank two wherever the car steers, and less at zero steering."""
-    steered, straight = found[found["steer"] > 0], found[found["steer"] == 0]
-    full, lost = int((steered["rank"] == 2).sum()), int((straight["rank"] < 2).sum())
+    steered = found[found["steer"] > 0]
+    straight = found[found["steer"] == 0]
+    full = int((steered["rank"] == 2).sum())
+    lost = int((straight["rank"] < 2).sum())
     worst = float(
         straight["deviation"].max()
         / found[found["steer"] == min(steered["steer"])]["deviation"].max()

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-MODEL, DATA, DEEP, CNN = "Model-based", "Data-driven", "DE-UKF", "CNN-UKF"
+MODEL = "Model-based"
+DATA = "Data-driven"
+DEEP = "DE-UKF"
+CNN = "CNN-UKF"
 SMOOTH = "Model-based, smooth tyres"  # not in the paper: the filter of the CNN-UKF alone
 FREE = "Model-based, free noise"
 """Not in the paper: the same filter, whose process noise may be as large as serves it best, far beyond the paper's."""
@@ -14,11 +17,11 @@ BEFORE = "not trained through the filter"
 Z_SCORES = "Data-driven, z-scores"
 RECURRENT = "Recurrent network"
 PLAIN = "plain tyres"
-ORACLE_FILTER, ORACLE_DISTRUST = (
-    "Oracle: filter fitted to the test",
-    "Oracle: CNN-UKF, perfect distrust",
-)
-ZERO, STATIC_MAP, DATA_SHEET = "v = 0", "Static map", "Data sheet"
+ORACLE_FILTER = "Oracle: filter fitted to the test"
+ORACLE_DISTRUST = "Oracle: CNN-UKF, perfect distrust"
+ZERO = "v = 0"
+STATIC_MAP = "Static map"
+DATA_SHEET = "Data sheet"
 
 CANDIDATES = (
     MODEL,

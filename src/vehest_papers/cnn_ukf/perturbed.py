@@ -44,7 +44,9 @@ BODIES = {
 }
 """What of the car is taken for another than it is -> factors of mass and of yaw inertia."""
 WITH_FILTER = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
-TRIALS, STAGES, SHRINK = 30, 2, 0.3  # of the search for p₁ and p₂, as in the training
+TRIALS = 30
+STAGES = 2
+SHRINK = 0.3  # of the search for p₁ and p₂, as in the training
 
 
 @dataclass(frozen=True, eq=False)

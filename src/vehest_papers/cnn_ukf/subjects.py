@@ -203,7 +203,8 @@ class Prepared:
     """
 
     def __init__(self, part: PartArtefacts, *, whole: bool = False) -> None:
-        self._part, self._whole = part, whole
+        self._part = part
+        self._whole = whole
         self._read: dict[tuple[str, str], Recording] = {}
 
     def spans(self, test: str) -> Sequence[Span]:

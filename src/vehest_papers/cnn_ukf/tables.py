@@ -58,7 +58,8 @@ def accuracy(
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}
         for kpi in KPIS:
             known = getattr(published[candidate], kpi) if candidate in published else math.nan
-            row[f"paper_{kpi}"], row[f"ours_{kpi}"] = known, comparison.in_words(candidate, kpi)
+            row[f"paper_{kpi}"] = known
+            row[f"ours_{kpi}"] = comparison.in_words(candidate, kpi)
             row[kpi] = (
                 row[f"ours_{kpi}"]
                 if math.isnan(known)
@@ -171,10 +172,8 @@ def networks_alone(
         measured = comparison.measured(*squares(seeds))
         every = [own for seed in seeds for own in seed]
         beyond = np.concatenate([own.nonlinear for own in every])
-        error, distrust = (
-            np.concatenate([own.error for own in every]),
-            np.concatenate([own.distrust for own in every]),
-        )
+        error = np.concatenate([own.error for own in every])
+        distrust = np.concatenate([own.distrust for own in every])
         rows.append(
             {
                 "candidate": candidate,
@@ -324,7 +323,8 @@ def given_as_found(full: Runs) -> str:
 
     Stiffness, friction and levels count by their relative difference, the reductions as they are.
     """
-    worst, where = 0.0, ""
+    worst = 0.0
+    where = ""
     for candidate, source in ((paper.DEEP, paper.MODEL), (paper.CNN, paper.SMOOTH)):
         if candidate not in full or source not in full:
             continue
@@ -344,7 +344,8 @@ def given_as_found(full: Runs) -> str:
                     abs(here - there) if name.startswith("reduction") else abs(here / there - 1.0)
                 )
                 if difference > worst:
-                    worst, where = difference, f"{name} of {candidate}"
+                    worst = difference
+                    where = f"{name} of {candidate}"
     shown = f"the largest difference is {significant(100.0 * worst, 2)} %{f' ({where})' if where else ''}"
     if worst > SAME:
         return f"**Tyres or sensors' levels of the hybrids are not those that the filters find now**: {shown}. Write them anew."

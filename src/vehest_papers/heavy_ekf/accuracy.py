@@ -139,10 +139,8 @@ def underestimation_claims(
     for test in ("nominal_laps", "worn_laps"):
         for name in (paper.LINT, paper.RATT):
             value, low, high = gains[test, name]
-            verdict, words = (
-                verdict_below(low, high, 1.0),
-                f"gain {with_interval(value, low, high, 2)}",
-            )
+            verdict = verdict_below(low, high, 1.0)
+            words = f"gain {with_interval(value, low, high, 2)}"
             why = {
                 "reproduced": "the interval lies below 1",
                 "not reproduced": "the interval lies above 1",
@@ -262,6 +260,7 @@ def _counts(n_blocks: int) -> FloatArray:
 
 def _drawn_rmse(error: FloatArray, rate_hz: float) -> FloatArray:
     """RMSE, first of all blocks as they are, then of drawn ones."""
-    sums, sizes = _sums(np.square(error), rate_hz), _sums(np.ones(len(error)), rate_hz)
+    sums = _sums(np.square(error), rate_hz)
+    sizes = _sums(np.ones(len(error)), rate_hz)
     counts = _counts(len(sums))
     return np.asarray(np.sqrt((counts @ sums) / (counts @ sizes)), dtype=np.float64)

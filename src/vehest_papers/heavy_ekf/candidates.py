@@ -22,7 +22,9 @@ from vehest_papers.heavy_ekf import crossfall_filter, paper
 from vehest_papers.heavy_ekf.twin import CURVES, NOISE, RATE, TRUCK, Conditions, Drive, drive
 
 ORACLE = "oracle tyres"
-ZERO, STATIC_MAP, DATA_SHEET = "zero", "static map", "data sheet"
+ZERO = "zero"
+STATIC_MAP = "static map"
+DATA_SHEET = "data sheet"
 WITH_STATE = ", crossfall state"
 KINDS: dict[str, Tyres] = {
     paper.LINT: "linear",
@@ -36,14 +38,14 @@ BOX = {"ay": (-4.0, 4.0), "steer": (-6.0, 4.0), "tyres": (-8.0, 2.0)}
 DEVIATION = (
     0.26  # of these logarithms at the start: the rms of ln(1 + mismatch) over the cells of the map
 )
-DRAWN, REFINED, EVALUATIONS = (
-    128,
-    3,
-    80,
-)  # points of the box, how many of the best are refined, and evaluations of each
+DRAWN = 128
+REFINED = 3
+EVALUATIONS = 80  # points of the box, how many of the best are refined, and evaluations of each
 TUNING_SECONDS = 60.0
 EDGE = 0.02  # of a box's width: nearer to its end than this the search ended on it
-TUNED_SLIPS, TUNED_MISMATCHES, FIRST_TUNING_SEED = (2.5, 4.5, 6.5), (-0.25, -0.05, 0.15), 1000
+TUNED_SLIPS = (2.5, 4.5, 6.5)
+TUNED_MISMATCHES = (-0.25, -0.05, 0.15)
+FIRST_TUNING_SEED = 1000
 
 
 @dataclass(frozen=True)
@@ -105,14 +107,16 @@ def states_of(
 def oracle(levels: Levels, own: Drive) -> FloatArray:
     """β of RATT that knows the plant's tyres, their loads and the friction at each sample, (T,), but not the payload's mass."""
     changes = np.flatnonzero(np.diff(own.friction)) + 1
-    found, state = np.empty(len(own.friction)), None
+    found = np.empty(len(own.friction))
+    state = None
     for begin, end in itertools.pairwise([0, *changes.tolist(), len(own.friction)]):
         before = 1 if begin else 0  # one more sample, whose measurements the state holds already
         rows = own.samples[begin - before : end].copy()
         rows[:before, [0, 2]] = np.nan
         estimator = estimator_of(ORACLE, levels, own.plant.curves(float(own.friction[begin])))
         filtered = estimator.filter_samples(rows, state)
-        found[begin:end], state = filtered.mean[before:, 0], filtered.last
+        found[begin:end] = filtered.mean[before:, 0]
+        state = filtered.last
     return found
 
 
@@ -121,7 +125,8 @@ def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray
     recordings = [own.recording for own in tuning]
     fitted = StaticMap(StaticMap.settings_type(RATE))
     fitted.values = fitted.closed_form(recordings)
-    front, rear = float(TRUCK.cg_to_front_axle), float(TRUCK.cg_to_rear_axle)
+    front = float(TRUCK.cg_to_front_axle)
+    rear = float(TRUCK.cg_to_rear_axle)
     sheet = DataSheet(
         DataSheet.settings_type(rate_hz=RATE, wheelbase=front + rear, cg_to_rear_axle=rear)
     )

@@ -20,7 +20,9 @@ BASELINE_TITLES = {
     "data_sheet": "data sheet",
 }
 """Estimators that the filters have to beat -> what they are called in tables."""
-LAPS, FAST, REAL = "nominal_laps", "nominal_fast", "test"
+LAPS = "nominal_laps"
+FAST = "nominal_fast"
+REAL = "test"
 ASKED = [(better, worse) for better, worse in paper.GAINS]
 
 
@@ -47,7 +49,8 @@ def claims_blocks(
 ) -> tuple[Table, str]:
     """The table of claims, those of the tests before ``others``, and a sentence a test on the best filter."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
-    titles, found = titles_of(truck), rankings_of(truck)
+    titles = titles_of(truck)
+    found = rankings_of(truck)
     data = words_of_kinds(truck)
     claims: list[Claim] = [
         bound_claim(

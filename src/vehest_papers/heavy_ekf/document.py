@@ -38,7 +38,10 @@ from vehest_papers.kit import methods
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
-TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"
+TRUCK = "truck"
+DRAWS = "seeds"
+FERRARI = "ferrari"
+WHEELED = "av21"
 WHEELS = SpeedFromWheels(
     wheel_radius=0.48, track_front=2.08, track_rear=2.08
 )  # as in conf/vehicle/heavy_truck.yaml
@@ -137,7 +140,8 @@ def _lap_by_lap(
         accuracy.underestimation_table(gains, names),
         accuracy.stop_table(drives, estimates, names),
     ]
-    ratte, three = estimates[NOMINAL][paper.RATTE], drives[NOMINAL]
+    ratte = estimates[NOMINAL][paper.RATTE]
+    three = drives[NOMINAL]
     faster = accuracy.faster_is_better_claim(three, ratte, slowest)
     return blocks, [
         faster,
@@ -147,10 +151,8 @@ def _lap_by_lap(
 
 
 def _asked(artefacts: StudyArtefacts) -> list[Block]:
-    kinds, absent = (
-        methods.kinds_of_parts(artefacts, artefacts.parts),
-        methods.absent_parts(artefacts),
-    )
+    kinds = methods.kinds_of_parts(artefacts, artefacts.parts)
+    absent = methods.absent_parts(artefacts)
     return [
         f"{kinds}. The paper's recordings are real, of another vehicle, and not public.{absent}",
         artefacts.about,
@@ -201,7 +203,8 @@ def _truck(
 ) -> list[Block]:
     data = words_of_kinds(part).upper()
     settings = filters[paper.RATTE].fitted.settings
-    car, slowest = settings.car, settings.minimum_speed
+    car = settings.car
+    slowest = settings.minimum_speed
     sound = validation_drives(part)
     own = {
         kind: tyres.OwnCurves.of(
@@ -209,7 +212,8 @@ def _truck(
         )
         for kind in TYRES
     }
-    three, fast = drives[NOMINAL], drives["nominal_fast"]
+    three = drives[NOMINAL]
+    fast = drives["nominal_fast"]
     fit = curves_of(
         filters[paper.RATTE].fitted, [drive for drive in sound if drive.vehicle == three.vehicle]
     )
@@ -290,7 +294,8 @@ def _ferrari(
     )
     columns = {"filter": Column("filter"), "rmse": Column("RMSE(β), test [deg]", decimals=3)}
     columns["validation"] = Column("RMSE(β), validation [deg]", decimals=3)
-    learnt, tested = spans_in_words(part.split.train), spans_in_words(part.split.tests["test"])
+    learnt = spans_in_words(part.split.train)
+    tested = spans_in_words(part.split.tests["test"])
     caption = f"The real Ferrari at 20 Hz, {data}: learnt on {learnt}, tested on {tested}."
     trace = f"Measured and estimated sideslip angle on the test range and the seconds before it, {data}, '{drive.id}'."
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."

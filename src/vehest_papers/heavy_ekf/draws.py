@@ -82,7 +82,8 @@ def compared(sums: Mapping[str, Sums]) -> dict[tuple[str, tuple[str, str]], tupl
     asked = [(test, pair) for test in sums for pair in paper.GAINS]
     differences = []
     for test, (first, second) in asked:
-        (one, samples), (other, _) = sums[test][first], sums[test][second]
+        (one, samples) = sums[test][first]
+        (other, _) = sums[test][second]
         differences.append(difference_of_blocks(one[None], other[None], samples).root)
     return dict(zip(asked, corrected(differences), strict=True))
 

@@ -43,10 +43,8 @@ PLANTS = tuple(
 )
 """Payload, wet patches, crossfall: each without and with."""
 PLAIN = PLANTS[0]
-ONCE, PLAIN_ONLY = (
-    "all roads and loads",
-    "dry, flat, without payload",
-)  # what the levels of noise were tuned on
+ONCE = "all roads and loads"
+PLAIN_ONLY = "dry, flat, without payload"  # what the levels of noise were tuned on
 PAIRS = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT), (paper.RATT, paper.LINT))
 LOST_DEGREES = 20.0  # an error of β by which a filter counts as lost
 ABSORBED_SLIP = 5.0
@@ -244,7 +242,8 @@ class Mistake:
 
     def car(self) -> SingleTrackParameters:
         """The car that the filter takes it for."""
-        front, rear = float(TRUCK.cg_to_front_axle), float(TRUCK.cg_to_rear_axle)
+        front = float(TRUCK.cg_to_front_axle)
+        rear = float(TRUCK.cg_to_rear_axle)
         return replace(
             TRUCK, cg_to_front_axle=front - self.forward, cg_to_rear_axle=rear + self.forward
         )
@@ -280,7 +279,9 @@ def absorbed(levels: Mapping[str, Levels]) -> pd.DataFrame:
 
     Tyres are those that a fit to four further drives gives under the mistake, so that RATT is as good as its maker can have it.
     """
-    rows, cells, ends = [], [], []
+    rows = []
+    cells = []
+    ends = []
     for mistake in MISTAKES:
         conditions = Conditions(ABSORBED_SLIP, crossfall=mistake.crossfall)
         drives = [mistake.measured(drive(conditions, seed)).recording for seed in _FITTED_SEEDS]

@@ -23,7 +23,8 @@ STRAIGHT_SECONDS = 25.0
 HANDLING_SECONDS = 60.0
 WHEELS = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
 WHEEL_COLOURS = ("#0b4f9c", "#4aa5e0", "#b8480b", "#f59a23")
-STRAIGHT, HANDLING = "#b3122a", "#5b8c00"
+STRAIGHT = "#b3122a"
+HANDLING = "#5b8c00"
 
 
 def busiest(drive: Recording, seconds: float, *, calmest: bool = False) -> tuple[float, float]:
@@ -78,15 +79,15 @@ def figure_6(
     drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, data: str
 ) -> Figure:
     """The track, β over the three laps, and details on a straight and in the handling section."""
-    straight, handling = (
-        busiest(drive, STRAIGHT_SECONDS, calmest=True),
-        busiest(drive, HANDLING_SECONDS),
-    )
+    straight = busiest(drive, STRAIGHT_SECONDS, calmest=True)
+    handling = busiest(drive, HANDLING_SECONDS)
     x, y = _track(drive)
     with new_figure(DOUBLE_COLUMN, 5.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=(1.1, 1.2, 1.2))
-        track, whole = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, :])
-        bends, calm = figure.add_subplot(grid[2, :]), figure.add_subplot(grid[0, 1])
+        track = figure.add_subplot(grid[0, 0])
+        whole = figure.add_subplot(grid[1, :])
+        bends = figure.add_subplot(grid[2, :])
+        calm = figure.add_subplot(grid[0, 1])
         track.plot(x, y, color="#888888", linewidth=0.8)
         for (start, stop), colour in ((straight, STRAIGHT), (handling, HANDLING)):
             first, last = drive.index_range(start, stop)
@@ -191,7 +192,8 @@ def _track(drive: Recording) -> tuple[FloatArray, FloatArray]:
     """Where the car went, by dead reckoning [m]."""
     step = 1.0 / drive.rate_hz
     yaw = np.cumsum(drive["yaw_rate_ref"]) * step
-    vx, vy = drive["vx_ref"], drive["vy_ref"]
+    vx = drive["vx_ref"]
+    vy = drive["vy_ref"]
     return np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * step, np.cumsum(
         vx * np.sin(yaw) + vy * np.cos(yaw)
     ) * step

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-LINT, RATT, RATTE = "LINT", "RATT", "RATTE"
+LINT = "LINT"
+RATT = "RATT"
+RATTE = "RATTE"
 UNSCENTED = "RATTE, unscented"
 HELD = "RATTE, in bends"  # RATTE whose tyre parameters are held straight ahead
 ORDER = (RATTE, RATT, LINT)  # from the smallest RMSE(β) to the largest

@@ -78,7 +78,8 @@ def validation_drives(part: PartArtefacts) -> list[Recording]:
 
 def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
     """The curves that a rational filter was fitted with and how well its fit knew them, beside what the axles do in other drives."""
-    car, slowest = own.car, own.minimum_speed
+    car = own.car
+    slowest = own.minimum_speed
     motion = axle_motion(drives, car, slowest)
     axles = own.axle_curves.reshape(2, 2)
     of_fit = own.curve_covariance - (own.curves.deviation or 0.0) ** 2 * np.eye(4)

@@ -112,10 +112,8 @@ def errors_table(
     for test, drive in drives.items():
         scored = drive["vx"] >= minimum_speed
         for name in names:
-            error, cornering = (
-                np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[scored],
-                corners(drive)[scored],
-            )
+            error = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[scored]
+            cornering = corners(drive)[scored]
             row: dict[str, object] = {"test": test.replace("_", ", "), "filter": name}
             row |= {"mean": float(error.mean()), "std": float(error.std())}
             rows.append(

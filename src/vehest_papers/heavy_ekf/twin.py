@@ -33,25 +33,29 @@ TRUCK = SingleTrackParameters(
     7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0
 )  # as in conf/vehicle/heavy_truck.yaml
 CURVES = np.array([paper.CURVES[name] for name in ("c1_front", "c2_front", "c1_rear", "c2_rear")])
-TRACK, CG_HEIGHT = 2.08, 0.85  # m, likewise; both assumed there
-PAYLOAD, PAYLOAD_BEHIND, PAYLOAD_HEIGHT = (
-    1978.0,
-    1.0,
-    1.4,
-)  # kg, a quarter; m behind the centre of gravity and above the road; assumed
+TRACK = 2.08
+CG_HEIGHT = 0.85  # m, likewise; both assumed there
+PAYLOAD = 1978.0
+PAYLOAD_BEHIND = 1.0
+PAYLOAD_HEIGHT = 1.4  # kg, a quarter; m behind the centre of gravity and above the road; assumed
 CROSSFALL = math.radians(1.0)
-DRY, WET = 1.0, 0.6
+DRY = 1.0
+WET = 0.6
 NOISE = {
     "yaw_rate": math.radians(0.1),
     "ay": 0.1,
     "steer": math.radians(0.05),
     "vx": 0.05,
 }  # a sample, white; assumed
-SLIP_GAIN, TURN_GAIN = 4.0, 10.0  # 1/s
-LARGEST_STEER, FASTEST_STEER = 0.7, 1.0  # rad, rad/s
+SLIP_GAIN = 4.0
+TURN_GAIN = 10.0  # 1/s
+LARGEST_STEER = 0.7
+FASTEST_STEER = 1.0  # rad, rad/s
 FRONT_SHARE = 0.98  # of the front axle's largest force, which the driver does not ask more of
 SPEEDS = (12.5, 26.0)  # m/s, mean of a drive: from the laps at 45 km/h to the fast one
-BEND_SECONDS, REST_SECONDS, WET_SECONDS = (4.0, 9.0), (1.0, 3.0), (12.0, 25.0)
+BEND_SECONDS = (4.0, 9.0)
+REST_SECONDS = (1.0, 3.0)
+WET_SECONDS = (12.0, 25.0)
 RAMP_SECONDS = 1.5
 SMALLEST_BEND = 0.4  # of the largest rear slip of a drive
 
@@ -87,12 +91,11 @@ class Plant:
         inertia = (
             TRUCK.yaw_inertia + TRUCK.mass * behind**2 + PAYLOAD * (PAYLOAD_BEHIND - behind) ** 2
         )
-        front, rear = TRUCK.cg_to_front_axle + behind, TRUCK.cg_to_rear_axle - behind
+        front = TRUCK.cg_to_front_axle + behind
+        rear = TRUCK.cg_to_rear_axle - behind
         height = (TRUCK.mass * CG_HEIGHT + PAYLOAD * PAYLOAD_HEIGHT) / mass
-        at_front, at_rear = (
-            mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle),
-            mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle),
-        )
+        at_front = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle)
+        at_rear = mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
         car = replace(
             TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear
         )
@@ -158,7 +161,9 @@ def course(
     """A course of bends to either side, of which one at least asks for the whole slip, at a speed that wavers."""
     step = 1.0 / (RATE * FINER)
     time = np.arange(round(seconds / step)) * step
-    slip, at, largest = np.zeros(len(time)), 2.0, math.radians(conditions.slip)
+    slip = np.zeros(len(time))
+    at = 2.0
+    largest = math.radians(conditions.slip)
     n_bends = 0
     while at < seconds - BEND_SECONDS[0]:
         length = float(generator.uniform(*BEND_SECONDS))
@@ -177,13 +182,17 @@ def course(
         )
         at += length + float(generator.uniform(*REST_SECONDS))
         n_bends += 1
-    phase, mean = generator.uniform(0.0, 2.0 * math.pi, 2), float(generator.uniform(*SPEEDS))
+    phase = generator.uniform(0.0, 2.0 * math.pi, 2)
+    mean = float(generator.uniform(*SPEEDS))
     speed = mean + 1.2 * np.sin(0.21 * time + phase[0]) + 0.8 * np.sin(0.53 * time + phase[1])
-    friction, at, wet = np.full(len(time), DRY), float(generator.uniform(*WET_SECONDS)), True
+    friction = np.full(len(time), DRY)
+    at = float(generator.uniform(*WET_SECONDS))
+    wet = True
     while conditions.wet_patches and at < seconds:
         until = at + float(generator.uniform(*WET_SECONDS))
         friction[(time >= at) & (time < until)] = WET if wet else DRY
-        at, wet = until, not wet
+        at = until
+        wet = not wet
     road = np.full(len(time), GRAVITY * math.sin(CROSSFALL) if conditions.crossfall else 0.0)
     return Course(speed, slip, np.gradient(slip, step), friction, road)
 
@@ -191,10 +200,8 @@ def course(
 def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     """A drive of a course, and sensors, that the seed alone decides: the same for all plants of equal slip."""
     generator = np.random.default_rng([seed, 22])
-    plant, own = (
-        Plant.of(payload=conditions.payload),
-        course(conditions, np.random.default_rng([seed, 4]), seconds),
-    )
+    plant = Plant.of(payload=conditions.payload)
+    own = course(conditions, np.random.default_rng([seed, 4]), seconds)
     states, steer, lateral = driven(plant, own)
     kept = slice(None, None, FINER)
     sideslip, yaw_rate = states[kept].T
@@ -217,11 +224,9 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
 
 def driven(plant: Plant, own: Course) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States (β, r), (K, 2), road-wheel angle and lateral acceleration (K,) along a course, by Runge and Kutta's fourth order."""
-    states, steer, lateral = (
-        np.zeros((len(own.speed), 2)),
-        np.zeros(len(own.speed)),
-        np.zeros(len(own.speed)),
-    )
+    states = np.zeros((len(own.speed), 2))
+    steer = np.zeros(len(own.speed))
+    lateral = np.zeros(len(own.speed))
     car = np.array(
         [
             plant.car.mass,
@@ -258,7 +263,9 @@ def _drive(car, tyres, speed, slip, slip_rate, friction, road, step, states, ste
     """Driver and plant; the steering angle stands still during a step."""
     angle = 0.0
     for k in range(len(speed)):
-        u, mu, pull = speed[k], friction[k], road[k]
+        u = speed[k]
+        mu = friction[k]
+        pull = road[k]
         wanted = _steering(
             car, tyres, u, mu, pull, slip[k], slip_rate[k], states[k, 0], states[k, 1]
         )

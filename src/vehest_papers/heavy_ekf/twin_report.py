@@ -241,7 +241,8 @@ def _in_words(found: Changes) -> str:
     for pair in CLAIMED:
         own = [found[at, pair] for at in range(len(SLIPS) * len(MISMATCHES))]
         better, worse, claimed = _counts(found, pair)
-        low, high = min(change.percent for change in own), max(change.percent for change in own)
+        low = min(change.percent for change in own)
+        high = max(change.percent for change in own)
         sentences.append(
             f"**{pair[0]} lies below {pair[1]} in {better} of {len(own)} cells and above it in {worse}**, by more than chance; in "
             f"{claimed} by the paper's {paper.GAINS[pair]:.0f} % or more (changes from {fixed(low, 0)} to {fixed(high, 0)} %)."
@@ -406,7 +407,8 @@ def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
 
 
 def _plant_in_words(own: Factorial) -> str:
-    empty, laden = Plant.of(payload=False), Plant.of(payload=True)
+    empty = Plant.of(payload=False)
+    laden = Plant.of(payload=True)
     largest = max(cell.reached[2] for cell in own.cells)
     lifts = 9.80665 * TRACK / (2.0 * largest)
     noise = f"{math.degrees(NOISE['yaw_rate']):.2g}°/s, {NOISE['ay']:g} m/s², {math.degrees(NOISE['steer']):.2g}° and {NOISE['vx']:g} m/s"

@@ -59,7 +59,8 @@ class OwnCurves:
         cls, drives: Sequence[Recording], car: SingleTrackParameters, minimum_speed: float
     ) -> OwnCurves:
         """Both fits to drives on the same tyres, which hold their forces; each drive's offsets of slip are taken off before."""
-        motions, offsets = [], {}
+        motions = []
+        offsets = {}
         for number, drive in enumerate(drives):
             motion = axle_motion([drive], car, minimum_speed, measured_forces=True)
             offsets[drive.id] = np.array(
@@ -101,7 +102,8 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for row, (axes, axle) in enumerate(zip(panels, AXLES, strict=True)):
-            slip, force = fit.slip[row], fit.force[row]
+            slip = fit.slip[row]
+            force = fit.force[row]
             reach = float(np.abs(slip).max())
             grid = np.linspace(-reach, reach, 201)
             dots = {"s": 2, "color": "#b5b9be", "linewidths": 0, "rasterized": True}
@@ -272,7 +274,8 @@ def convergence_table(
                 estimate = estimates[test][name]
                 if quantity not in estimate.channels or (name == paper.LINT and "c1" in quantity):
                     continue
-                values, target = estimate[quantity], own[tyres].value(quantity, name)
+                values = estimate[quantity]
+                target = own[tyres].value(quantity, name)
                 took = convergence_time(drive.time, values, target)
                 rows.append(
                     {

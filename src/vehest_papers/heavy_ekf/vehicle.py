@@ -133,7 +133,8 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
     wheels = SpeedFromWheels(
         wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1])
     )
-    rows, claims = [], []
+    rows = []
+    claims = []
     for test, spans in part.split.tests.items():
         parts = [drive for drive in recordings_of(part, spans) if (drive["vx_ref"] > SLOWEST).any()]
         sums = [block_sums(drive, wheels) for drive in parts]

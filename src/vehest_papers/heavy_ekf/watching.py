@@ -195,7 +195,8 @@ def bad_input_table(
         ]
         limits[name] = MARGIN * float(np.nanmax(np.concatenate(means)))
     clean = {(finding.check, finding.channel) for finding in checks_of_recording(drive)}
-    rows, silent = [], []
+    rows = []
+    silent = []
     for fault, apply in faults(wheels).items():
         damaged = apply(drive)
         scored = (np.abs(damaged["vx_ref"]) >= minimum_speed) & (damaged["vx_ref"] > 0)

@@ -92,8 +92,10 @@ def observability_along(
     if not (np.all(np.asarray(sizes) > 0) and np.all(np.asarray(noise) > 0)):
         raise ValueError("sizes of states and noise of measurements must be positive")
     A, H = jacobians_along(transition, observation, states, inputs)
-    A, H = A * sizes / np.asarray(sizes)[:, None], H * sizes / np.asarray(noise)[:, None]
-    matrices, n = observability_matrices(A, H, steps), A.shape[-1]
+    A = A * sizes / np.asarray(sizes)[:, None]
+    H = H * sizes / np.asarray(noise)[:, None]
+    matrices = observability_matrices(A, H, steps)
+    n = A.shape[-1]
     _, values, directions = np.linalg.svd(matrices, full_matrices=matrices.shape[1] < n)
     full = np.zeros((len(values), n))
     full[:, : values.shape[1]] = values

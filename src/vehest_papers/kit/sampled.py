@@ -23,7 +23,8 @@ class SampledErrors:
     """
 
     def __init__(self, candidates: Collection[str], *, paired: bool) -> None:
-        self.candidates, self.paired = candidates, paired
+        self.candidates = candidates
+        self.paired = paired
 
     def __contains__(self, candidate: object) -> bool:
         return candidate in self.candidates
@@ -37,7 +38,9 @@ class SampledErrors:
         root: bool = False,
     ) -> Measured:
         """Mean over seeds, or the root of it, of values by resample and seed (n + 1, S), of which the first row is the test itself."""
-        drawn, n_seeds, power = values, values.shape[1], 0.5 if root else 1.0
+        drawn = values
+        n_seeds = values.shape[1]
+        power = 0.5 if root else 1.0
         if n_seeds > 1:
             drawn = np.take_along_axis(
                 values, generator.integers(n_seeds, size=(len(values), n_seeds - 1)), axis=1

@@ -72,7 +72,8 @@ def periodogram(
     length = round(segment_seconds * rate_hz)
     if not series:
         raise DataError("a periodogram needs at least one series")
-    total, n_segments = np.zeros(length // 2 + 1), 0
+    total = np.zeros(length // 2 + 1)
+    n_segments = 0
     for position, samples in enumerate(series):
         if len(samples) < length:
             raise DataError(

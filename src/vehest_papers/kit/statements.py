@@ -233,13 +233,15 @@ def _claim(statement: Statement, found: Sequence[tuple[Compared, Outcome, float]
             "not testable on this data",
             statement.missing,
         )
-    words, shown = [], set[str]()
+    words = []
+    shown = set[str]()
     for test, _, confidence in found:
         if test.label not in shown:
             words.append(test.in_words(confidence))
         shown.add(test.label)
     results = [outcome for _, outcome, _ in found]
-    turned, open_ones = results.count("the other way round"), results.count("not told apart")
+    turned = results.count("the other way round")
+    open_ones = results.count("not told apart")
     verdict: Verdict = "not reproduced" if turned else "undecided" if open_ones else "reproduced"
     why = "by more than chance"
     if turned or open_ones:

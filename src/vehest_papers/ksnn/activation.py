@@ -62,10 +62,8 @@ def activation(own: Trained, recordings: Sequence[Recording] = ()) -> list[Block
                 zorder=1,
             )
         for position, column in enumerate(weights.T):
-            colour, dash = (
-                LOCAL_COLOURS[position % len(LOCAL_COLOURS)],
-                LOCAL_DASHES[position % len(LOCAL_DASHES)],
-            )
+            colour = LOCAL_COLOURS[position % len(LOCAL_COLOURS)]
+            dash = LOCAL_DASHES[position % len(LOCAL_DASHES)]
             axes.plot(
                 grid,
                 column,

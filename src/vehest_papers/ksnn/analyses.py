@@ -30,7 +30,8 @@ TESTED_ON = {
 
 def of_the_data(artefacts: StudyArtefacts) -> list[Block]:
     """Table I, Figures 4 and 5: the four sets, a third car and the real drive where they are there."""
-    first, second = artefacts.parts["scheme_1"], artefacts.parts["scheme_2"]
+    first = artefacts.parts["scheme_1"]
+    second = artefacts.parts["scheme_2"]
     sets: dict[str, list[Recording]] = {
         "C-1": recordings_of(second, second.split.validation),
         "C-2": recordings_of(first, first.split.tests["c2"]),

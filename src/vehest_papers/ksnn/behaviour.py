@@ -55,7 +55,8 @@ def at_low_yaw_rate(
     scheme: Scheme, threshold: float, categories: Sequence[str], test: str
 ) -> tuple[SegmentErrors, float]:
     """SegmentErrors where |ω| lies below the observer's threshold [rad/s], and the share of such samples."""
-    part, rate = scheme.part, scheme.part.protocol.rate_hz
+    part = scheme.part
+    rate = scheme.part.protocol.rate_hz
     recordings = [
         reference
         for reference, _ in pieces_of(

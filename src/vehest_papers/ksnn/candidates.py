@@ -71,7 +71,8 @@ def category_of(estimator: str, variant: str) -> str:
         return f"{paper.FIXED_LAG} {lag[1].removesuffix('s')} s"
     if estimator != "ksnn":
         return _NAMES.get(estimator, estimator)
-    kind, bias = variant.split("_")[0], "no_bias" if "_no_bias" in variant else "bias"
+    kind = variant.split("_")[0]
+    bias = "no_bias" if "_no_bias" in variant else "bias"
     return _KINDS[kind, bias]
 
 
@@ -80,7 +81,8 @@ def structure_of(variant: str) -> str:
     states = re.search(r"states_(\d+)", variant)
     if states:
         return f"{states[1]} states"
-    local, hidden = re.search(r"_p(\d+)", variant), re.search(r"_q(\d+)", variant)
+    local = re.search(r"_p(\d+)", variant)
+    hidden = re.search(r"_q(\d+)", variant)
     words = [f"P = {local[1]}"] if local else []
     words += [f"Q = {hidden[1]}"] if hidden else []
     return ", ".join(words) or "–"
@@ -101,7 +103,8 @@ def chosen(runs: pd.DataFrame) -> pd.Series:
 
 def chosen_by_category(runs: pd.DataFrame) -> dict[str, pd.Series]:
     """Category -> the run that validation chooses among all its structures and seeds: baselines, then as in Tables IV and V."""
-    present, known = dict.fromkeys(runs["category"]), (*paper.BASELINES, *paper.CATEGORIES)
+    present = dict.fromkeys(runs["category"])
+    known = (*paper.BASELINES, *paper.CATEGORIES)
     order = [
         *(name for name in known if name in present),
         *(name for name in present if name not in known),

@@ -200,7 +200,8 @@ def causes_table(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Sch
     for category in categories:
         row = {"model": category}
         for title, scheme in ordered.items():
-            errors, name = scheme.errors(scheme.other), scheme.name_of(category)
+            errors = scheme.errors(scheme.other)
+            name = scheme.name_of(category)
             row |= {
                 title: fixed(errors.value(name, "fvu"), 3),
                 f"{title}, interval": errors.in_words(name, "fvu"),

@@ -23,7 +23,8 @@ N_DRAWS = 4000
 
 def on_accuracy(schemes: Sequence[Scheme]) -> list[Statement | Claim]:
     """Sections VIII-A to VIII-C, over both schemes."""
-    data, first = schemes[0].kind, schemes[0]
+    data = schemes[0].kind
+    first = schemes[0]
     plain = [
         Compared(f"{_brief(name)}, {other}", first.change(name, other, first.own, "fvu"))
         for name in paper.WITH_BIAS

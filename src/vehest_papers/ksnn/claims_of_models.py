@@ -34,7 +34,8 @@ from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_of
 
-ENOUGH, LONGER = "30", "60"  # samples of a window: the paper's 1.5 s, and twice that
+ENOUGH = "30"
+LONGER = "60"  # samples of a window: the paper's 1.5 s, and twice that
 SLACK = -0.05
 BANDS_HZ = tuple(
     float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0)
@@ -53,7 +54,8 @@ def at_low_yaw_rates(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None
         paper.LSTM,
         *paper.STRUCTURED,
     )
-    tests, rows = [], []
+    tests = []
+    rows = []
     for scheme in schemes:
         observer = behaviour.luenberger_of(scheme)
         if observer is None:
@@ -117,7 +119,8 @@ def tuned(schemes: Sequence[Scheme]) -> Claim:
 
 def on_convergence(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
     """Section III: windows of 30 samples, in which an estimator has to converge."""
-    tests, rows = [], []
+    tests = []
+    rows = []
     for scheme in schemes:
         for category in (paper.NONLINEAR, paper.LINEAR, paper.LSTM):
             if scheme.model(category) is None:
@@ -155,7 +158,8 @@ def on_convergence(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
 def on_biases(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
     """Section IX-A: mean biases of a_y taken off before the networks see it."""
     categories = (paper.LSTM, *paper.STRUCTURED)
-    tests, rows = [], []
+    tests = []
+    rows = []
     for scheme in schemes:
         errors, biases = behaviour.without_biases(scheme, categories, scheme.other)
         for category in categories:
@@ -222,7 +226,8 @@ def on_noise(schemes: Sequence[Scheme]) -> Claim:
             ratios.append(ours)
     words = "–"
     if ratios:
-        low, high = np.min(np.concatenate(ratios), axis=0), np.max(np.concatenate(ratios), axis=0)
+        low = np.min(np.concatenate(ratios), axis=0)
+        high = np.max(np.concatenate(ratios), axis=0)
         words = f"ratios over seeds: a_y {short(low[0])} to {short(high[0])}, a_x {short(low[1])} to {short(high[1])}"
     return counted(
         claim, "“significantly lower”", words, schemes[0].kind, found, "every seed, or not"
@@ -258,7 +263,8 @@ def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:
         ]
         found = [outcome for outcome, _ in outcomes(tests)]
         lower = sum(own.change is not None and own.change.log_ratio < 0 for own in tests)
-        turned, significant = found.count("the other way round"), found.count("as claimed")
+        turned = found.count("the other way round")
+        significant = found.count("as claimed")
         ours = f"lower in {lower} of {len(tests)} bands; by more than chance {significant} lower, {turned} higher"
         verdict = (
             "not reproduced" if turned else "reproduced" if lower == len(tests) else "undecided"
@@ -329,7 +335,8 @@ def band_levels(
 
 def on_parameters(schemes: Sequence[Scheme]) -> tuple[list[Claim], Table | None]:
     """Section IV: what the twelve parameters of the linear network without bias and with P = 2 have become, over all seeds."""
-    rows, models = [], list[LocalModels]()
+    rows = []
+    models = list[LocalModels]()
     for scheme in schemes:
         own = [
             LocalModels.of(network)
@@ -348,7 +355,8 @@ def on_parameters(schemes: Sequence[Scheme]) -> tuple[list[Claim], Table | None]
     def of(values: NDArray[np.bool_]) -> str:
         return f"{int(values.sum())} of {len(values)}"
 
-    nearer, leaks = gamma[:, 1, 0] > gamma[:, 0, 0], gamma[:, 0, 0] < 1.0
+    nearer = gamma[:, 1, 0] > gamma[:, 0, 0]
+    leaks = gamma[:, 0, 0] < 1.0
     reduced: NDArray[np.bool_] = np.all(beta[:, :, 0] < 1.0, axis=1)
     why = "all seeds, P = 2"
     claims = [
@@ -409,7 +417,8 @@ def on_cost(frame: pd.DataFrame, kind: str) -> Claim:
         for row in frame.to_dict("records")
         if row["model"] in shown
     ]
-    linear, lstm = cost.IN_C_US["ksnn", "linear_no_bias_p2"], cost.IN_C_US["lstm", "states_5"]
+    linear = cost.IN_C_US["ksnn", "linear_no_bias_p2"]
+    lstm = cost.IN_C_US["lstm", "states_5"]
     timed = f"; in C {short(linear)} (linear, P = 2) to {short(lstm)} µs (LSTM, 5 states)"
     why = "GRU, LSTM affordable too" if {paper.GRU, paper.LSTM} & set(frame["model"]) else "counted"
     return Claim(claim, "“small”", ", ".join(words) + timed, "counted", "reproduced", why)

@@ -91,7 +91,8 @@ class SegmentErrors(SampledErrors):
 
     def change(self, first: str, second: str, metric: str) -> Change | None:
         """From the second to the first; none where either is not there."""
-        own, other = self.get(first, metric), self.get(second, metric)
+        own = self.get(first, metric)
+        other = self.get(second, metric)
         return Change.of(own, other) if own is not None and other is not None else None
 
     def value(self, candidate: str, metric: str) -> float:
@@ -112,10 +113,8 @@ def masked_segments(
     parts: Sequence[Scored], masks: Sequence[FloatArray], rate_hz: float
 ) -> Segments:
     """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them at ``rate_hz`` [Hz], of samples where masks (K,) are 1."""
-    marked, fields = (
-        list(zip(parts, masks, strict=True)),
-        ("vy", "vy_ref", "sideslip", "sideslip_ref"),
-    )
+    marked = list(zip(parts, masks, strict=True))
+    fields = ("vy", "vy_ref", "sideslip", "sideslip_ref")
     chosen = segments_of(
         [
             replace(part, **{name: getattr(part, name) * mask for name in fields})

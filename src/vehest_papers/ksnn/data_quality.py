@@ -29,7 +29,8 @@ NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
 HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
 MOST_POINTS = 5000
-AY_WIDTH, LEAST_SAMPLES = 1.0, 50
+AY_WIDTH = 1.0
+LEAST_SAMPLES = 50
 COMPARED_AY = 8.0
 
 
@@ -157,7 +158,9 @@ def _figure_4(
         lowest = np.inf
         for axes, ((vehicle, kind), (rate, noise)) in zip(panels, spectra.items(), strict=True):
             shown = (rate.frequency > 1.5 * rate.frequency[1]) & (rate.frequency <= HIGHEST_HZ)
-            hz, above, below = rate.frequency[shown], rate.density[shown], noise.density[shown]
+            hz = rate.frequency[shown]
+            above = rate.density[shown]
+            below = noise.density[shown]
             lowest = min(lowest, float(above.min()), float(below.min()))
             fill = partial(axes.fill_between, hz, above, below, linewidth=0, interpolate=True)
             fill(
@@ -233,7 +236,9 @@ def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str
     colours = car_colours(groups)
     with new_figure(DOUBLE_COLUMN * 0.75, 3.4) as figure:
         axes = figure.add_subplot()
-        reach, points, point_colours = 0.0, [], []
+        reach = 0.0
+        points = []
+        point_colours = []
         for position, ((vehicle, kind), recordings) in enumerate(groups.items()):
             ay, velocity = (
                 np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref")

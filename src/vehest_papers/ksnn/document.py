@@ -85,7 +85,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
     """A part with its cars: those of the paper's schemes by the name, others by which data set a test shares with what is learnt on."""
-    part, title = artefacts.parts[name], as_text(artefacts.titles[name])
+    part = artefacts.parts[name]
+    title = as_text(artefacts.titles[name])
     if name in SCHEMES:
         published, own, other = SCHEMES[name]
         return Scheme(name, title, part, own, other, published)

@@ -165,7 +165,8 @@ def gains_in_words(own: Trained) -> str:
 
 
 def _of_the_leak(model: LpvModel) -> str:
-    still, turning = float(model.gamma[0, 0]), float(model.gamma[-1, 0])
+    still = float(model.gamma[0, 0])
+    turning = float(model.gamma[-1, 0])
     if still >= 1.0:
         words = "γ₁ = 1 at ω = 0: nothing makes v̂ forget while driving straight, where it cannot be observed."
     else:
@@ -184,7 +185,8 @@ def _of_the_leak(model: LpvModel) -> str:
 
 
 def _of_the_slip_rate(model: LpvModel) -> str:
-    lowest, highest = float(model.beta[:, 0].min()), float(model.beta[:, 0].max())
+    lowest = float(model.beta[:, 0].min())
+    highest = float(model.beta[:, 0].max())
     span = (
         f"β₁ lies between {fixed(lowest, 2)} and {fixed(highest, 2)}"
         if len(model.centres) > 1
@@ -228,7 +230,8 @@ def _of_the_third(model: LpvModel) -> str:
 def _of_the_poles(model: LpvModel) -> str:
     yaw_rate = np.linspace(0.0, float(model.centres[-1]) or 1.0, 201)
     largest = _poles(model, yaw_rate)[:, 0]
-    at, after = int(np.argmax(largest)), float(largest.max()) ** model.n_window
+    at = int(np.argmax(largest))
+    after = float(largest.max()) ** model.n_window
     where = f"at |ω| = {fixed(float(yaw_rate[at]), 2)} rad/s"
     if largest[at] >= 1.0:
         return (
@@ -323,7 +326,8 @@ def _figure_of_parts(
 ) -> Figure:
     drive.cut(*stretch)
     first, last = drive.index_range(*stretch)
-    shown, time = np.s_[first:last], drive.time[first:last]
+    shown = np.s_[first:last]
+    time = drive.time[first:last]
     with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.5, 0.6))
         top.plot(
@@ -359,7 +363,8 @@ def _figure_of_parts(
 
 def _table_of_parts(own: Trained, drive: Recording, parts: SubModels, source: str) -> Table:
     known = np.isfinite(parts.total)
-    total, reference = parts.total[known], drive["vy_ref"][known]
+    total = parts.total[known]
+    reference = drive["vy_ref"][known]
     rows = []
     for name in _shown(own):
         part = getattr(parts, name)[known]
@@ -405,7 +410,8 @@ def feedback_functions(
     low, middle, high = np.nanquantile(error, [0.01, 0.5, 0.99]).tolist()
     reach = 1.4 * max(abs(low), abs(high), 1e-3)
     grid = np.linspace(-reach, reach, 401)
-    values, slopes = models.feedback(grid), models.slope(grid)
+    values = models.feedback(grid)
+    slopes = models.slope(grid)
     with new_figure(DOUBLE_COLUMN, 4.0) as figure:
         panels = figure.subplots(2, 2, sharex=True)
         for column in (0, 1):
@@ -413,10 +419,8 @@ def feedback_functions(
                 axes.axvspan(low, high, color="#e9e9e9", zorder=0)
                 axes.axvline(0.0, color="#888888", linewidth=0.6)
                 for position in range(len(models.centres)):
-                    colour, dash = (
-                        LOCAL_COLOURS[position % len(LOCAL_COLOURS)],
-                        LOCAL_DASHES[position % len(LOCAL_DASHES)],
-                    )
+                    colour = LOCAL_COLOURS[position % len(LOCAL_COLOURS)]
+                    dash = LOCAL_DASHES[position % len(LOCAL_DASHES)]
                     label = f"$|\\omega|$ = {models.centres[position]:.2f} rad/s"
                     axes.plot(
                         grid, curves[:, position, column], color=colour, linestyle=dash, label=label

@@ -75,10 +75,8 @@ class LocalModels:
     @classmethod
     def of(cls, estimator: Ksnn) -> LocalModels:
         """Copy them out of an estimator."""
-        settings, found = (
-            estimator.settings,
-            {name: values.astype(np.float64) for name, values in estimator.weights().items()},
-        )
+        settings = estimator.settings
+        found = {name: values.astype(np.float64) for name, values in estimator.weights().items()}
         none = np.zeros((settings.n_local, 2))
         neurons = np.zeros((settings.n_local, 2, settings.n_hidden))
         return cls(
@@ -165,7 +163,8 @@ class LpvModel:
 
     def state_matrix(self, yaw_rate: FloatArray | float) -> FloatArray:
         """A(ω) of the state (v, û - u_m), (...) -> (..., 2, 2)."""
-        omega, own = np.asarray(yaw_rate, dtype=np.float64), self.gains(yaw_rate)
+        omega = np.asarray(yaw_rate, dtype=np.float64)
+        own = self.gains(yaw_rate)
         above = np.stack([own.gamma[..., 0], -omega * own.weight[..., 0]], axis=-1)
         below = np.stack(
             [own.beta[..., 1] * self.step * omega, own.gamma[..., 1] - own.weight[..., 1]], axis=-1
@@ -206,16 +205,17 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
     """
     omega, speed, ay, ax = np.moveaxis(np.asarray(measurements, dtype=np.float64), -1, 0)
     phi = models.activations(omega)
-    gamma, beta = phi @ models.gamma, phi @ models.beta
+    gamma = phi @ models.gamma
+    beta = phi @ models.beta
     offset = phi @ models.feedback(np.zeros(()))
     v, e = (np.zeros((*speed.shape[:-1], 4)) for _ in range(2))
-    parts, errors = np.empty((*speed.shape, 4)), np.empty_like(speed)
-    tau, last = models.step, speed.shape[-1] - 1
+    parts = np.empty((*speed.shape, 4))
+    errors = np.empty_like(speed)
+    tau = models.step
+    last = speed.shape[-1] - 1
     for k in range(last + 1):
-        now, after = (
-            np.s_[..., k],
-            np.s_[..., min(k + 1, last)],
-        )  # what the last one gives e is no longer read
+        now = np.s_[..., k]
+        after = np.s_[..., min(k + 1, last)]  # what the last one gives e is no longer read
         error = e.sum(axis=-1)
         gain = (phi[..., k, :, None] * models.secant(error)).sum(axis=-2)
         (gamma_1, gamma_2), (beta_1, beta_2) = (
@@ -237,7 +237,8 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
             + (beta_2 * tau * omega[now])[..., None] * v
             + into_e,
         )
-        parts[..., k, :], errors[now] = v, error
+        parts[..., k, :] = v
+        errors[now] = error
     return SubModels(parts[..., 0], parts[..., 1], parts[..., 2], parts[..., 3], errors)
 
 

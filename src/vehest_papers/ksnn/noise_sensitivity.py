@@ -122,8 +122,11 @@ class NoiseSensitivity:
 
 def ksnn_sensitivity(model: LpvModel, yaw_rate: float) -> NoiseSensitivity:
     """Of a linear KS-NN without end, at constant yaw rate [rad/s]; `NoiseSensitivity.truncated` makes it that of its windows."""
-    own, tau = model.gains(yaw_rate), model.step
-    (gamma_1, gamma_2), (beta_1, beta_2), (weight_1, weight_2) = own.gamma, own.beta, own.weight
+    own = model.gains(yaw_rate)
+    tau = model.step
+    (gamma_1, gamma_2) = own.gamma
+    (beta_1, beta_2) = own.beta
+    (weight_1, weight_2) = own.weight
     constant = beta_2 * yaw_rate**2 * tau * weight_1 - weight_2 * gamma_1 + gamma_2 * gamma_1
     return NoiseSensitivity(
         numerator_ay=np.array([0.0, beta_1 * tau, beta_1 * tau * (weight_2 - gamma_2)]),
@@ -135,8 +138,10 @@ def ksnn_sensitivity(model: LpvModel, yaw_rate: float) -> NoiseSensitivity:
 
 def luenberger_sensitivity(estimator: Luenberger, yaw_rate: float) -> NoiseSensitivity:
     """Of a fitted Luenberger observer at its own rate; zero where the yaw rate is so small that it resets its state."""
-    tau, gain = 1.0 / estimator.settings.rate_hz, estimator.gain
-    damping, stiffness = 2.0 * gain * abs(yaw_rate) * tau, (gain * yaw_rate * tau) ** 2
+    tau = 1.0 / estimator.settings.rate_hz
+    gain = estimator.gain
+    damping = 2.0 * gain * abs(yaw_rate) * tau
+    stiffness = (gain * yaw_rate * tau) ** 2
     if abs(yaw_rate) < estimator.threshold:
         return NoiseSensitivity(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0]), 1.0 / tau)
     return NoiseSensitivity(

@@ -5,12 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-LUENBERGER, GRU, LSTM = "Luenberger", "GRU", "LSTM"
-LINEAR_BIAS, NONLINEAR_BIAS = "KS-NN linear + bias", "KS-NN nonlinear + bias"
-LINEAR, NONLINEAR = "KS-NN linear no bias", "KS-NN nonlinear no bias"
-KALMAN, FACTOR_GRAPH = "Kalman filter (KF)", "Factor graph (FG)"
+LUENBERGER = "Luenberger"
+GRU = "GRU"
+LSTM = "LSTM"
+LINEAR_BIAS = "KS-NN linear + bias"
+NONLINEAR_BIAS = "KS-NN nonlinear + bias"
+LINEAR = "KS-NN linear no bias"
+NONLINEAR = "KS-NN nonlinear no bias"
+KALMAN = "Kalman filter (KF)"
+FACTOR_GRAPH = "Factor graph (FG)"
 FIXED_LAG = "Factor graph (FG), fixed lag of"
-ZERO, STATIC_MAP, KINEMATIC = "v = 0", "Static map", "Kinematic integration"
+ZERO = "v = 0"
+STATIC_MAP = "Static map"
+KINEMATIC = "Kinematic integration"
 BASELINES = (ZERO, STATIC_MAP, KINEMATIC)  # not in the paper; they stand in every table
 
 CATEGORIES = (
@@ -24,7 +31,8 @@ CATEGORIES = (
 )  # in the order of Tables IV and V
 
 STRUCTURED = (LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
-WITHOUT_BIAS, WITH_BIAS = (LINEAR, NONLINEAR), (LINEAR_BIAS, NONLINEAR_BIAS)
+WITHOUT_BIAS = (LINEAR, NONLINEAR)
+WITH_BIAS = (LINEAR_BIAS, NONLINEAR_BIAS)
 PLAIN = (GRU, LSTM)
 
 

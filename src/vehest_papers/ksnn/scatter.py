@@ -35,12 +35,14 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
         name: scheme.runs[scheme.runs["category"] == name]
         for name in dict.fromkeys(scheme.runs["category"])
     }
-    x, y = f"{metric}.{scheme.other}", f"{metric}.{scheme.own}"
+    x = f"{metric}.{scheme.other}"
+    y = f"{metric}.{scheme.own}"
     shown: list[float] = []
     for name in paper.CATEGORIES:
         if name not in groups:
             continue
-        own, first = groups[name], groups[name].iloc[0]
+        own = groups[name]
+        first = groups[name].iloc[0]
         line = line_of(str(first["estimator"]), str(first["variant"]))
         axes.scatter(
             own[x],
@@ -79,7 +81,8 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
                 zorder=3,
             )
             shown += point
-    low, high = min(shown), max(shown)
+    low = min(shown)
+    high = max(shown)
     pad = 0.06 * (high - low)
     limits = (low - pad, high + pad)
     axes.plot(limits, limits, color="#444444", linewidth=0.6, linestyle="dashed", zorder=1)

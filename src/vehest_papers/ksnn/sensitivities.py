@@ -30,7 +30,8 @@ YAW_RATES = (
     0.2,
     0.4,
 )  # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
-LOWEST_HZ, HIGHEST_HZ = 0.01, 10.0
+LOWEST_HZ = 0.01
+HIGHEST_HZ = 10.0
 CHANNELS = ("ay", "ax")
 INJECTED_SAMPLES = 200_000
 INJECTED_SIZE = 0.5  # standard deviation of the injected noise [m/s²]
@@ -137,10 +138,8 @@ def _rows(own: Trained, n_samples: int, error: float) -> list[dict[str, object]]
     for yaw_rate in YAW_RATES:
         closed = sensitivity_of(own.estimator, yaw_rate, error)
         for position, channel in enumerate(CHANNELS):
-            gain, band = (
-                closed.white_noise_gains()[position],
-                closed.band_gains(HIGHEST_HZ)[position],
-            )
+            gain = closed.white_noise_gains()[position]
+            band = closed.band_gains(HIGHEST_HZ)[position]
             found = injected(
                 own.estimator, yaw_rate, channel, n_samples=n_samples, seed=len(rows), error=error
             )

@@ -53,10 +53,8 @@ def across_cars(
 ) -> Table:
     """Tables IV and V and Figure 6 in one: of each category the structure chosen by validation, over all seeds, with 95 % intervals."""
     rows = []
-    third, published = (
-        any(THIRD in scheme.part.split.tests for scheme in schemes),
-        any(scheme.published for scheme in schemes),
-    )
+    third = any(THIRD in scheme.part.split.tests for scheme in schemes)
+    published = any(scheme.published for scheme in schemes)
     for scheme in schemes:
         tests = {"own": scheme.own, "other": scheme.other} | (
             {"third": THIRD} if THIRD in scheme.part.split.tests else {}
@@ -64,11 +62,9 @@ def across_cars(
         for category, run in scheme.chosen.items():
             if category in without:
                 continue
-            key, known, structure = (
-                scheme.name_of(category),
-                scheme.published.get(category),
-                str(run["structure"]),
-            )
+            key = scheme.name_of(category)
+            known = scheme.published.get(category)
+            structure = str(run["structure"])
             row: dict[str, object] = {
                 "scheme": scheme.title,
                 "model": category,
@@ -328,7 +324,8 @@ def whether_an_order_means_anything(scheme: Scheme) -> str:
     A candidate that leaves more of its own training car than v = 0 or the static map has not learnt that car; its error on another
     does not depend on structure alone.
     """
-    own, other = scheme.errors(scheme.own), scheme.errors(scheme.other)
+    own = scheme.errors(scheme.own)
+    other = scheme.errors(scheme.other)
     names = {
         category: scheme.name_of(category)
         for category in scheme.chosen

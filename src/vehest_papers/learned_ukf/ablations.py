@@ -23,7 +23,10 @@ from vehest_papers.learned_ukf.candidates import models_by_candidate
 from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.lengths import epoch_claim, figure_7, length_comparisons, lengths
 
-DIAGONAL, CURVATURE, SCRATCH, LENGTH = "diagonal", "curvature", "scratch", "length_"
+DIAGONAL = "diagonal"
+CURVATURE = "curvature"
+SCRATCH = "scratch"
+LENGTH = "length_"
 SHOWN = "Added after the tests had been seen for the methods above; rules fixed before these candidates were trained (docs/learned_ukf.md)."
 CELLS = (
     "Cells: both MSE, then their difference with its interval, corrected by Holm within each tyre."
@@ -62,7 +65,8 @@ def additions(
     kind: str,
 ) -> Additions:
     """All comparisons of the parts that are there."""
-    own, groups = Additions(), models_by_candidate(part)
+    own = Additions()
+    groups = models_by_candidate(part)
     main = {title: Subject.of(part, title, errors=errors) for title in groups}
     scratch = _alone(beside, SCRATCH)
     if paper.NNTF_UH in main:

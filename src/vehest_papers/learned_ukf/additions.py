@@ -131,7 +131,8 @@ def comparison_claims(
     for place, own in enumerate(comparisons):
         if not own.claim:
             continue
-        words, verdicts = [], []
+        words = []
+        verdicts = []
         for test in own.tests:
             value, low, high = found[place, test]
             verdicts.append(verdict_below(low, high))
@@ -153,7 +154,8 @@ def comparison_claims(
 def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) -> Claim:
     """That trainings from scratch end in local minima, by their validation losses."""
     limit = float(trained.validation().max())
-    k, n = int((scratch.validation() > limit).sum()), len(scratch.seeds)
+    k = int((scratch.validation() > limit).sum())
+    n = len(scratch.seeds)
     ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)
     verdict: Verdict = (
         "not reproduced" if not k else "reproduced" if 2 * k >= n and share >= 1.0 else "undecided"
@@ -261,8 +263,6 @@ def samples_seen(own: Subject) -> int:
     drives = lengths_of(own.part, own.part.split.train)
     through = training["through" if own.models[0].variant.find("_u") >= 0 else "noise"]
     steps = int(training["steps"])
-    pairs, samples = (
-        sum(length - 1 for length in drives),
-        sum(length // steps * steps for length in drives),
-    )
+    pairs = sum(length - 1 for length in drives)
+    samples = sum(length // steps * steps for length in drives)
     return int(training["one_step"]["max_epochs"]) * pairs + int(through["max_epochs"]) * samples

@@ -34,7 +34,8 @@ from vehest_papers.learned_ukf.errors import Losses
 TOLERANCE = 0.05  # of the friction
 NEAR = 0.1  # of the paper's nominal friction
 
-A, D = "tyre_a", "tyre_d"
+A = "tyre_a"
+D = "tyre_d"
 
 PAIRS: Mapping[str, Sequence[tuple[str, str]]] = {
     A: (
@@ -166,7 +167,8 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
     """How fast the friction of NNTF_UH converges on the unseen tyre from the start it was trained with, and to what."""
     nominal = paper.NOMINAL_FRICTION[D]
     fast, why = verdict_of(median.low, median.high, 2.0)
-    low, high = nominal - NEAR, nominal + NEAR
+    low = nominal - NEAR
+    high = nominal + NEAR
     near: Verdict = "undecided"
     if low < final.low and final.high < high:
         near = "reproduced"
@@ -204,11 +206,9 @@ def instability_claims(lost: Mapping[str, Sequence[tuple[int, int]]], data: str)
     """That the tyre network without friction becomes unstable on the unseen tyre; ``lost``: sequences lost without repair, and all."""
     claims = []
     for method, seeds in lost.items():
-        bad, k, n = (
-            sum(own > 0 for own, _ in seeds),
-            sum(own for own, _ in seeds),
-            sum(own for _, own in seeds),
-        )
+        bad = sum(own > 0 for own, _ in seeds)
+        k = sum(own for own, _ in seeds)
+        n = sum(own for _, own in seeds)
         ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)
         verdict: Verdict = (
             "reproduced" if 2 * bad >= len(seeds) else "not reproduced" if not bad else "undecided"
@@ -232,7 +232,8 @@ def states_claim(
     claim: str, words: str, expected: Mapping[str, tuple[Interval, float, bool]], data: str
 ) -> Claim:
     """About several states of Figure 5: difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower."""
-    verdicts, shown = [], []
+    verdicts = []
+    shown = []
     for state, (own, before, lower) in expected.items():
         verdicts.append(
             verdict_below(own.low, own.high) if lower else verdict_below(-own.high, -own.low)

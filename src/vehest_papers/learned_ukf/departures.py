@@ -88,7 +88,8 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
             differing.append(
                 f"{_either(sorted(epochs))} epochs (paper: {PAPER_EPOCHS}{', of one batch each' * (phase != 'one_step')})"
             )
-        sizes, falling = values(phase, "learning_rate"), "cosine" in values(phase, "schedule")
+        sizes = values(phase, "learning_rate")
+        falling = "cosine" in values(phase, "schedule")
         if sizes != [PAPER_STEP_SIZE] or falling:
             size = f"a step size of {_either(sizes)}{' that falls to zero along a cosine' if falling else ''}"
             differing.append(

@@ -33,7 +33,8 @@ from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, los
 from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
 MAIN = ("real", "simulated")
-LIKELIHOOD, TRIAL = "likelihood", "trial_"
+LIKELIHOOD = "likelihood"
+TRIAL = "trial_"
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 NOTE = (
@@ -146,7 +147,8 @@ def _outcome(
     name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: dict[str, pd.DataFrame]
 ) -> Outcome:
     """Everything of a main part; parts beside it belong to the real one, or to whichever there is."""
-    runs, kind = runs_of(part), words_of_kinds(part)
+    runs = runs_of(part)
+    kind = words_of_kinds(part)
     where = f"{kind.upper()}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
     errors = {test: losses(part, test) for test in SETS}
     own = Outcome()
@@ -163,7 +165,8 @@ def _outcome(
     _likelihood(own, name, part, beside, kind)
     _prediction(own, name, part, where, kind, data)
     added = ablations.additions(name, part, beside, errors, kind)
-    own.added, own.timed = [*added.front()], added.timed
+    own.added = [*added.front()]
+    own.timed = added.timed
     own.appendix += added.appendix
     groups = models_by_candidate(part)
     shown: dict[str, EvaluatedModel] = {
@@ -269,10 +272,8 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
         for test, own_drives in drives.items()
     }
     trained = tracks["tyre_d"][friction.TRAINED_FROM]
-    times, final = (
-        friction.interval_of(trained.times(), friction.median),
-        friction.interval_of(trained.final, friction.mean),
-    )
+    times = friction.interval_of(trained.times(), friction.median)
+    final = friction.interval_of(trained.final, friction.mean)
     own.claims += claims.friction_claims(times, final, kind)
     own.front += ["## Friction", friction.figure(tracks, skip, name, where)]
     own.appendix += [

@@ -43,7 +43,8 @@ class Losses:
 
     def of_pair(self, first: str, second: str) -> Interval:
         """Difference of the mean squared losses of two methods; seed by seed where both have the same weights."""
-        one, other = self.squared[first], self.squared[second]
+        one = self.squared[first]
+        other = self.squared[second]
         if {first, second} == SAME_WEIGHTS:
             return self.mean(one - other)
         return self.difference(one, other)
@@ -54,7 +55,8 @@ class Losses:
 
     def ratio(self, first: str, second: str) -> tuple[float, float, float]:
         """Of mean losses, with its 95 % interval: the factors c for which first - c second is not told apart from zero (Fieller)."""
-        one, other = self.squared[first], self.squared[second]
+        one = self.squared[first]
+        other = self.squared[second]
         value = float(one.mean() / other.mean())
 
         def apart(factor: float) -> bool:

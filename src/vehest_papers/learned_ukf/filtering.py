@@ -26,7 +26,8 @@ class Swapped(PointModel):
     """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained."""
 
     def __init__(self, predicting: PointModel, observing: PointModel) -> None:
-        self.working, self.lower = predicting.working, predicting.lower  # type: ignore[method-assign]
+        self.working = predicting.working  # type: ignore[method-assign]
+        self.lower = predicting.lower  # type: ignore[method-assign]
         self.entries = [_with_its_car(predicting, 0), _with_its_car(observing, 1)]
 
 
@@ -94,7 +95,8 @@ def filtered(
     start = drives.states[:, 0].clone()
     start[:, -1] = friction or (s.friction if s.start_friction is None else s.start_friction)
     own = estimator.filter
-    kept, own.repair = own.repair, repair
+    kept = own.repair
+    own.repair = repair
     try:
         with torch.no_grad():
             covariance = own.initial_covariance().clone()

@@ -26,7 +26,8 @@ from vehest_papers.learned_ukf.prediction import over_sequences
 
 STARTS = (0.3, 0.6, 0.9)
 COLOURS = ("#0b4f9c", "#444444", "#b3122a")
-TRAINED_FROM, LOW = 0.6, 0.4  # starts of NNTF_UH and NNTF_UH*
+TRAINED_FROM = 0.6
+LOW = 0.4  # starts of NNTF_UH and NNTF_UH*
 DEVIATIONS = (
     None,
     0.03,
@@ -84,7 +85,8 @@ def interval_of(values: FloatArray, statistic: Callable[[FloatArray], float]) ->
         )
         for _ in range(N_RESAMPLES)
     ]
-    value, error = statistic(values), float(np.std(drawn))
+    value = statistic(values)
+    error = float(np.std(drawn))
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - 1)) * error
     return Interval(value, value - half, value + half, np.nan, error, n - 1)
 
@@ -107,7 +109,8 @@ def convergence_table(
     for test, by_start in tracks.items():
         for start, own in by_start.items():
             times = own.times()
-            time, final = interval_of(times, median), interval_of(own.final, mean)
+            time = interval_of(times, median)
+            final = interval_of(own.final, mean)
             apart = interval_of(own.apart(by_start[TRAINED_FROM]), median)
             rows.append(
                 {

@@ -49,7 +49,8 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
                     f"part '{name}': {model.title} was not trained through the filter; set estimator.through_filter=true"
                 )
         training = part.models[0].training
-        steps, batch = int(training["steps"]), int(training["batch_size"])
+        steps = int(training["steps"])
+        batch = int(training["batch_size"])
         candidate = next(iter(models_by_candidate(part)))
         subject = Subject.of(part, candidate, f"{candidate}, {batch} × {steps} samples")
         sequences = sum(length // steps for length in lengths_of(part, part.split.train))
@@ -88,7 +89,8 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
                 row[f"words.{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
             rows.append(row)
-    frame, tests = pd.DataFrame(rows), list(SETS)
+    frame = pd.DataFrame(rows)
+    tests = list(SETS)
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
@@ -149,7 +151,8 @@ def length_comparisons(found: Sequence[Length]) -> list[Comparison]:
     for way, words in WAYS.items():
         own = of_way(found, way)
         if len(own) > 1:
-            short, long = own[0], own[-1]
+            short = own[0]
+            long = own[-1]
             claim = f"sequences of {long.steps} samples below {short.steps}, {words}"
             comparisons.append(
                 Comparison(long.subject, short.subject, claim, "Figure 7: longer is better")

@@ -14,13 +14,11 @@ from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest_papers.kit.paired import paired_difference
 
-AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL, APART = (
-    "as in the paper",
-    "the other way round",
-    "undecided",
-    "level in the paper, not told apart here",
-    "level in the paper, told apart here",
-)
+AS_IN_THE_PAPER = "as in the paper"
+TURNED = "the other way round"
+UNDECIDED = "undecided"
+LEVEL = "level in the paper, not told apart here"
+APART = "level in the paper, told apart here"
 DECIMALS = 4
 
 

@@ -5,13 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-PC, PCR, NN, NN_U = "PC", "PCR", "NN", "NN_U"
-NNT, NNT_U, NNTF, NNTF_U, NNTF_UH = "NNT", "NNT_U", "NNTF", "NNTF_U", "NNTF_UH"
+PC = "PC"
+PCR = "PCR"
+NN = "NN"
+NN_U = "NN_U"
+NNT = "NNT"
+NNT_U = "NNT_U"
+NNTF = "NNTF"
+NNTF_U = "NNTF_U"
+NNTF_UH = "NNTF_UH"
 NNTF_UH_LOW = "NNTF_UH*"
-DIAGONAL, CURVED = "NNTF_UH with diagonal noise", "PC with E"
+DIAGONAL = "NNTF_UH with diagonal noise"
+CURVED = "PC with E"
 FROM_SCRATCH = " from scratch"
-GRU, LSTM = "GRU", "LSTM"
-ZERO, STATIC_MAP, DATA_SHEET, ORACLE = "zero", "static map", "data sheet", "oracle"
+GRU = "GRU"
+LSTM = "LSTM"
+ZERO = "zero"
+STATIC_MAP = "static map"
+DATA_SHEET = "data sheet"
+ORACLE = "oracle"
 BASELINES = (ZERO, STATIC_MAP, DATA_SHEET)
 
 CANDIDATES = (
@@ -82,10 +94,8 @@ AUTHORS_CODE: Mapping[str, float] = {"tyre_a": 0.0158, "tyre_d": 0.0441}
 and 1000 epochs, one seed, on a CPU."""
 
 MINUTES = 52.0  # of driving in the paper's data set (Section III-C), of which ..
-SHARE_OF_TYRE_A, SHARE_LEARNT = (
-    0.201,
-    0.7,
-)  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
+SHARE_OF_TYRE_A = 0.201
+SHARE_LEARNT = 0.7  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
 MINUTES_LEARNT = MINUTES * SHARE_OF_TYRE_A * SHARE_LEARNT
 
 NOMINAL_FRICTION: Mapping[str, float] = {

@@ -26,8 +26,10 @@ from vehest_papers.learned_ukf.filtering import (
     weighted,
 )
 
-BEFORE, AFTER = paper.NNTF, paper.NNTF_U
-PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
+BEFORE = paper.NNTF
+AFTER = paper.NNTF_U
+PLAIN_BLUE = "#0b4f9c"
+THROUGH_RED = "#b3122a"
 TASKS = {"one_step": "one-step prediction", "estimation": "estimation"}
 
 Pair = tuple[LearnedUkf, LearnedUkf]  # NNTF and NNTF_U of one seed
@@ -101,7 +103,8 @@ def frames(
         One row a test set, seed, ``predicts`` and ``observes``: ``mse`` (weighted).
     """
     names = (BEFORE, AFTER)
-    states, swaps = [], []
+    states = []
+    swaps = []
     for test, own in found.items():
         for place, seed in enumerate(seeds):
             for task in TASKS:

@@ -193,7 +193,8 @@ def _figure(published: Published | None, short: str) -> float:
 
 
 def _beside(row: Mapping[str, object], state: str, test: str) -> str:
-    value, own = row[f"paper_{state}_{test}"], str(row[f"ours_{state}_{test}"])
+    value = row[f"paper_{state}_{test}"]
+    own = str(row[f"ours_{state}_{test}"])
     return (
         f"{own} (paper {fixed(value, 3)})"
         if isinstance(value, float) and math.isfinite(value)

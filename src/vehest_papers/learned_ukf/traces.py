@@ -134,11 +134,9 @@ def _drawn(
         for candidate in candidates:
             if f"friction.{candidate}" not in values:
                 continue
-            line, friction, sigma = (
-                LINES[candidate],
-                values[f"friction.{candidate}"],
-                values[f"friction_sigma.{candidate}"],
-            )
+            line = LINES[candidate]
+            friction = values[f"friction.{candidate}"]
+            sigma = values[f"friction_sigma.{candidate}"]
             bottom.fill_between(
                 time, friction - sigma, friction + sigma, color=line.colour, alpha=0.2, linewidth=0
             )

@@ -112,7 +112,9 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
     from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
     assert page.handling is not None
-    edges, counts, curves = (AY_EDGES, ANGLE_EDGES), page.handling.everything, page.characteristics
+    edges = (AY_EDGES, ANGLE_EDGES)
+    counts = page.handling.everything
+    curves = page.characteristics
     sources = {
         "simulated": page.handling,
         **({"real": page.real_handling} if page.real_handling is not None else {}),
@@ -216,10 +218,8 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
         ):
             reach = 1.0
             for own in counted:
-                shares, (colour, dash) = (
-                    100.0 * own.counts / max(int(own.counts.sum()), 1),
-                    SOURCES[own.kind],
-                )
+                shares = 100.0 * own.counts / max(int(own.counts.sum()), 1)
+                (colour, dash) = SOURCES[own.kind]
                 filled = own.kind == "simulated"
                 axes.stairs(
                     shares,
@@ -296,7 +296,8 @@ def _reach(
     edges: FloatArray, counts: NDArray[np.int64], curves: Sequence[FloatArray], share: float = 0.0
 ) -> tuple[float, float]:
     """Limits of an axis that show the curves and all but a share of the samples at either end, the same to both sides of zero."""
-    total, reach = int(counts.sum()), 1.0
+    total = int(counts.sum())
+    reach = 1.0
     if total:
         inside = np.flatnonzero(
             (np.cumsum(counts) > share * total) & (np.cumsum(counts[::-1])[::-1] > share * total)

@@ -31,7 +31,8 @@ from vehest_papers.ksnn.data_quality import (
 from vehest_papers.proving_ground.papers import PROFILES
 from vehest_papers.proving_ground.tally import MOVING
 
-BEFORE, AFTER = "sim_two_cars", "sim_race_cars"
+BEFORE = "sim_two_cars"
+AFTER = "sim_race_cars"
 """Data sets whose gates are shown: the first simulated cars, and those that the study of the KS-NN learns on."""
 RATE_HZ = 20.0  # rate of the paper's recordings, at which all is read
 BANDS_HZ = tuple(

@@ -18,15 +18,19 @@ from vehest.simulation.plant.parameters import Vehicle, compiled_parameters
 
 Counts = NDArray[np.int64]
 
-AY_WIDTH, AY_LIMIT = 0.5, 14.0  # m/s²
-ANGLE_WIDTH, ANGLE_LIMIT = 0.1, 10.0  # deg
+AY_WIDTH = 0.5
+AY_LIMIT = 14.0  # m/s²
+ANGLE_WIDTH = 0.1
+ANGLE_LIMIT = 10.0  # deg
 AY_EDGES: FloatArray = np.arange(-AY_LIMIT, AY_LIMIT + AY_WIDTH / 2, AY_WIDTH)
 ANGLE_EDGES: FloatArray = np.linspace(
     -ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1
 )
 
 SLOWEST = 5.0  # speed from which on samples count [m/s]
-STEADY_ACCELERATION, STEADY_YAW, SMOOTHED_SECONDS = 1.0, 0.1, 0.3
+STEADY_ACCELERATION = 1.0
+STEADY_YAW = 0.1
+SMOOTHED_SECONDS = 0.3
 """Steady is a turn with |ax|, |ay - vx·yaw rate| [m/s²] and the change of the yaw rate [rad/s²] below, averaged over so long [s]."""
 LEAST_SAMPLES = 50
 RAMP_SPEED = 25.0
@@ -50,7 +54,8 @@ class HandlingPoints:
 
     def add(self, recording: Recording) -> None:
         """Count a recording in; it is to be about as free of noise as one at 20 Hz."""
-        vx, yaw_rate = recording["vx"], recording["yaw_rate"]
+        vx = recording["vx"]
+        yaw_rate = recording["yaw_rate"]
         moving = vx > SLOWEST
         ay = vx * yaw_rate
         angle = np.degrees(
@@ -116,7 +121,8 @@ def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteris
         end = int(np.argmax(np.abs(ay))) + 1
         halves.append((ay[:end], np.degrees(understeer_angle(ramp, plant.wheelbase))[:end]))
     (right_ay, right_angle), (left_ay, left_angle) = halves
-    ay, angle = np.append(right_ay[::-1], left_ay), np.append(right_angle[::-1], left_angle)
+    ay = np.append(right_ay[::-1], left_ay)
+    angle = np.append(right_angle[::-1], left_angle)
     return Characteristic(label, speed, ay, angle, single_track_gradient(vehicle))
 
 

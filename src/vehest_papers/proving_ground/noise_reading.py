@@ -64,7 +64,8 @@ def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, fl
     }
     levels["steer.quantisation"] = quantum(channels["steer"])
 
-    longitudinal, lateral = change["vx"] - vy * yaw_rate, change["vy"] + vx * yaw_rate
+    longitudinal = change["vx"] - vy * yaw_rate
+    lateral = change["vy"] + vx * yaw_rate
     scale, lag = lags(longitudinal, [ax, change["ax"]], rate_hz)
     levels["ax.delay"] = lag / scale
     scale, lag, levels["yaw_rate.delay"] = lags(

@@ -238,7 +238,8 @@ def _beside_real(
             f"{heading}\n\nThe real recording of data set `{profile.counterpart}` is absent from this report. {how}".strip()
         ]
     real = next(iter(page.real.values()))
-    simulated, measured = page.merged("simulated").values(), real.all.values()
+    simulated = page.merged("simulated").values()
+    measured = real.all.values()
     rows = [
         {"quantity": QUANTITIES[name], "unit": unit, "real": measured[name][0], "simulated": value}
         for name, (value, unit) in simulated.items()

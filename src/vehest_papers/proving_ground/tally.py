@@ -108,11 +108,13 @@ class Tally:
 
     def quantile(self, name: str, share: float, *, absolute: bool = False) -> float:
         """The value below which a share of the samples lies; NaN where there are none."""
-        grid, counts = FINE[name], self.counts[name]
+        grid = FINE[name]
+        counts = self.counts[name]
         centres = grid.edges[:-1] + grid.width / 2
         if absolute:
             half = grid.size // 2
-            counts, centres = counts[half:] + counts[half - 1 :: -1], centres[half:]
+            counts = counts[half:] + counts[half - 1 :: -1]
+            centres = centres[half:]
         total = int(counts.sum())
         if total == 0:
             return math.nan
@@ -126,7 +128,8 @@ class Tally:
 
     def histogram(self, name: str, width: float) -> tuple[FloatArray, Counts]:
         """Edges (B + 1,) and counts (B,) of wider bins, a whole number of fine ones each, one edge at zero."""
-        grid, together = FINE[name], round(width / FINE[name].width)
+        grid = FINE[name]
+        together = round(width / FINE[name].width)
         if abs(together * grid.width - width) > 1e-9 or (grid.size // 2) % together:
             raise ValueError(f"bins of {width} do not fit those of {grid.width} up to {grid.limit}")
         return grid.edges[::together], self.counts[name].reshape(-1, together).sum(axis=1)

@@ -25,7 +25,8 @@ from vehest_papers.proving_ground.tally import Tally, flags_of
 NEEDED = ("vx", "yaw_rate", "ax", "ay", "vy_ref")
 CHANNELS = (*NEEDED, "steer", "vx_ref", "sideslip_ref")
 TRACED = ("vx", "steer", "yaw_rate", "ay", "sideslip_ref")
-TRACE_SECONDS, SHORTEST_TRACE = 60.0, 8.0
+TRACE_SECONDS = 60.0
+SHORTEST_TRACE = 8.0
 MOST_CHARACTERISTICS = 4
 ROLES = ("train", "validation", "test")
 ALL = "all"
@@ -155,7 +156,8 @@ def _add_real(page: VehiclePage, recording: Recording) -> None:
 
 
 def _add_simulated(page: VehiclePage, dataset: StoredDataset, recording: Recording) -> None:
-    about, manoeuvre = recording.provenance, manoeuvre_of(recording)
+    about = recording.provenance
+    manoeuvre = manoeuvre_of(recording)
     if "parameter_set" in about and "steer" in recording:  # by vehest's own plant
         label = _variant(page.name, recording)
         if len(page.characteristics) < MOST_CHARACTERISTICS and label not in {

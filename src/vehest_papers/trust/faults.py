@@ -27,7 +27,8 @@ WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current"
 
 DRAWN = ("noise", "spikes")
 LASTS = 10.0  # s
-TIMES, PLUS = 2.0, 0.5  # of the oracle's delay, and s beyond it, within which a flag is in time
+TIMES = 2.0
+PLUS = 0.5  # of the oracle's delay, and s beyond it, within which a flag is in time
 LEAST_SECONDS = 25.0  # of a range that faults are tried on
 MOST_RANGES = 6  # of a part, so that a set of many manoeuvres takes minutes
 
@@ -55,10 +56,8 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
     )
     channels = _channels([*train, *validation, *tests])
     rate = part.protocol.rate_hz
-    model, oracle = (
-        learn_health(train, validation, channels, rate),
-        learn_oracle(train, validation, channels, rate),
-    )
+    model = learn_health(train, validation, channels, rate)
+    oracle = learn_oracle(train, validation, channels, rate)
     limits = learn_limits(train, channels, rate)
     nominal = [
         _flags(model, Guard(channels, (), limits, rate), recording.stack(channels))
@@ -134,7 +133,8 @@ def _case(
     fault: Fault,
     nominal: NDArray[np.bool_],
 ) -> dict[str, Any]:
-    rate, steps = model.rate_hz, len(nominal)
+    rate = model.rate_hz
+    steps = len(nominal)
     faulty = inject(clean, rate, fault)
     first = window(fault, steps, rate)[0]
     if fault.kind in DRAWN:

@@ -24,12 +24,10 @@ from vehest.data.runs import true_runs
 ALERT_LIMIT = 2.0  # deg of sideslip
 CONFIDENCE = 0.95
 
-NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = (
-    "nominal",
-    "misleading",
-    "hazardously misleading",
-    "unavailable",
-)
+NOMINAL = "nominal"
+MISLEADING = "misleading"
+HAZARDOUS = "hazardously misleading"
+UNAVAILABLE = "unavailable"
 
 
 @dataclass(frozen=True, eq=False)

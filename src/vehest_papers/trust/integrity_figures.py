@@ -73,7 +73,8 @@ def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
 
 def _draw_regions(axes: Any, own: Integrity) -> None:
     """Limits between regions, and the share of the samples in each."""
-    limit, end = own.alert_limit, REACH * own.alert_limit
+    limit = own.alert_limit
+    end = REACH * own.alert_limit
     axes.fill(
         [0.0, limit, limit], [0.0, 0.0, limit], color=NONLINEAR_ORANGES[0], alpha=0.15, linewidth=0
     )

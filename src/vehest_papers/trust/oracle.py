@@ -89,11 +89,10 @@ class Oracle:
             drawn: whether the fault is random; the oracle then knows the covariance of its signature and not the signature.
         """
         length = round(HORIZON_SECONDS * self.rate_hz)
-        begin, end = (
-            max(onset - self.model.order, 0),
-            min(onset + length, len(next(iter(healthy.values())))),
-        )
-        first, within = onset - begin, end - onset
+        begin = max(onset - self.model.order, 0)
+        end = min(onset + length, len(next(iter(healthy.values()))))
+        first = onset - begin
+        within = end - onset
         parts = [
             {name: np.asarray(part[name][begin:end]) for name in self.channels}
             for part in (healthy, faulty, drive or healthy)
@@ -120,7 +119,8 @@ class Oracle:
             if self.speed
             else np.ones((1, len(self.channels)))
         )
-        signature, innovations = signature / levels, innovations / levels
+        signature = signature / levels
+        innovations = innovations / levels
         test = (
             _random_test(signature, self.model.covariance)
             if drawn
@@ -196,7 +196,8 @@ def learn_oracle(
         for recording in (*train, *validation)
     ]
     model = fit_autoregression(pieces[: len(train)])
-    speed, innovations = speed_channel(names), [model.innovations(piece) for piece in pieces]
+    speed = speed_channel(names)
+    innovations = [model.innovations(piece) for piece in pieces]
     speeds = [
         recording[speed] if speed else np.zeros(len(recording))
         for recording in (*train, *validation)

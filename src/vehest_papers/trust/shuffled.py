@@ -62,7 +62,8 @@ def scores_of(part: PartArtefacts, model: EvaluatedModel, test_set: str) -> Scor
                 else None
             )
     labels, _ = block_labels(turns, [len(own) for own in values], part.protocol.rate_hz)
-    together, known = np.concatenate(values), np.concatenate(labels)
+    together = np.concatenate(values)
+    known = np.concatenate(labels)
     finite = np.isfinite(together)
     return (
         Scores(together[finite], np.unique(known[finite], return_inverse=True)[1])
@@ -168,7 +169,8 @@ def shuffled_in_words(board: pd.DataFrame) -> str:
         f"{title} {shares.mean():.0f} %"
         for title, shares in own.groupby("title", sort=False)["if_shuffled"]
     )
-    held, chance = 100 * float((own["inside"] == "yes").mean()), float(own["if_shuffled"].mean())
+    held = 100 * float((own["inside"] == "yes").mean())
+    chance = float(own["if_shuffled"].mean())
     return (
         f"Of these {len(own)}, {held:.0f} % hold it. **With manoeuvres shuffled {DRAWS} times between calibration and test, which "
         f"makes the two alike, {chance:.0f} % do** ({by_title}): a band of so few manoeuvres seldom holds just 90 %. "

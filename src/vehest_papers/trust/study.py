@@ -162,7 +162,8 @@ def _widening_in_words(board: pd.DataFrame) -> str:
     own = board[board["car"] == OTHER]
     if own.empty:
         return "There is no such test set."
-    with_it, without = own["coverage_90"].median(), own["without_widening"].median()
+    with_it = own["coverage_90"].median()
+    without = own["without_widening"].median()
     return (
         f"Bands are {OTHER_VEHICLE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold "
         f"{100 * with_it:.0f} % of the errors (median, lowest {100 * own['coverage_90'].min():.0f} %); without the widening "
@@ -219,7 +220,8 @@ def _reliability(board: pd.DataFrame) -> Figure:
     """Coverage over level, test sets of cars learnt on together, a line a family."""
     learnt = board[board["car"] == LEARNT]
     families = [name for name in SHOWN if name in set(learnt["estimator"])]
-    lines, rows = lines_of([(name, "") for name in families]), []
+    lines = lines_of([(name, "") for name in families])
+    rows = []
     for family in families:
         own = learnt[learnt["estimator"] == family]
         values = own[list(COVERAGES)].to_numpy(dtype=float)

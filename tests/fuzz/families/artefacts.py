@@ -72,7 +72,8 @@ def manifest(case):
             for folder in sorted((case.place / "outputs" / stage).glob("*"))
         ]
     )
-    file, how = folder / "manifest.json", case.idea(4)
+    file = folder / "manifest.json"
+    how = case.idea(4)
     if how == 0:
         case.spoil(file, lambda content, rng: _rename(content, case))
     elif how == 1:
@@ -105,11 +106,9 @@ def manifest(case):
 def model(case):
     """model.yaml, model.safetensors with its header, manifest.json; names of models and folders that are none."""
     case.copy("study")
-    folder, rng, how = (
-        case.rng.choice(sorted((case.place / "outputs" / "train").iterdir())),
-        case.rng,
-        case.idea(5),
-    )
+    folder = case.rng.choice(sorted((case.place / "outputs" / "train").iterdir()))
+    rng = case.rng
+    how = case.idea(5)
     name = rng.choice([str(folder.relative_to(case.place)), folder.name])
     if how == 0:
         case.spoil(
@@ -181,7 +180,8 @@ def tracked(folder):
 def tracking_store(case):
     """The store is damaged, or something else stands in its place: work goes on without it and says so."""
     case.copy("tracked")
-    store, how = case.place / "outputs" / "mlflow.db", case.idea(4)
+    store = case.place / "outputs" / "mlflow.db"
+    how = case.idea(4)
     if how == 0:
         _put(store, case.visit // 4)
     elif how == 1:

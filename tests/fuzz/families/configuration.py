@@ -252,7 +252,8 @@ def pipeline(case):
     name = "small"
     if how in (1, 2):
         file = case.rng.choice(sorted(packaged("pipelines").glob("*.yaml")))
-        name, tree = file.stem, yaml.safe_load(file.read_text(encoding="utf-8"))
+        name = file.stem
+        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
     else:
         tree = PIPELINE if case.honest else case.rng.choice(PIPELINES)
     _write(case, f"pipelines/{name}.yaml", tree)

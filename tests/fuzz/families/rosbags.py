@@ -63,7 +63,8 @@ def _spoil_layout(content, case):
 
 @generator("bags", weight=8)
 def bag(case):
-    how, storage = case.idea(5), case.rng.choice(["sqlite3", "mcap"])
+    how = case.idea(5)
+    storage = case.rng.choice(["sqlite3", "mcap"])
     storage = "sqlite3" if how == 0 else storage
     case.copy("bags/conf", "conf")
     folder = case.copy(f"bags/{storage}/lap", "raw/lap")

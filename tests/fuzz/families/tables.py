@@ -28,7 +28,8 @@ def _reads(case, file):
 
 @generator(weight=8)
 def csv(case):
-    file, how = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False)), case.idea(2)
+    file = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False))
+    how = case.idea(2)
     if how == 0:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         for row in case.rng.sample(rows, case.rng.choice([1, 1, 3, 50])):

@@ -56,9 +56,10 @@ from vehest.data.channels import CHANNELS
 STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
-FITTING_SPEED, MISREAD = (
-    (0.97, 1.08),
-    (0.9, 1.35),
+FITTING_SPEED = (0.97, 1.08)
+MISREAD = (
+    0.9,
+    1.35,
 )  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
 WHEELS_AGREE = 0.02
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
@@ -162,7 +163,8 @@ def propose(
 
 def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
     """Without channels by name alone whose values no vehicle can have, in columns (T,) of any log of the car; others are asked there."""
-    kept, notes = [], list(proposals.notes)
+    kept = []
+    notes = list(proposals.notes)
     for one in proposals.channels:
         beyond = one.beyond(columns[one.column])
         share = float(beyond.mean())
@@ -291,11 +293,9 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         for own in (*_turning_proposals(search.turning), *repeated(search)):
             before = found.get(own.channel)
             if before is not None and before.column == own.column:
-                evidence, asked, others = (
-                    (*before.evidence, *own.evidence),
-                    own.asked or before.asked,
-                    own.others or before.others,
-                )
+                evidence = (*before.evidence, *own.evidence)
+                asked = own.asked or before.asked
+                others = own.others or before.others
                 own = replace(own, evidence=evidence, asked=asked, others=others)
             found[own.channel] = own
         fitting, notes = fitting_channels(search)
@@ -361,7 +361,8 @@ def _by_name(column: Candidate, channel: str) -> Proposal:
             f"sign: {UNCONFIRMED}",
             others=UNITS[channel],
         )
-    size, (low, high) = largest(column.values), USUAL[channel]
+    size = largest(column.values)
+    (low, high) = USUAL[channel]
     sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
     fitting = [unit for unit, own in sizes.items() if low <= own <= high]
     fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]

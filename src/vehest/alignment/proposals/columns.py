@@ -134,7 +134,8 @@ def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
 
 def correlation(left: FloatArray, right: FloatArray) -> float:
     """Of two signals about their means; 0 where one does not change."""
-    a, b = left - left.mean(), right - right.mean()
+    a = left - left.mean()
+    b = right - right.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / size if size > 0.0 else 0.0
 

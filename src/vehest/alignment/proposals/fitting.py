@@ -25,10 +25,8 @@ CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
 FITTING = 1.1  # logarithm of the scale of an acceleration over d(vx)/dt, within which pitch, grade and slip explain it
-OF_REFERENCE, BESIDE_BUS = (
-    2.5,
-    8.0,
-)  # of score, for what the car is to measure itself; where its bus has a column of that name, more
+OF_REFERENCE = 2.5
+BESIDE_BUS = 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 HARDLY = "the motion hardly decides it"
@@ -334,7 +332,8 @@ def agreement(
 
 def angles(known: Motion, column: Candidate) -> list[Angle]:
     """Road wheel or steering wheel in each unit that range and slow corners allow, by angle = length·yaw_rate/vx + K·ay + offset."""
-    ay, driven = known.channels.get("ay", known.turning), _driven(known)
+    ay = known.channels.get("ay", known.turning)
+    driven = _driven(known)
     calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
     slope, offset = _regressed(known, column, calm if calm.sum() >= FEWEST_CALM else driven, ay)
     reach = float(np.quantile(np.abs(column.values - offset), 0.995))

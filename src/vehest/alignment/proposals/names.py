@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from functools import cache
 
-STRONG, WEAK = 4.0, 2.0
+STRONG = 4.0
+WEAK = 2.0
 
 _STRONG = {  # over the name without blanks
     "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
@@ -189,7 +190,8 @@ def _corner(words: str) -> str:
 
 def is_pair(longitudinal: str, lateral: str) -> bool:
     """Whether two names differ by x and y, u and v, or long and lat alone."""
-    ahead, aside = bare(longitudinal), bare(lateral)
+    ahead = bare(longitudinal)
+    aside = bare(lateral)
     return ahead != aside and any(
         re.sub(rf"{one}(?![a-z]*{one})", other, ahead) == aside for one, other in _PAIRS
     )

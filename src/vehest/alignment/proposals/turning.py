@@ -18,7 +18,8 @@ from vehest.constants import FloatArray
 
 LEAST_CORRELATION = 0.75
 RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
-CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
+CLOSE = 0.3
+FAR = 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
 EVIDENT = 0.1  # likewise: within, the scale alone indicates an acceleration
 APART = 0.2  # by which the next best units must be worse
 RANGES = {
@@ -112,7 +113,8 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
     """Speed and yaw rate by name, where no lateral acceleration ties them together; None without one of them."""
-    named, units = {}, {}
+    named = {}
+    units = {}
     for channel in ("vx", "yaw_rate"):
         pool = [one for one in _pool(columns, channel) if channel in one.hints]
         if not pool:
@@ -242,7 +244,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
             search.turning.units[channel],
             search.turning.signs[channel],
         )
-        same, scaled = [], []
+        same = []
+        scaled = []
         for column in search.free:
             agreeing = correlation(column.slow, first.column.slow)
             unit = _unit(column, first, channel, agreeing)
@@ -281,10 +284,12 @@ def repeated(search: Search) -> Iterator[Proposal]:
 
 def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
     """With a speed that is named as a reference, or like the lateral velocity, as the reference's, where wheels can give the car's own."""
-    own, lateral = found.get("vx"), found.get("vy_ref")
+    own = found.get("vx")
+    lateral = found.get("vy_ref")
     if own is None or lateral is None or "vx_ref" in found:
         return found
-    evidence, asked = "named as a reference", own.asked
+    evidence = "named as a reference"
+    asked = own.asked
     if not is_reference(own.column):
         evidence = f"named like '{lateral.column}', and wheels are there for vx"
         asked = asked or "whether it is the car's own speed or the reference's"

@@ -19,7 +19,8 @@ USUAL_RADIUS = 0.31  # m, of cars
 NOMINAL_RADIUS = 0.3  # m, by which a speed at the rim is brought to rad/s and back
 RADII = (0.2, 0.55)
 SMALL_RADIUS = 0.02  # of models, which are not fast
-FASTEST_MODEL, FASTEST = 20.0, 110.0  # m/s
+FASTEST_MODEL = 20.0
+FASTEST = 110.0  # m/s
 SLOWEST = 1.0
 AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
@@ -65,7 +66,8 @@ def speed_of_wheels(
     for unit, of_rate, of_ay in product(
         _units(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]
     ):
-        implausible, scale = False, None
+        implausible = False
+        scale = None
         if rate:
             turning = rate.slow * si_factor(of_rate, "yaw_rate")
             implausible = not RANGES["yaw_rate"][0] <= largest(turning) <= RANGES["yaw_rate"][1]
@@ -92,8 +94,10 @@ def wheel_proposals(
     wheels: Wheels, known: Motion | None, *, has_speed: bool, is_made: bool
 ) -> tuple[list[Proposal], float | None]:
     """A channel each, and the rolling radius by which they make the speed, if it has no column; of it, the motion's may be made."""
-    mean, units = _mean(wheels), _units(wheels)
-    evidence, radius = ["its name"], NOMINAL_RADIUS
+    mean = _mean(wheels)
+    units = _units(wheels)
+    evidence = ["its name"]
+    radius = NOMINAL_RADIUS
     if known is None:
         unit, asked = (
             ("rad/s", "nothing to compare the wheels with") if len(units) > 1 else (units[0], "")
@@ -117,7 +121,8 @@ def wheel_proposals(
         ]
     factor = 1.0
     if unit in AT_RIM:
-        factor, unit = float(f"{si_factor(unit, 'vx') / NOMINAL_RADIUS:.7g}"), "rad/s"
+        factor = float(f"{si_factor(unit, 'vx') / NOMINAL_RADIUS:.7g}")
+        unit = "rad/s"
     others = UNITS if asked else ()
     found = [
         Proposal(

@@ -76,7 +76,8 @@ class CarFilter(nn.Module):
         repair: bool = True,
     ) -> None:
         super().__init__()
-        self.dynamics, self.constant = dynamics, noise == "constant"
+        self.dynamics = dynamics
+        self.constant = noise == "constant"
         n = len(STATES)
         self.process_noise, self.observation_noise = (
             ConstantNoise(variances, correlated)
@@ -85,7 +86,8 @@ class CarFilter(nn.Module):
             for variances in ((*PROCESS, FRICTION[noise]), OBSERVATION)
         )
         self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
-        self.step, self.repair = step, repair
+        self.step = step
+        self.repair = repair
         self.lower = (least[0], *[-torch.inf] * 3, least[1])
         self.rule = symmetric_rule(n, KAPPA)
 
@@ -140,10 +142,8 @@ class CarFilter(nn.Module):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            process, observation = (
-                with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY),
-                self.observation_noise(at, inputs),
-            )
+            process = with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY)
+            observation = self.observation_noise(at, inputs)
         else:
             process, observation = self.noise_at()  # type: ignore[assignment]
         return unscented_scan(
@@ -184,10 +184,8 @@ class CarFilter(nn.Module):
                 [d.measurements - self.dynamics.observation(d.states, d.inputs) for d in drives]
             )
             size = torch.cat([drive.states for drive in drives]).square().mean(0).sqrt()
-            process, observation = (
-                steps.T @ steps / len(steps),
-                expected.T @ expected / len(expected),
-            )
+            process = steps.T @ steps / len(steps)
+            observation = expected.T @ expected / len(expected)
             friction = len(STATES) - 1
             process[friction, friction] = FRICTION[
                 "constant" if self.constant else "state_dependent"
@@ -212,10 +210,12 @@ class CarFilter(nn.Module):
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
         model = self.point_model()
-        means, covariances = [], []
+        means = []
+        covariances = []
         for first in range(0, total, steps or total):
             # a later stretch starts with the last sample of the one before, which is not measured twice
-            begin, end = max(first - 1, 0), min(first + (steps or total), total)
+            begin = max(first - 1, 0)
+            end = min(first + (steps or total), total)
             measurements = drives.measurements[:, begin:end]
             if first:
                 measurements = torch.cat(

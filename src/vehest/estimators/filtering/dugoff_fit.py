@@ -62,7 +62,8 @@ def fit_dugoff(
     thin = max(1, -(-motion.slip.shape[1] // MOST_SAMPLES))
     vx, steer, ax = (torch.as_tensor(row) for row in motion.driven[:, ::thin])
     forces = motion.force[:, ::thin] / np.stack([np.cos(steer.numpy()), np.ones(len(steer))])
-    loads, at_rest = car.loads(ax), car.loads(torch.zeros(()))
+    loads = car.loads(ax)
+    at_rest = car.loads(torch.zeros(()))
     found = []
     for axle in (0, 1):
         tangent = torch.as_tensor(np.tan(motion.slip[axle, ::thin]))

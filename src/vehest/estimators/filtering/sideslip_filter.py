@@ -79,14 +79,14 @@ class SideslipFilter(GatedFilter, Recursive):
         self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
         """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over."""
-        mean, variance = np.zeros(len(deviation)), np.square(deviation)
+        mean = np.zeros(len(deviation))
+        variance = np.square(deviation)
         if "vy" in given:
-            mean[0], variance[0] = (
-                math.atan2(given["vy"], max(sample[1], self.minimum_speed)),
-                KNOWN**2,
-            )
+            mean[0] = math.atan2(given["vy"], max(sample[1], self.minimum_speed))
+            variance[0] = KNOWN**2
         if "yaw_rate" in given:
-            mean[1], variance[1] = given["yaw_rate"], KNOWN**2
+            mean[1] = given["yaw_rate"]
+            variance[1] = KNOWN**2
         return Gaussian(mean, np.diag(variance))
 
     @abstractmethod
@@ -119,14 +119,17 @@ class SideslipFilter(GatedFilter, Recursive):
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
         """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what further states say."""
-        rows, refused = samples, state.refused.copy()
+        rows = samples
+        refused = state.refused.copy()
         if state.sample is not None:
             rows = np.empty((len(samples) + 1, len(self.channels)))
-            rows[0], rows[1:] = state.sample, samples
+            rows[0] = state.sample
+            rows[1:] = samples
             rows[0, MEASURED] = np.nan
         found = self.filter_samples(rows, state.state, self.gate_in_use(), refused)
         own = slice(len(rows) - len(samples), None)
-        mean, vx = found.mean[own], samples[:, 1]
+        mean = found.mean[own]
+        vx = samples[:, 1]
         tangent = np.tan(mean[:, 0])
         scale = np.ones((len(samples), 2))
         scale[:, 0] = vx * (1.0 + tangent**2)

@@ -54,7 +54,8 @@ class SigmaPointStepper(Stepper):
         step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
         if self._filter is None:
             self._filter = estimator.new_filter(step)
-        dtype, of_vy = self._filter.state.mean.dtype, estimator.states.index("vy")
+        dtype = self._filter.state.mean.dtype
+        of_vy = estimator.states.index("vy")
         mean = self._filter.step(
             step.measurement.astype(dtype),
             step.inputs.astype(dtype),

@@ -97,7 +97,8 @@ class TrackFilter:
         for row, given in enumerate(states or ()):
             for column, name in enumerate(TRACK_STATES):
                 if given and name in given:
-                    mean[row, column], deviation[row, column] = given[name], KNOWN
+                    mean[row, column] = given[name]
+                    deviation[row, column] = KNOWN
         return Gaussian(mean, torch.diag_embed(deviation.square()))
 
 
@@ -123,9 +124,11 @@ def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
     which a recording counts by its error, not by the square of it. Recordings without a sample do not count.
     """
     if over == "samples":
-        total, count = 0.0, 0
+        total = 0.0
+        count = 0
         for square, number in sums:
-            total, count = total + square, count + number
+            total = total + square
+            count = count + number
         return total / max(count, 1)
     roots = [math.sqrt(square / number) for square, number in sums if number]
     return float(np.mean(roots)) ** 2 if roots else 0.0

@@ -197,10 +197,8 @@ def _motion_of(
             np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])]),
             driven,
         )
-    total, moment = (
-        mass * smoothed(recording["ay"]),
-        inertia * smoothed(recording["yaw_rate"], derivative=1),
-    )
+    total = mass * smoothed(recording["ay"])
+    moment = inertia * smoothed(recording["yaw_rate"], derivative=1)
     return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear), driven
 
 
@@ -256,11 +254,10 @@ def _fitted(
         found = optimize.least_squares(
             misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,)
         )
-        logarithms, spread = (
-            found.x,
-            math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight,
-        )
-    of_data, of_knowledge = found.jac[: len(slip)], found.jac[len(slip) :]
+        logarithms = found.x
+        spread = math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight
+    of_data = found.jac[: len(slip)]
+    of_knowledge = found.jac[len(slip) :]
     scores = of_data * found.fun[: len(slip), None]
     sums = np.stack([np.bincount(member, weights=column) for column in scores.T], axis=1)
     curvature = np.linalg.pinv(found.jac.T @ found.jac)

@@ -43,7 +43,8 @@ def has_to_compile(where: str) -> bool:
     function = getattr(module, entry_name)
     if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
         return False
-    folder, source = function.stats.cache_path, Path(str(module.__file__))
+    folder = function.stats.cache_path
+    source = Path(str(module.__file__))
     kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{entry_name}-*.nbi")
     return folder is not None and not any(
         index.stat().st_mtime >= source.stat().st_mtime for index in kept

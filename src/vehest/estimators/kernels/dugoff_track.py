@@ -17,13 +17,15 @@ from vehest.lanes import choose, each, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 DRIVEN = 3  # rows of inputs before those that are kept
-PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
+PLAIN = LARGEST_RATIO["plain"]
+SMOOTH = LARGEST_RATIO["smooth"]
 
 
 class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
 
-    is_compiled, kept = True, 4
+    is_compiled = True
+    kept = 4
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
@@ -56,12 +58,12 @@ def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
     wheelbase = front_arm + rear_arm
     transfer = at_row(inputs, 2, b) * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
-    front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
-    least, steer = car.dtype.type(LEAST_LOAD), at_row(inputs, 1, b)
-    load_front, load_rear = (
-        mass * most(front - transfer, least * front),
-        mass * most(rear + transfer, least * rear),
-    )
+    front = gravity * rear_arm / wheelbase
+    rear = gravity * front_arm / wheelbase
+    least = car.dtype.type(LEAST_LOAD)
+    steer = at_row(inputs, 1, b)
+    load_front = mass * most(front - transfer, least * front)
+    load_rear = mass * most(rear + transfer, least * rear)
     return (
         most(at_row(inputs, 0, b), minimum_speed),
         each(math.tan, steer),
@@ -75,7 +77,8 @@ def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
 def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
-    one, least = axle.dtype.type(1.0), axle.dtype.type(LEAST_SHARE)
+    one = axle.dtype.type(1.0)
+    least = axle.dtype.type(LEAST_SHARE)
     slide = abs(tangent)
     share = one - reduction * vx * slide
     per_slide = choose(share < least, 0.0, -reduction * vx)
@@ -91,7 +94,8 @@ def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
     else:
         used = ratio * (2 - ratio)
         by_ratio = 2 - 2 * ratio
-    force, slope = stiffness * tangent, stiffness * (used + slide * by_ratio * by_slide)
+    force = stiffness * tangent
+    slope = stiffness * (used + slide * by_ratio * by_slide)
     return choose(linear, force, force * used), choose(linear, stiffness, slope)
 
 
@@ -100,8 +104,10 @@ def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
     """Forces across the body at point s, front and rear, and the derivative of each by the lateral velocity of its axle."""
     vx, turned, cosine, load_front, load_rear = settled
     car, axles, smooth = track
-    vy, yaw_rate = at_row(points, 2 * s, b), at_row(points, 2 * s + 1, b)
-    course_front, course_rear = (vy + car[2] * yaw_rate) / vx, (vy - car[3] * yaw_rate) / vx
+    vy = at_row(points, 2 * s, b)
+    yaw_rate = at_row(points, 2 * s + 1, b)
+    course_front = (vy + car[2] * yaw_rate) / vx
+    course_rear = (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
     least = axles.dtype.type(LEAST_COSINE)
     tangent = (turned - course_front) / choose(across > least, across, least)
@@ -138,7 +144,8 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled, rolls = _settled(inputs, b, car), at_row(inputs, 0, b) < minimum_speed
+        settled = _settled(inputs, b, car)
+        rolls = at_row(inputs, 0, b) < minimum_speed
         turn = at_row(inputs, 0, b) * at_row(inputs, 1, b) / (front_arm + rear_arm)
         for s in range(points.shape[0]):
             vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, settled, track)
@@ -151,7 +158,8 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
 
 @compiled
 def _observation(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
-    car, m = track[0], out.shape[1]
+    car = track[0]
+    m = out.shape[1]
     for b in range(first, end, width(points)):
         settled = _settled(inputs, b, car)
         for s in range(points.shape[0]):
@@ -170,10 +178,12 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        vx, rolls = most(at_row(inputs, 0, b), minimum_speed), at_row(inputs, 0, b) < minimum_speed
+        vx = most(at_row(inputs, 0, b), minimum_speed)
+        rolls = at_row(inputs, 0, b) < minimum_speed
         for s in range(points.shape[0]):
             by_front, by_rear = _kept(inputs, 0, s, b)
-            across, turning = at_row(upstream, 2 * s, b), at_row(upstream, 2 * s + 1, b)
+            across = at_row(upstream, 2 * s, b)
+            turning = at_row(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
             spun = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
@@ -183,12 +193,14 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
 
 @compiled
 def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
-    car, m = track[0], upstream.shape[1]
+    car = track[0]
+    m = upstream.shape[1]
     mass, _, front_arm, rear_arm, _, _, minimum_speed = car
     for b in range(first, end, width(points)):
         vx = most(at_row(inputs, 0, b), minimum_speed)
         for s in range(points.shape[0]):
-            vy, (by_front, by_rear) = at_row(points, 2 * s, b), _kept(inputs, 1, s, b)
+            vy = at_row(points, 2 * s, b)
+            (by_front, by_rear) = _kept(inputs, 1, s, b)
             across = at_row(upstream, m * s, b) / mass
             front_bar = (across + at_row(upstream, m * s + 2, b)) * by_front
             rear_bar = (across + at_row(upstream, m * s + 3, b)) * by_rear

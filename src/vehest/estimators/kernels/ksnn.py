@@ -48,7 +48,8 @@ def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int
 
 def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
     """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6 Q)."""
-    p, gamma = parameters, parameters["gamma"]
+    p = parameters
+    gamma = parameters["gamma"]
     bias = p.get("linear_bias", np.zeros_like(gamma))
     if "output_bias" in p:
         bias = bias + p["output_bias"]
@@ -70,7 +71,8 @@ def c_tables(
     theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool
 ) -> dict[str, Any]:
     """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their biases are left out."""
-    n_local, n_hidden = len(theta), (theta.shape[1] - LINEAR) // 6
+    n_local = len(theta)
+    n_hidden = (theta.shape[1] - LINEAR) // 6
     return {
         "window": window,
         "local": n_local,
@@ -86,14 +88,17 @@ def c_tables(
 
 def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
     """The recursion of a network with parameters in the order of `shapes_of`; its last local model is centred at a yaw rate [rad/s]."""
-    own, views, first = settings, {}, 0
+    own = settings
+    views = {}
+    first = 0
     shapes = shapes_of(own.n_local, own.n_hidden, bias=own.bias)
     one = np.eye(sum(int(np.prod(shape)) for shape in shapes.values()))
     for name, shape in shapes.items():
         views[name] = one[:, first : first + int(np.prod(shape))].reshape(-1, *shape)
         first += int(np.prod(shape))
     slots = packed(views).reshape(len(one), -1).argmax(1)
-    step, per_width = 1.0 / own.rate_hz, (own.n_local - 1) / yaw_rate_max
+    step = 1.0 / own.rate_hz
+    per_width = (own.n_local - 1) / yaw_rate_max
     return Recursion(
         loop,
         lambda number: (
@@ -111,16 +116,18 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
 def loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
     """See `vehest.estimators.kernels.recursion.Recursion`."""
     slots, n_local, n_hidden, n_window, step, per_width = given
-    lanes, neurons = width(series), 4 * n_hidden
+    lanes = width(series)
+    neurons = 4 * n_hidden
     theta = np.empty(n_local * (LINEAR + 6 * n_hidden), flat.dtype)
-    sums, scratch = np.empty(theta.size * lanes, flat.dtype), np.empty(lanes, flat.dtype)
-    measured, rows = series.ravel(), np.empty(lanes, np.int64)
+    sums = np.empty(theta.size * lanes, flat.dtype)
+    scratch = np.empty(lanes, flat.dtype)
+    measured = series.ravel()
+    rows = np.empty(lanes, np.int64)
     seen = np.empty(n_window * CHANNELS * lanes, flat.dtype)
-    kept, outputs = (
-        np.empty(n_window * KEPT * lanes, flat.dtype),
-        np.empty(max(n_window * neurons * 3, 1) * lanes, flat.dtype),
-    )
-    car, room = (theta, n_local, n_hidden, step, per_width), (seen, kept, outputs)
+    kept = np.empty(n_window * KEPT * lanes, flat.dtype)
+    outputs = np.empty(max(n_window * neurons * 3, 1) * lanes, flat.dtype)
+    car = (theta, n_local, n_hidden, step, per_width)
+    room = (seen, kept, outputs)
     for m in range(flat.shape[0]):
         for number, start in enumerate(range(0, starts.shape[1], batch)):
             end = min(start + batch, starts.shape[1])
@@ -132,7 +139,8 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
             for first in range(0, own.size, lanes):
                 gather(measured, CHANNELS, starts[m, start:end], first, rows, seen, CHANNELS)
                 v = load(scratch, 0) * 0
-                v, u = load(seen, lanes) * 0, load(seen, lanes)
+                v = load(seen, lanes) * 0
+                u = load(seen, lanes)
                 for k in range(n_window):
                     v, u = _forward(car, room, k, v, u)
                 store(scratch, 0, v)
@@ -140,7 +148,8 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                     own[first + lane] = scratch[lane]
                 if gradient.size:
                     slopes_of(own, targets[m, start:end], first, losses.size > 0, scratch)
-                    v, u = load(scratch, 0), load(scratch, 0) * 0
+                    v = load(scratch, 0)
+                    u = load(scratch, 0) * 0
                     for k in range(n_window - 1, -1, -1):
                         v, u = _backward(car, room, k, v, u, sums)
             if gradient.size:
@@ -158,29 +167,37 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
     """v and û after a step of all lanes."""
     theta, n_local, n_hidden, step, per_width = car
     seen, kept, outputs = room
-    lanes, row = width(theta), LINEAR + 6 * n_hidden
-    now, then, neuron = k * CHANNELS * lanes, k * KEPT * lanes, k * 4 * n_hidden * 3 * lanes
-    omega, speed = load(seen, now), load(seen, now + lanes)
+    lanes = width(theta)
+    row = LINEAR + 6 * n_hidden
+    now = k * CHANNELS * lanes
+    then = k * KEPT * lanes
+    neuron = k * 4 * n_hidden * 3 * lanes
+    omega = load(seen, now)
+    speed = load(seen, now + lanes)
     position = least(abs(omega) * per_width, n_local - 1)
     phi = most(1 - position, 0)
-    g1, g2, b1, b2 = phi * theta[0], phi * theta[1], phi * theta[2], phi * theta[3]
-    w1, f1, w2, f2 = phi * theta[4], phi * theta[5], phi * theta[6], phi * theta[7]
+    g1 = phi * theta[0]
+    g2 = phi * theta[1]
+    b1 = phi * theta[2]
+    b2 = phi * theta[3]
+    w1 = phi * theta[4]
+    f1 = phi * theta[5]
+    w2 = phi * theta[6]
+    f2 = phi * theta[7]
     for p in range(1, n_local):
-        phi, own = most(1 - abs(position - p), 0), p * row
-        g1, g2, b1, b2 = (
-            g1 + phi * theta[own + 0],
-            g2 + phi * theta[own + 1],
-            b1 + phi * theta[own + 2],
-            b2 + phi * theta[own + 3],
-        )
-        w1, f1, w2, f2 = (
-            w1 + phi * theta[own + 4],
-            f1 + phi * theta[own + 5],
-            w2 + phi * theta[own + 6],
-            f2 + phi * theta[own + 7],
-        )
+        phi = most(1 - abs(position - p), 0)
+        own = p * row
+        g1 = g1 + phi * theta[own + 0]
+        g2 = g2 + phi * theta[own + 1]
+        b1 = b1 + phi * theta[own + 2]
+        b2 = b2 + phi * theta[own + 3]
+        w1 = w1 + phi * theta[own + 4]
+        f1 = f1 + phi * theta[own + 5]
+        w2 = w2 + phi * theta[own + 6]
+        f2 = f2 + phi * theta[own + 7]
     error = u - speed
-    f1, f2 = f1 + w1 * error, f2 + w2 * error
+    f1 = f1 + w1 * error
+    f2 = f2 + w2 * error
     if n_hidden:
         model = _model(position, n_local)
         for side in range(min(2, n_local)):
@@ -225,18 +242,15 @@ def _model(position, n_local):  # type: ignore[no-untyped-def]
 @part(_nrt=False)
 def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
     """w₂, b₂, w₃ of one neuron of the lanes' active models."""
-    w2, b2, w3 = (
-        model * 0 + theta[column],
-        model * 0 + theta[column + 1],
-        model * 0 + theta[column + 2],
-    )
+    w2 = model * 0 + theta[column]
+    b2 = model * 0 + theta[column + 1]
+    w3 = model * 0 + theta[column + 2]
     for p in range(1, n_local - 1):
-        at, here = column + p * row, model == p
-        w2, b2, w3 = (
-            choose(here, theta[at], w2),
-            choose(here, theta[at + 1], b2),
-            choose(here, theta[at + 2], w3),
-        )
+        at = column + p * row
+        here = model == p
+        w2 = choose(here, theta[at], w2)
+        b2 = choose(here, theta[at + 1], b2)
+        w3 = choose(here, theta[at + 2], w3)
     return w2, b2, w3
 
 
@@ -245,20 +259,24 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
     """Adjoint of one step: derivatives by v and û before it from those after it; ``sums`` adds up those by parameters."""
     theta, n_local, n_hidden, step, per_width = car
     seen, kept, outputs = room
-    lanes, row = width(theta), LINEAR + 6 * n_hidden
-    now, then, neuron = k * CHANNELS * lanes, k * KEPT * lanes, k * 4 * n_hidden * 3 * lanes
-    omega, speed, v, u = (
-        load(seen, now),
-        load(seen, now + lanes),
-        load(kept, then),
-        load(kept, then + lanes),
-    )
-    error, position = u - speed, least(abs(omega) * per_width, n_local - 1)
+    lanes = width(theta)
+    row = LINEAR + 6 * n_hidden
+    now = k * CHANNELS * lanes
+    then = k * KEPT * lanes
+    neuron = k * 4 * n_hidden * 3 * lanes
+    omega = load(seen, now)
+    speed = load(seen, now + lanes)
+    v = load(kept, then)
+    u = load(kept, then + lanes)
+    error = u - speed
+    position = least(abs(omega) * per_width, n_local - 1)
     slip = step * (load(seen, now + 2 * lanes) - speed * omega)
     thrust = step * (load(seen, now + 3 * lanes) + v * omega)
-    to_f1, to_f2 = -omega * to_v, -to_u
+    to_f1 = -omega * to_v
+    to_f2 = -to_u
     for p in range(n_local):
-        phi, at = most(1 - abs(position - p), 0), p * row * lanes
+        phi = most(1 - abs(position - p), 0)
+        at = p * row * lanes
         add(sums, at, phi * to_v * v)
         add(sums, at + lanes, phi * to_u * u)
         add(sums, at + 2 * lanes, phi * to_v * slip)
@@ -289,7 +307,8 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
                     next_u = next_u + inner * load(outputs, at)
                     column = side * row + LINEAR + 3 * (i * n_hidden + j)
                     for p in range(max(n_local - 1, 1)):
-                        here, slot = model == p, (column + p * row) * lanes
+                        here = model == p
+                        slot = (column + p * row) * lanes
                         own = choose(here, inner, 0)
                         add(sums, slot, own * error)
                         add(sums, slot + lanes, own)

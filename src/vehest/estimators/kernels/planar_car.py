@@ -140,9 +140,13 @@ def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
 def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
     """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
     for b in range(first, end):
-        sine, cosine = math.sin(inputs[0, b]), math.cos(inputs[0, b])
+        sine = math.sin(inputs[0, b])
+        cosine = math.cos(inputs[0, b])
         for p in range((b - first) * count, (b + 1 - first) * count if b + 1 < end else u.shape[1]):
-            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[0, b], sine, cosine, inputs[1, b]
+            u[0, p] = inputs[0, b]
+            u[1, p] = sine
+            u[2, p] = cosine
+            u[3, p] = inputs[1, b]
 
 
 @piece
@@ -190,11 +194,9 @@ def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Writes ``f_bar``, and adds to the gradients when learning."""
     _, _, _, _, W3, _, W1, W2, _ = layers
-    h2_bar, h1_bar, out_bar = (
-        np.empty_like(h2),
-        np.empty_like(h1),
-        np.empty((f.shape[0], 4), f.dtype),
-    )
+    h2_bar = np.empty_like(h2)
+    h1_bar = np.empty_like(h1)
+    out_bar = np.empty((f.shape[0], 4), f.dtype)
     for p in range(f.shape[0]):
         for k in range(4):
             out_bar[p, k] = o_bar[k, p]
@@ -215,7 +217,8 @@ def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients)
 
 @piece
 def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
-    one, nothing = rows.dtype.type(1), rows.dtype.type(0)
+    one = rows.dtype.type(1)
+    nothing = rows.dtype.type(0)
     for p in range(rows.shape[0]):
         for i in range(rows.shape[1]):
             rows_bar[p, i] *= _rise(rows[p, i], one - rows[p, i], flat, nothing)
@@ -241,7 +244,8 @@ def _add_rows(rows, out):  # type: ignore[no-untyped-def]
 def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
     """Slips (front, rear, ratio), and what the network sees."""
     _, theta, constants, kind = car
-    lr, still = theta[0], constants[6]
+    lr = theta[0]
+    still = constants[6]
     lf = constants[1] - lr
     for p in range(x.shape[1]):
         along = x[0, p] + still
@@ -261,7 +265,8 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
         for p in range(f.shape[0]):
             for i in range(4):
                 f[p, i] = x[i, p]
-            f[p, 4], f[p, 5] = u[0, p], u[3, p]
+            f[p, 4] = u[0, p]
+            f[p, 5] = u[3, p]
 
 
 @piece
@@ -285,7 +290,9 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
     points = x.shape[1]
-    turn, unscaled, one = constants[4], constants[5], theta.dtype.type(1)
+    turn = constants[4]
+    unscaled = constants[5]
+    one = theta.dtype.type(1)
     if kind == FRICTION_SCALED:
         for k in range(2):
             for p in range(points):
@@ -301,7 +308,8 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         for p in range(points):
             along = friction * Dx * _curve(slips[2, p], Bx, Cx, one)[0]
-            forces[0, p], forces[1, p] = rear_load * along, front_load * along
+            forces[0, p] = rear_load * along
+            forces[1, p] = front_load * along
             forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr, one)[0]
             forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf, one)[0]
 
@@ -311,8 +319,11 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
     """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and adds to the others."""
     _, theta, constants, kind = car
     points = x.shape[1]
-    turn, unscaled, flat = constants[4], constants[5], constants[7]
-    one, nothing = theta.dtype.type(1), theta.dtype.type(0)
+    turn = constants[4]
+    unscaled = constants[5]
+    flat = constants[7]
+    one = theta.dtype.type(1)
+    nothing = theta.dtype.type(0)
     slips_bar[:] = 0
     if kind == FRICTION_SCALED:
         for k in range(2):
@@ -373,9 +384,15 @@ def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
     lr, inertia, drag0, drag1, drag2, powertrain, torque, viscous, coulomb = theta[:9]
     lf = wheelbase - lr
     for p in range(x.shape[1]):
-        vx, rim = x[0, p], x[3, p]
-        sine, cosine, current = u[1, p], u[2, p], u[3, p]
-        rear_x, front_x, rear_y, front_y = forces[0, p], forces[1, p], forces[2, p], forces[3, p]
+        vx = x[0, p]
+        rim = x[3, p]
+        sine = u[1, p]
+        cosine = u[2, p]
+        current = u[3, p]
+        rear_x = forces[0, p]
+        front_x = forces[1, p]
+        rear_y = forces[2, p]
+        front_y = forces[3, p]
         sideways = front_x * sine + front_y * cosine
         drag = drag0 * np.sign(vx) + drag1 * vx + drag2 * vx * vx
         out[0, p] = (rear_x + front_x * cosine - front_y * sine - drag) / mass
@@ -400,24 +417,34 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
     mass, wheelbase, radius = constants[:3]
     lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta[:9]
     lf = wheelbase - lr
-    zero, two = x.dtype.type(0), x.dtype.type(2)
-    d_lf, d_lr, d_inertia, d_drag0, d_drag1, d_drag2 = zero, zero, zero, zero, zero, zero
-    d_powertrain, d_torque, d_viscous, d_coulomb = zero, zero, zero, zero
+    zero = x.dtype.type(0)
+    two = x.dtype.type(2)
+    d_lf = zero
+    d_lr = zero
+    d_inertia = zero
+    d_drag0 = zero
+    d_drag1 = zero
+    d_drag2 = zero
+    d_powertrain = zero
+    d_torque = zero
+    d_viscous = zero
+    d_coulomb = zero
     for p in range(x.shape[1]):
-        vx, rim = x[0, p], x[3, p]
-        sine, cosine, current = u[1, p], u[2, p], u[3, p]
-        front_x, rear_y, front_y = forces[1, p], forces[2, p], forces[3, p]
-        ax, ay, turning, spinning = (
-            out_bar[0, p] / mass,
-            out_bar[1, p] / mass,
-            out_bar[2, p] / inertia,
-            out_bar[3, p],
-        )
+        vx = x[0, p]
+        rim = x[3, p]
+        sine = u[1, p]
+        cosine = u[2, p]
+        current = u[3, p]
+        front_x = forces[1, p]
+        rear_y = forces[2, p]
+        front_y = forces[3, p]
+        ax = out_bar[0, p] / mass
+        ay = out_bar[1, p] / mass
+        turning = out_bar[2, p] / inertia
+        spinning = out_bar[3, p]
         twisting = spinning * radius / powertrain
-        along, across = (
-            ax * cosine + ay * sine + turning * sine * lf,
-            ay * cosine - ax * sine + turning * cosine * lf,
-        )
+        along = ax * cosine + ay * sine + turning * sine * lf
+        across = ay * cosine - ax * sine + turning * cosine * lf
         slope[0, p] = ax - radius * twisting
         slope[1, p] = along - radius * twisting
         slope[2, p] = ay - turning * lr
@@ -458,7 +485,8 @@ def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
         for p in range(x.shape[1]):
             out[0, p] = o[0, p] - x[1, p] * x[2, p]
             out[1, p] = o[1, p] + x[0, p] * x[2, p]
-            out[2, p], out[3, p] = o[2, p], o[3, p]
+            out[2, p] = o[2, p]
+            out[3, p] = o[3, p]
         return
     _forces(x, car, slips, o, forces)
     _chassis(x, u, car, forces, plain)
@@ -475,7 +503,9 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
     layers, theta, constants, kind = car
     f, slips, h1, h2, o, forces, plain = room
     points = x.shape[1]
-    o_bar, f_bar, slips_bar = np.empty_like(o), np.zeros_like(f), np.zeros_like(slips)
+    o_bar = np.empty_like(o)
+    f_bar = np.zeros_like(f)
+    slips_bar = np.zeros_like(slips)
     dtheta = gradients[6]
     if kind != RATES:
         slope = np.empty_like(o)
@@ -508,12 +538,19 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
 
 @piece
 def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
-    lf, still = constants[1] - lr, constants[6]
-    one, d_lf, d_lr = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0)
+    lf = constants[1] - lr
+    still = constants[6]
+    one = x.dtype.type(1)
+    d_lf = x.dtype.type(0)
+    d_lr = x.dtype.type(0)
     for p in range(x.shape[1]):
-        vx, vy, yaw_rate, rim = x[0, p], x[1, p], x[2, p], x[3, p]
+        vx = x[0, p]
+        vy = x[1, p]
+        yaw_rate = x[2, p]
+        rim = x[3, p]
         along = vx + still
-        front, rear = (vy + lf * yaw_rate) / along, (vy - lr * yaw_rate) / along
+        front = (vy + lf * yaw_rate) / along
+        rear = (vy - lr * yaw_rate) / along
         front_bar = slips_bar[0, p] / (one + front * front) / along
         rear_bar = slips_bar[1, p] / (one + rear * rear) / along
         ratio_bar = slips_bar[2, p] / along
@@ -551,7 +588,8 @@ def _taken(points, inputs, first, end):  # type: ignore[no-untyped-def]
     count, n, _ = points.shape
     lanes = width(points)
     columns = ((end - first) * count + lanes - 1) // lanes * lanes
-    x, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
+    x = np.empty((n, columns), points.dtype)
+    u = np.empty((4, columns), points.dtype)
     _columns(points, first, end, 1, x)
     _driven(inputs, first, end, count, u)
     return x, u
@@ -560,7 +598,9 @@ def _taken(points, inputs, first, end):  # type: ignore[no-untyped-def]
 @piece
 def _room(points, x, car):  # type: ignore[no-untyped-def]
     """For what the network sees of so many points, slips, both hidden layers, its outputs, forces, and rates without what it adds."""
-    (T1, _, T2), columns, dtype = car[0][:3], x.shape[1], x.dtype
+    (T1, _, T2) = car[0][:3]
+    columns = x.shape[1]
+    dtype = x.dtype
     return (
         np.empty((points, T1.shape[0]), dtype),
         np.empty((3, columns), dtype),
@@ -575,8 +615,10 @@ def _room(points, x, car):  # type: ignore[no-untyped-def]
 @piece
 def _stages(x0, u, car, rooms):  # type: ignore[no-untyped-def]
     """States and rates at the four stages of the Runge-Kutta method."""
-    step, half = car[2][3], x0.dtype.type(0.5)
-    x, rates = np.empty((4, *x0.shape), x0.dtype), np.empty((4, *x0.shape), x0.dtype)
+    step = car[2][3]
+    half = x0.dtype.type(0.5)
+    x = np.empty((4, *x0.shape), x0.dtype)
+    rates = np.empty((4, *x0.shape), x0.dtype)
     motion = np.empty((4, x0.shape[1]), x0.dtype)
     for stage in range(4):
         if stage == 0:
@@ -594,7 +636,8 @@ def _stages(x0, u, car, rooms):  # type: ignore[no-untyped-def]
 @compiled
 def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
     count, n, _ = points.shape
-    sixth, two = points.dtype.type(car[2][3] / 6), points.dtype.type(2)
+    sixth = points.dtype.type(car[2][3] / 6)
+    two = points.dtype.type(2)
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
@@ -619,7 +662,8 @@ def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-unty
         expected = np.empty_like(u)
         _motion(x, u, car, _room((end - first) * count, x, car), expected)
         for p in range(x.shape[1]):
-            expected[2, p], expected[3, p] = x[2, p], x[3, p]
+            expected[2, p] = x[2, p]
+            expected[3, p] = x[3, p]
         _put(expected, out, first, end)
 
 
@@ -627,21 +671,21 @@ def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-unty
 def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
     learning = gradients[7]
     count, n, _ = points.shape
-    step, nothing = car[2][3], points.dtype.type(0)
+    step = car[2][3]
+    nothing = points.dtype.type(0)
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
         x0, u = _taken(points, inputs, first, end)
-        own, columns = (end - first) * count, x0.shape[1]
+        own = (end - first) * count
+        columns = x0.shape[1]
         rooms = (_room(own, x0, car), _room(own, x0, car), _room(own, x0, car), _room(own, x0, car))
         x, _ = _stages(x0, u, car, rooms)
         up = np.empty_like(x0)
         _columns(upstream, first, end, 0, up)
-        total, stage_bar, rates_bar = (
-            up.copy(),
-            np.zeros_like(up),
-            np.empty((4, columns), points.dtype),
-        )
+        total = up.copy()
+        stage_bar = np.zeros_like(up)
+        rates_bar = np.empty((4, columns), points.dtype)
         for k in range(4):
             at = 3 - k
             weight = points.dtype.type(step / 3 if at in (1, 2) else step / 6)
@@ -666,16 +710,21 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
 
 @compiled
 def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
-    learning, count = gradients[7], points.shape[0]
+    learning = gradients[7]
+    count = points.shape[0]
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
         x, u = _taken(points, inputs, first, end)
-        room, up, x_bar = _room((end - first) * count, x, car), np.empty_like(u), np.zeros_like(x)
+        room = _room((end - first) * count, x, car)
+        up = np.empty_like(u)
+        x_bar = np.zeros_like(x)
         _motion(x, u, car, room, np.empty_like(u))
         _columns(upstream, first, end, 0, up)
         for p in range(x.shape[1]):
-            x_bar[2, p], x_bar[3, p] = up[2, p], up[3, p]
-            up[2, p], up[3, p] = 0, 0
+            x_bar[2, p] = up[2, p]
+            x_bar[3, p] = up[3, p]
+            up[2, p] = 0
+            up[3, p] = 0
         _motion_adjoint(x, u, car, room, up, x_bar, learning, gradients)
         _put(x_bar, out, first, end)

@@ -45,18 +45,26 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
             (T, 2, 2), and what was measured, (T, 2).
     """
     car, nominal, adapted, step, minimum_speed, adapt_above = track
-    (largest, lost, rolling), (limit, patience, refused), (mean, cov) = guessed, gate, state
+    (largest, lost, rolling) = guessed
+    (limit, patience, refused) = gate
+    (mean, cov) = state
     means, deviations, sideslip_cov, innovation, innovation_cov, measured = out
-    n, tyres = len(mean), 4 + len(adapted)
-    left, gain, cross = np.empty((n, n)), np.empty((n, 2)), np.empty((n, 2))
-    per_rate, per_turn = np.zeros(n), np.zeros(n)
+    n = len(mean)
+    tyres = 4 + len(adapted)
+    left = np.empty((n, n))
+    gain = np.empty((n, 2))
+    cross = np.empty((n, 2))
+    per_rate = np.zeros(n)
+    per_turn = np.zeros(n)
     parameters = nominal.copy()
     for k in range(len(samples)):
-        vx, steer = samples[k, 1], samples[k, 3]
+        vx = samples[k, 1]
+        steer = samples[k, 3]
         if vx < minimum_speed:
             _roll(mean, cov, rolling, car, vx, steer)
             _note(k, mean, cov, means, deviations, sideslip_cov)
-            innovation[k], measured[k] = 0.0, False
+            innovation[k] = 0.0
+            measured[k] = False
             innovation_cov[k] = np.eye(2)
             continue
         if k > 0:
@@ -71,7 +79,8 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
             _clip(mean, bounds)
             if not abs(mean[0]) < largest:
                 _roll(mean, cov, rolling, car, vx, steer)
-                mean[4:tyres], cov[4:tyres, 4:tyres] = 0.0, start_tyres
+                mean[4:tyres] = 0.0
+                cov[4:tyres, 4:tyres] = start_tyres
             elif not cov[0, 0] < lost:
                 _roll(mean, cov, rolling, car, vx, steer)
         held = abs(vx * mean[1]) < adapt_above
@@ -112,7 +121,8 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
         front_arm * front_arm * front.per_slip + rear_arm * rear_arm * rear.per_slip
     ) / (inertia * speed)
     for i, index in enumerate(adapted):
-        by_front, by_rear = 0.0, 0.0
+        by_front = 0.0
+        by_rear = 0.0
         if index == 0:
             by_front = front.per_log_c1
         elif index == 1:
@@ -122,7 +132,8 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
         elif index == 3:
             by_rear = rear.per_log_c2
         else:
-            by_front, by_rear = front.per_log_friction, rear.per_log_friction
+            by_front = front.per_log_friction
+            by_rear = rear.per_log_friction
         per_rate[4 + i] = (by_front + by_rear) * along
         per_turn[4 + i] = (front_arm * by_front - rear_arm * by_rear) / inertia
     rate = (front.force + rear.force) * along - mean[1]
@@ -132,7 +143,8 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
     acceleration = (front_arm * front.force - rear_arm * rear.force) / inertia
     mean[0] += step * mean[2]
     mean[1] += step * mean[3]
-    mean[2], mean[3] = rate, acceleration
+    mean[2] = rate
+    mean[3] = acceleration
     return front
 
 
@@ -143,21 +155,25 @@ def _spread(cov, per_rate, per_turn, step, left):  # type: ignore[no-untyped-def
     for j in range(n):  # A P
         left[0, j] = cov[0, j] + step * cov[2, j]
         left[1, j] = cov[1, j] + step * cov[3, j]
-        first, second = 0.0, 0.0
+        first = 0.0
+        second = 0.0
         for i in range(n):
             first += per_rate[i] * cov[i, j]
             second += per_turn[i] * cov[i, j]
-        left[2, j], left[3, j] = first, second
+        left[2, j] = first
+        left[3, j] = second
         for i in range(4, n):
             left[i, j] = cov[i, j]
     for i in range(n):
         cov[i, 0] = left[i, 0] + step * left[i, 2]
         cov[i, 1] = left[i, 1] + step * left[i, 3]
-        first, second = 0.0, 0.0
+        first = 0.0
+        second = 0.0
         for j in range(n):
             first += left[i, j] * per_rate[j]
             second += left[i, j] * per_turn[j]
-        cov[i, 2], cov[i, 3] = first, second
+        cov[i, 2] = first
+        cov[i, 3] = second
         for j in range(4, n):
             cov[i, j] = left[i, j]
 
@@ -165,7 +181,8 @@ def _spread(cov, per_rate, per_turn, step, left):  # type: ignore[no-untyped-def
 @numba.njit(inline="always")
 def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ignore[no-untyped-def]
     """Q = Δt B Λ Bᵀ of the steering angle and, where they wander, of the tyre parameters; Eqs. 41 to 45."""
-    rate, acceleration = front.per_slip * (1.0 / (car[0] * speed)), car[2] * front.per_slip / car[1]
+    rate = front.per_slip * (1.0 / (car[0] * speed))
+    acceleration = car[2] * front.per_slip / car[1]
     spread = step * variances[2]
     cov[2, 2] += spread * rate * rate
     cov[2, 3] += spread * rate * acceleration
@@ -202,9 +219,11 @@ def _innovate(  # type: ignore[no-untyped-def]
         cross[i, 1] = vx * (cov[i, 2] + cov[i, 1])
         if crossfall:
             cross[i, 1] -= cov[i, -1]
-    ay, spread_of_ay = vx * (mean[2] + mean[1]), vx * (cross[2, 1] + cross[1, 1])
+    ay = vx * (mean[2] + mean[1])
+    spread_of_ay = vx * (cross[2, 1] + cross[1, 1])
     if crossfall:
-        ay, spread_of_ay = ay - mean[-1], spread_of_ay - cross[-1, 1]
+        ay = ay - mean[-1]
+        spread_of_ay = spread_of_ay - cross[-1, 1]
     for j in range(2):
         value = sample[0] if j == 0 else sample[2]
         measured[j] = not math.isnan(value)
@@ -242,7 +261,8 @@ def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type
         for j in range(n):
             left[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
     for i in range(n):
-        seen_rate, seen_ay = left[i, 1], vx * (left[i, 2] + left[i, 1])
+        seen_rate = left[i, 1]
+        seen_ay = vx * (left[i, 2] + left[i, 1])
         if crossfall:
             seen_ay -= left[i, -1]
         for j in range(n):
@@ -258,7 +278,10 @@ def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type
 @numba.njit(inline="always")
 def _roll(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
     turn = steer / (car[2] + car[3])
-    mean[0], mean[1], mean[2], mean[3] = car[3] * turn, vx * turn, 0.0, 0.0
+    mean[0] = car[3] * turn
+    mean[1] = vx * turn
+    mean[2] = 0.0
+    mean[3] = 0.0
     for i in range(4):
         cov[i, :] = 0.0
         cov[:, i] = 0.0

@@ -13,7 +13,8 @@ from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.recursion import add, gather, slopes_of, squared_error, step_of_adam
 from vehest.lanes import load, store, total, width
 
-GRU, LSTM = 3, 4  # gates
+GRU = 3
+LSTM = 4  # gates
 KEPT = 6  # rows of the hidden state's size that a step leaves: the gates and two more
 BLOCK = 4  # inputs whose weights' gradients are summed together
 
@@ -22,18 +23,18 @@ BLOCK = 4  # inputs whose weights' gradients are summed together
 def loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
     """See `vehest.estimators.kernels.recursion.Recursion`."""
     gates, states, n_window, mean, scale = given
-    lanes, channels = width(series), series.shape[1]
-    measured, rows, scratch = series.ravel(), np.empty(lanes, np.int64), np.empty(lanes, flat.dtype)
+    lanes = width(series)
+    channels = series.shape[1]
+    measured = series.ravel()
+    rows = np.empty(lanes, np.int64)
+    scratch = np.empty(lanes, flat.dtype)
     inputs = channels + states  # rows of ``seen`` a sample: measurements, and the state before
-    seen, state = (
-        np.empty(n_window * inputs * lanes, flat.dtype),
-        np.empty(2 * states * lanes, flat.dtype),
-    )
-    kept, sums = (
-        np.empty(n_window * KEPT * states * lanes, flat.dtype),
-        np.empty(flat.shape[1] * lanes, flat.dtype),
-    )
-    size, room = (gates, states, channels), (seen, kept, state)
+    seen = np.empty(n_window * inputs * lanes, flat.dtype)
+    state = np.empty(2 * states * lanes, flat.dtype)
+    kept = np.empty(n_window * KEPT * states * lanes, flat.dtype)
+    sums = np.empty(flat.shape[1] * lanes, flat.dtype)
+    size = (gates, states, channels)
+    room = (seen, kept, state)
     read = gates * states * (inputs + 1)  # where the read-out's weights begin
     for m in range(flat.shape[0]):
         own = flat[m]
@@ -86,11 +87,14 @@ def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
     """Arguments of the gates at step k; a candidate's is without U_n h, which is one row later. Returns where they are kept."""
     gates, states, channels = size
     seen, kept, state = room
-    lanes, row = width(flat), states * width(flat)
-    now, at = k * (channels + states) * lanes, k * KEPT * row
+    lanes = width(flat)
+    row = states * width(flat)
+    now = k * (channels + states) * lanes
+    at = k * KEPT * row
     for i in range(states):
         store(seen, now + (channels + i) * lanes, load(state, i * lanes))
-    biases, weights = gates * states * (channels + states), gates * states * channels
+    biases = gates * states * (channels + states)
+    weights = gates * states * channels
     for unit in range(gates * states):
         recurrent = load(seen, now) * 0
         driven = recurrent + flat[biases + unit]
@@ -127,7 +131,8 @@ def _lstm(row, kept, state, first):  # type: ignore[no-untyped-def]
         store(kept, at, sigmoid(load(kept, at)))
     for unit in range(0, row, lanes):
         at = first + unit
-        offer, before = tanh(load(kept, at + 3 * row)), load(state, row + unit)
+        offer = tanh(load(kept, at + 3 * row))
+        before = load(state, row + unit)
         cell = load(kept, at + row) * before + load(kept, at) * offer
         shown = tanh(cell)
         store(kept, at + 3 * row, offer)
@@ -142,16 +147,17 @@ def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """Adjoint of one step: ``state`` is that of the state after it, then before it; what is kept becomes the arguments' adjoints."""
     _, states, channels = size
     seen, kept, state = room
-    lanes, row = width(state), states * width(state)
-    now, first = k * (channels + states) * lanes, k * KEPT * row
+    lanes = width(state)
+    row = states * width(state)
+    now = k * (channels + states) * lanes
+    first = k * KEPT * row
     for i in range(states):
-        at, unit = first + i * lanes, i * lanes
-        reset, update, candidate, recurrent = (
-            load(kept, at),
-            load(kept, at + row),
-            load(kept, at + 2 * row),
-            load(kept, at + 3 * row),
-        )
+        at = first + i * lanes
+        unit = i * lanes
+        reset = load(kept, at)
+        update = load(kept, at + row)
+        candidate = load(kept, at + 2 * row)
+        recurrent = load(kept, at + 3 * row)
         bar = load(state, unit)
         inner = bar * (1 - update) * (1 - candidate * candidate)
         store(kept, at, inner * recurrent * reset * (1 - reset))
@@ -170,17 +176,18 @@ def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """The same; the second half of ``state`` is that of the cell."""
     _, states, _ = size
     _, kept, state = room
-    lanes, row = width(state), states * width(state)
+    lanes = width(state)
+    row = states * width(state)
     first = k * KEPT * row
     for i in range(states):
-        at, unit = first + i * lanes, i * lanes
-        admit, keep, show, offer = (
-            load(kept, at),
-            load(kept, at + row),
-            load(kept, at + 2 * row),
-            load(kept, at + 3 * row),
-        )
-        shown, bar = load(kept, at + 4 * row), load(state, unit)
+        at = first + i * lanes
+        unit = i * lanes
+        admit = load(kept, at)
+        keep = load(kept, at + row)
+        show = load(kept, at + 2 * row)
+        offer = load(kept, at + 3 * row)
+        shown = load(kept, at + 4 * row)
+        bar = load(state, unit)
         cell = load(state, row + unit) + bar * show * (1 - shown * shown)
         store(kept, at, cell * offer * admit * (1 - admit))
         store(kept, at + row, cell * load(kept, at + 5 * row) * keep * (1 - keep))
@@ -200,14 +207,13 @@ def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
 def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
     """Add what goes through the gates' arguments to the adjoint of the state before."""
     gates, states, channels = size
-    lanes, row = width(flat), states * width(flat)
+    lanes = width(flat)
+    row = states * width(flat)
     for j in range(states):
         bar = load(state, j * lanes)
         for g in range(gates):
-            weights, at = (
-                gates * states * channels + g * states * states + j,
-                first + _row_of_state(gates, g) * row,
-            )
+            weights = gates * states * channels + g * states * states + j
+            at = first + _row_of_state(gates, g) * row
             for i in range(states):
                 bar = bar + flat[weights + i * states] * load(kept, at + i * lanes)
         store(state, j * lanes, bar)
@@ -219,7 +225,8 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
     gates, states, channels = size
     seen, kept, _ = room
     lanes = width(sums)
-    row, inputs = states * lanes, (channels + states) * lanes
+    row = states * lanes
+    inputs = (channels + states) * lanes
     steps = seen.size // inputs
     for g in range(gates):
         for i in range(states):
@@ -250,15 +257,14 @@ def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: i
     lanes = width(sums)
     for block in range(0, count, BLOCK):
         c = (first + block) * lanes
-        one, two, three, four = (
-            load(sums, 0) * 0,
-            load(sums, 0) * 0,
-            load(sums, 0) * 0,
-            load(sums, 0) * 0,
-        )
+        one = load(sums, 0) * 0
+        two = load(sums, 0) * 0
+        three = load(sums, 0) * 0
+        four = load(sums, 0) * 0
         left = count - block
         for k in range(steps):
-            bar, x = load(kept, k * KEPT * row + at), k * inputs + c
+            bar = load(kept, k * KEPT * row + at)
+            x = k * inputs + c
             one = one + bar * load(seen, x)
             if left > 1:
                 two = two + bar * load(seen, x + lanes)

@@ -17,7 +17,8 @@ from vehest.lanes import load, store
 
 Floats = NDArray[Any]
 
-DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam
+DECAYS = (0.9, 0.999)
+EPSILON = 1e-8  # of Adam
 
 
 class Recursion(NamedTuple):
@@ -93,7 +94,8 @@ class Recursion(NamedTuple):
         adam: Any = None,
     ) -> Floats:
         """Values, (M, B), by all threads."""
-        values, given = np.empty(starts.shape, flat.dtype), self.given(flat.dtype.type)
+        values = np.empty(starts.shape, flat.dtype)
+        given = self.given(flat.dtype.type)
         if adam is None:
             adam = (flat, flat, flat, flat, *[0.0] * 6)
 
@@ -134,7 +136,8 @@ def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-unty
     """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0 in lanes without a window."""
     count = values.size
     for lane in range(scratch.size):
-        at, slope = first + lane, scratch.dtype.type(0)
+        at = first + lane
+        slope = scratch.dtype.type(0)
         if at < count:
             slope = (
                 (values[at] - targets[at]) * scratch.dtype.type(2 / count)
@@ -161,8 +164,10 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
     The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t (Section 7.2).
     """
     first, second, average, bounds, before, rate, decay, decay_of_squares, epsilon, averaging = adam
-    number, t = flat.dtype.type, before + batches
-    size, root = number(rate / (1 - decay**t)), number(np.sqrt(1 - decay_of_squares**t))
+    number = flat.dtype.type
+    t = before + batches
+    size = number(rate / (1 - decay**t))
+    root = number(np.sqrt(1 - decay_of_squares**t))
     for j in range(flat.size):
         g = gradient[j]
         first[m, j] += (g - first[m, j]) * number(1 - decay)

@@ -76,11 +76,10 @@ class _Outputs(torch.autograd.Function):
     def forward(
         ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor
     ) -> Tensor:
-        x, weights = (
-            inputs.contiguous().numpy(),
-            [parameter.detach().contiguous().numpy() for parameter in parameters],
-        )
-        members, samples = len(weights[0]), x.shape[1]
+        x = inputs.contiguous().numpy()
+        weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
+        members = len(weights[0])
+        samples = x.shape[1]
         layers = [
             np.empty((members, samples, weights[2 * layer].shape[2]), x.dtype)
             for layer in range(LAYERS)
@@ -149,11 +148,9 @@ class _Losses(torch.autograd.Function):
             ]
             up = np.empty_like(layers[-1])
             for m in range(first, end):
-                seen, own, bars = (
-                    x[chosen[m]],
-                    [weight[m] for weight in weights],
-                    [gradient[m] for gradient in gradients],
-                )
+                seen = x[chosen[m]]
+                own = [weight[m] for weight in weights]
+                bars = [gradient[m] for gradient in gradients]
                 _forward(seen, *own, drawn[m], hidden, *layers)
                 losses[m] = criterion(layers[-1], y[chosen[m]], up)
                 _backward(seen, own[2], own[4], hidden, layers[0], layers[1], up, *bars)
@@ -174,7 +171,8 @@ class _Losses(torch.autograd.Function):
 @compiled
 def squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
     """Mean of (o - t)²; a `Criterion` of one output."""
-    total, count = 0.0, len(targets)
+    total = 0.0
+    count = len(targets)
     for row in range(count):
         error = outputs[row, 0] - targets[row]
         total += error * error
@@ -188,9 +186,11 @@ def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-
 
     Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017, Eq. 1.
     """
-    total, count = 0.0, len(targets)
+    total = 0.0
+    count = len(targets)
     for row in range(count):
-        raw, error = outputs[row, 1], outputs[row, 0] - targets[row]
+        raw = outputs[row, 1]
+        error = outputs[row, 0] - targets[row]
         variance = max(raw, 0.0) + np.log1p(np.exp(-abs(raw))) + 1e-6
         total += 0.5 * (np.log(variance) + error * error / variance)
         by_variance = 0.5 * (1.0 - error * error / variance) / variance
@@ -215,7 +215,8 @@ def _forward(x, w1, b1, w2, b2, w3, b3, seed, hidden, first, second, out):  # ty
 def _backward(x, w2, w3, hidden, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar):  # type: ignore[no-untyped-def]
     np.dot(second.T, up, w3_bar)
     _summed(up, b3_bar)
-    second_bar, first_bar = np.empty_like(second), np.empty_like(first)
+    second_bar = np.empty_like(second)
+    first_bar = np.empty_like(first)
     np.dot(up, w3.T, second_bar)
     _gate(second, second_bar, hidden, b2_bar)
     np.dot(first.T, second_bar, w2_bar)

@@ -39,15 +39,13 @@ AT = (STATES + AT) * (BYTES // 8)
 GRIP, WEIGHT, KNOWN = range(
     STATES + 36, STATES + 39
 )  # grip limit, weight among all filters and among those without the network's
-COST, TOTAL = (
-    STATES + 39,
-    STATES + 41,
+COST = STATES + 39
+TOTAL = (
+    STATES + 41
 )  # of both measurements: what lowers the log likelihood, variance of the residual
-ROW, SHARED, ROWS = (
-    STATES + 43,
-    STATES + 51,
-    STATES + 59,
-)  # derivatives of a measurement, its covariances with the states
+ROW = STATES + 43
+SHARED = STATES + 51
+ROWS = STATES + 59  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
@@ -85,7 +83,8 @@ def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
         if f[k + (GRIP - SHARED) * lanes] > 0.0:
             f[k] **= n.exponent
     left = load(f, SHARED * lanes)
-    slip, excess = limit * (1.0 - left) / n.exponent, most(abs(force) - limit, 0.0)
+    slip = limit * (1.0 - left) / n.exponent
+    excess = most(abs(force) - limit, 0.0)
     slip = choose(grip > 0.0, choose(force < 0.0, -slip, slip), lags[SLIP])
     return slip, choose(grip > 0.0, left / rest, 0.0), choose(grip > 0.0, excess, 0.0)
 
@@ -94,7 +93,10 @@ def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
 def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # type: ignore[no-untyped-def]
     """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
     lanes = width(f)
-    v, v_v, v_u, u_u = load(f, V * lanes), load(f, AT[V, V]), load(f, AT[V, U]), load(f, AT[U, U])
+    v = load(f, V * lanes)
+    v_v = load(f, AT[V, V])
+    v_u = load(f, AT[V, U])
+    u_u = load(f, AT[U, U])
     store(
         f,
         V * lanes,
@@ -139,11 +141,9 @@ def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-
     Returns the residual, its variance, and half the square of what the grip limit rules out, over a sample.
     """
     lanes = width(f)
-    offset, rear, compliance = (
-        load(f, OFFSET_Y * lanes),
-        load(f, REAR * lanes),
-        load(f, COMPLIANCE * lanes),
-    )
+    offset = load(f, OFFSET_Y * lanes)
+    rear = load(f, REAR * lanes)
+    compliance = load(f, COMPLIANCE * lanes)
     own = 1.0 - load(f, LEAKAGE * lanes)
     slip, slope, excess = _rear_slip(f, lags, turning, n)
     smooth = load(f, V * lanes) - lags[SUM_AY] * own + offset * lags[SUM_ONE] + lags[SUM_TURN]
@@ -178,7 +178,9 @@ def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-unt
 
     Beyond ``gate`` deviations a residual is cut off; parameters stay where the filter does not learn (a Schmidt-Kalman update).
     """
-    lanes, limit, inverse = width(f), gate * root(variance), 1.0 / variance
+    lanes = width(f)
+    limit = gate * root(variance)
+    inverse = 1.0 / variance
     residual = most(least(residual, limit), -limit)
     for i in range(states):
         held = not learns and LEAKAGE <= i <= COMPLIANCE
@@ -209,27 +211,33 @@ def _network(theta, yaw_rate_max, series, first, steps, dt):  # type: ignore[no-
 
     Da Lio et al. 2023, Eqs. 7 and 8; rows of ``theta`` as in `kernels.ksnn`, of ``series`` as in `scan`'s samples.
     """
-    local, half, row = theta.shape[0], (theta.shape[1] - 8) // 6, series.shape[1]
+    local = theta.shape[0]
+    half = (theta.shape[1] - 8) // 6
+    row = series.shape[1]
     u = load(series, row + first)
     v = 0.0 * u
     for at in range(first, first + steps):
-        yaw_rate, speed = load(series, at), load(series, row + at)
+        yaw_rate = load(series, at)
+        speed = load(series, row + at)
         place = least(abs(yaw_rate) * ((local - 1) / yaw_rate_max), local - 1.0)
-        slip, thrust = (
-            dt * (load(series, 2 * row + at) - speed * yaw_rate),
-            dt * (load(series, 3 * row + at) + v * yaw_rate),
-        )
-        error, next_v, next_u = u - speed, 0.0 * u, 0.0 * u
+        slip = dt * (load(series, 2 * row + at) - speed * yaw_rate)
+        thrust = dt * (load(series, 3 * row + at) + v * yaw_rate)
+        error = u - speed
+        next_v = 0.0 * u
+        next_u = 0.0 * u
         for m in range(local):
             share = most(1.0 - abs(place - m), 0.0)
-            f1, f2 = theta[m, 4] * error + theta[m, 5], theta[m, 6] * error + theta[m, 7]
+            f1 = theta[m, 4] * error + theta[m, 5]
+            f2 = theta[m, 6] * error + theta[m, 7]
             for q in range(half):
-                one, two = 8 + 3 * q, 8 + 3 * (half + q)
+                one = 8 + 3 * q
+                two = 8 + 3 * (half + q)
                 f1 += theta[m, one + 2] * _tanh(theta[m, one] * error + theta[m, one + 1])
                 f2 += theta[m, two + 2] * _tanh(theta[m, two] * error + theta[m, two + 1])
             next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)
             next_u += share * (theta[m, 1] * u + theta[m, 3] * thrust - f2)
-        v, u = next_v, next_u
+        v = next_v
+        u = next_u
     return v
 
 
@@ -240,11 +248,9 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
     for at, value in ((YAW_RATE, sample[0]), (AY, sample[2]), (AX, sample[3])):
         lags[at] += g * (value - lags[at])
     lags[SPEED] += g_1 * (sample[1] - lags[SPEED])
-    ay, ax, turn = (
-        (last[2] + sample[2]) / 2.0,
-        (last[3] + sample[3]) / 2.0,
-        (last[0] * last[1] + sample[0] * sample[1]) / 2.0,
-    )
+    ay = (last[2] + sample[2]) / 2.0
+    ax = (last[3] + sample[3]) / 2.0
+    turn = (last[0] * last[1] + sample[0] * sample[1]) / 2.0
     for at, value in ((SUM_AY, ay), (SUM_TURN, turn), (SUM_ONE, 1.0)):
         lags[at] = (1.0 - g) * (lags[at] + n.dt * value)
     for at, value in ((SUM_AY_1, ay), (SUM_TURN_1, turn), (SUM_AX_1, ax)):
@@ -261,9 +267,11 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
     if moving:
         lags[TIME] = lags[TIME] * keep + n.dt
         lags[POWER] = lags[POWER] * keep + ay * ay * n.dt
-    odds, floor = (0.0, math.log(n.network_odds), math.log(n.steady_odds)), n.residual_floor**2
+    odds = (0.0, math.log(n.network_odds), math.log(n.steady_odds))
+    floor = n.residual_floor**2
     for c in range(CANDIDATES):
-        one, v = own[c], found[c]
+        one = own[c]
+        v = found[c]
         one[SMOOTH] += g_1 * (v - one[SMOOTH])
         one[SUM_TURN_V] = (1.0 - g_1) * (one[SUM_TURN_V] + n.dt * yaw_rate * (one[LAST] + v) / 2.0)
         one[LAST] = v
@@ -271,7 +279,8 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
         x = sample[1] - lags[SPEED] - lags[SUM_AX_1] - one[SUM_TURN_V]
         one[SLOW_Y] += g_slow * (y - one[SLOW_Y])
         one[SLOW_X] += g_slow * (x - one[SLOW_X])
-        y, x = y - one[SLOW_Y], x - one[SLOW_X]
+        y = y - one[SLOW_Y]
+        x = x - one[SLOW_X]
         if moving:
             one[SQUARE_Y] = one[SQUARE_Y] * keep + y * y * n.dt
             one[CROSS_Y] = one[CROSS_Y] * keep + y * ay * n.dt
@@ -306,24 +315,25 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         found: output, vy and its variance, (T, 2).
         parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample alone.
     """
-    g, g_1, g_slow = (
-        -math.expm1(-n.dt / n.axle_lag),
-        -math.expm1(-n.dt / n.residual_time),
-        -math.expm1(-n.dt / n.slow_time),
-    )
-    lags, log_weights, lanes, count, steps = (
-        state.lags,
-        state.log_weights,
-        width(grips),
-        len(grips),
-        len(state.window),
-    )
-    bank, own = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes)), np.zeros((3, 4))
-    values, left, sample, last = own[0], own[1], own[2], state.last
+    g = -math.expm1(-n.dt / n.axle_lag)
+    g_1 = -math.expm1(-n.dt / n.residual_time)
+    g_slow = -math.expm1(-n.dt / n.slow_time)
+    lags = state.lags
+    log_weights = state.log_weights
+    lanes = width(grips)
+    count = len(grips)
+    steps = len(state.window)
+    bank = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes))
+    own = np.zeros((3, 4))
+    values = own[0]
+    left = own[1]
+    sample = own[2]
+    last = state.last
     for k in range(
         len(bank) * lanes
     ):  # lanes beyond the last filter are as that one, without weight
-        j, f = min(k, count - 1), bank[k // lanes]
+        j = min(k, count - 1)
+        f = bank[k // lanes]
         f[GRIP * lanes + k % lanes] = grips[j]
         for i in range(STATES):
             f[i * lanes + k % lanes] = state.means[j, i]
@@ -350,9 +360,12 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
             n.compliance * max(sample[1], n.minimum_speed)
         )
         lags[SLIP] += g * (slip - lags[SLIP])
-        speed, moving = sample[1], sample[1] > n.minimum_speed
-        yaw_rate, turn = (last[0] + sample[0]) / 2.0, (last[0] * last[1] + sample[0] * speed) / 2.0
-        ay, ax = (last[2] + sample[2]) / 2.0, (last[3] + sample[3]) / 2.0
+        speed = sample[1]
+        moving = sample[1] > n.minimum_speed
+        yaw_rate = (last[0] + sample[0]) / 2.0
+        turn = (last[0] * last[1] + sample[0] * speed) / 2.0
+        ay = (last[2] + sample[2]) / 2.0
+        ax = (last[3] + sample[3]) / 2.0
         size = 0.0
         for b in range(len(bank) if moving else 0):
             slips, slope, _ = _rear_slip(bank[b], lags, turning, n)
@@ -386,7 +399,8 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
                 )
         if moving:
             for j in range(count):
-                f, lane = bank[j // lanes], j % lanes
+                f = bank[j // lanes]
+                lane = j % lanes
                 cost = f[COST * lanes + lane] + f[(COST + 1) * lanes + lane]
                 likelihood = -cost - 0.5 * math.log(
                     f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane]
@@ -397,10 +411,8 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
             _weigh(bank, log_weights)
         known = parameters[min(t, len(parameters) - 1)]
         rear = _mixture(bank, known)
-        values[BANK], values[NETWORK] = (
-            known[V] + n.rear_known * (n.rear - rear) * sample[0],
-            series[4, t],
-        )
+        values[BANK] = known[V] + n.rear_known * (n.rear - rear) * sample[0]
+        values[NETWORK] = series[4, t]
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
         _judge(
             values,
@@ -432,7 +444,10 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
 @part()
 def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
     """Weights of the filters from their logarithms, with and without the last, the network's; of sum 1."""
-    lanes, others, largest, sum_ = width(bank), len(log_weights) - 1, log_weights[0], 0.0
+    lanes = width(bank)
+    others = len(log_weights) - 1
+    largest = log_weights[0]
+    sum_ = 0.0
     for j in range(others):
         largest = max(largest, log_weights[j])
     for j in range(others):
@@ -440,7 +455,8 @@ def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
         bank[j // lanes, KNOWN * lanes + j % lanes] = weight
         sum_ += weight
     lead = log_weights[others] - largest
-    share, own = math.exp(min(-lead, 0.0)), math.exp(min(lead, 0.0))
+    share = math.exp(min(-lead, 0.0))
+    own = math.exp(min(lead, 0.0))
     whole = sum_ * share + own
     for b in range(len(bank)):
         known = load(bank[b], KNOWN * lanes)
@@ -455,15 +471,19 @@ def _mixture(bank, found):  # type: ignore[no-untyped-def]
 
     Returns the mean of b with it.
     """
-    lanes, rear = width(bank), 0.0
+    lanes = width(bank)
+    rear = 0.0
     for i in range(STATES):
-        own, mean, variance = KNOWN if REAR <= i <= COMPLIANCE else WEIGHT, 0.0, 0.0
+        own = KNOWN if REAR <= i <= COMPLIANCE else WEIGHT
+        mean = 0.0
+        variance = 0.0
         for b in range(len(bank)):
             mean += total(load(bank[b], own * lanes) * load(bank[b], i * lanes))
         for b in range(len(bank)):
             off = load(bank[b], i * lanes) - mean
             variance += total(load(bank[b], own * lanes) * (load(bank[b], AT[i, i]) + off * off))
-        found[i], found[STATES + i] = mean, variance
+        found[i] = mean
+        found[STATES + i] = variance
     for b in range(len(bank)):
         rear += total(load(bank[b], WEIGHT * lanes) * load(bank[b], REAR * lanes))
     return rear
@@ -472,7 +492,8 @@ def _mixture(bank, found):  # type: ignore[no-untyped-def]
 @part()
 def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
     """Weights of sum 1 from the first logarithms; whole arrays would double the time to compile."""
-    largest, total = log_weights[0], 0.0
+    largest = log_weights[0]
+    total = 0.0
     for j in range(count):
         largest = max(largest, log_weights[j])
     for j in range(count):
@@ -487,11 +508,9 @@ def _combine(values, weights, left, parameters, sample, n, found):  # type: igno
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
-    mean, spread, unexplained = (
-        own[0] * values[0] + own[1] * values[1] + own[2] * values[2],
-        0.0,
-        0.0,
-    )
+    mean = own[0] * values[0] + own[1] * values[1] + own[2] * values[2]
+    spread = 0.0
+    unexplained = 0.0
     for c in range(CANDIDATES):
         spread += own[c] * (values[c] - mean) ** 2
         unexplained += own[c] * left[c]

@@ -60,10 +60,8 @@ class _Predict(torch.autograd.Function):
     def forward(
         ctx: Any, flat: Tensor, prepared: Tensor, starts: Tensor, recursion: Recursion
     ) -> Tensor:
-        ctx.recursion, ctx.arrays = (
-            recursion,
-            [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)],
-        )
+        ctx.recursion = recursion
+        ctx.arrays = [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)]
         return torch.from_numpy(recursion.values(*ctx.arrays))
 
     @staticmethod

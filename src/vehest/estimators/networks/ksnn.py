@@ -104,9 +104,11 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         """Run the recursion from v = 0, û = u_m over the window (Fig. 1)."""
         yaw_rate, speed, ay, ax = measurements.unbind(-1)
         weights = self.activations(yaw_rate)
-        v, u = torch.zeros_like(speed[..., 0]), speed[..., 0]
+        v = torch.zeros_like(speed[..., 0])
+        u = speed[..., 0]
         for k in range(measurements.shape[-2]):
-            omega, phi = yaw_rate[..., k], weights[..., k, :]
+            omega = yaw_rate[..., k]
+            phi = weights[..., k, :]
             f = self.feedback(u - speed[..., k])
             slip = self.step * (ay[..., k] - speed[..., k] * omega)
             thrust = self.step * (ax[..., k] + v * omega)
@@ -118,7 +120,8 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
             u_local = (
                 self.gamma[:, 1] * u[..., None] + self.beta[:, 1] * thrust[..., None] - f[..., 1]
             )
-            v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
+            v = (phi * v_local).sum(-1)
+            u = (phi * u_local).sum(-1)
         return v
 
     def recursion(self) -> Recursion:

@@ -53,7 +53,8 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     n_gates: ClassVar[int]  # of the cell
 
     def __init__(self, settings: Any) -> None:
-        channels, states = len(RecurrentEstimator.channels), settings.n_states
+        channels = len(RecurrentEstimator.channels)
+        states = settings.n_states
         super().__init__(channels)
         self.settings = settings
         self.input_weight = nn.Parameter(torch.empty(self.n_gates, states, channels))
@@ -87,12 +88,10 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
 
     def recursion(self) -> Recursion:
         """The compiled recursion."""
-        gates, own, mean, scale = (
-            self.n_gates,
-            self.settings,
-            float(self.output_mean),
-            float(self.output_scale),
-        )
+        gates = self.n_gates
+        own = self.settings
+        mean = float(self.output_mean)
+        scale = float(self.output_scale)
         return Recursion(
             loop, lambda number: (gates, own.n_states, own.window, number(mean), number(scale))
         )

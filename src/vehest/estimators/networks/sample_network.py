@@ -147,9 +147,11 @@ class SampleNetwork(nn.Module):
 
         ``range`` maps inputs to [0, 1] by their extremes, ``standard`` to a mean of 0 and a standard deviation of 1.
         """
-        low, span = inputs.min(axis=0), np.ptp(inputs, axis=0)
+        low = inputs.min(axis=0)
+        span = np.ptp(inputs, axis=0)
         if normalisation == "standard":
-            low, span = inputs.mean(axis=0), np.where(span > 0.0, inputs.std(axis=0), 0.0)
+            low = inputs.mean(axis=0)
+            span = np.where(span > 0.0, inputs.std(axis=0), 0.0)
         self.input_low.copy_(torch.as_tensor(low))
         self.input_span.copy_(torch.as_tensor(np.where(span > 0.0, span, np.finfo(np.float32).max)))
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))

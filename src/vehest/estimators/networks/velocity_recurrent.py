@@ -259,10 +259,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
     def c_values(self) -> dict[str, Any]:
         """Weights, sizes, and what estimates start from."""
-        s, weights = (
-            self.settings,
-            {name: array.astype(np.float64) for name, array in self.weights().items()},
-        )
+        s = self.settings
+        weights = {name: array.astype(np.float64) for name, array in self.weights().items()}
         return {
             **{name.replace(".", "_"): array for name, array in weights.items()},
             "states": s.n_states,
@@ -310,10 +308,8 @@ class _Drives:
         dtype: torch.dtype,
     ) -> None:
         require_learnable(recordings, (*estimator.channels, *estimator.learns_from), estimator.name)
-        self.names, self.lengths = (
-            [recording.id for recording in recordings],
-            [len(recording) for recording in recordings],
-        )
+        self.names = [recording.id for recording in recordings]
+        self.lengths = [len(recording) for recording in recordings]
         parts = (
             [estimator._measured_velocities(recording.channels) for recording in recordings],
             [recording.stack(estimator.inputs) for recording in recordings],
@@ -336,7 +332,8 @@ class _Drives:
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
         """All drives, cut whole at random places into pieces of ``steps`` samples and less: first row and length of each, (N, 2)."""
-        found, offset = [], 0
+        found = []
+        offset = 0
         for length in self.lengths:
             shift = int(torch.randint(steps, (), generator=generator))
             edges = sorted({0, *range(shift, length, steps), length})
@@ -347,13 +344,15 @@ class _Drives:
     def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
         """Pieces of different lengths side by side, as long as the longest; what is beyond a piece's end does not count."""
         firsts, lengths = pieces.unbind(1)
-        places, ends = torch.arange(int(lengths.max())), lengths.unsqueeze(1)
+        places = torch.arange(int(lengths.max()))
+        ends = lengths.unsqueeze(1)
         counted = ((places >= dropped) & (places < ends)).to(self.inputs.dtype)
         return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
 
     def for_validation(self, training: SequenceSettings) -> list[_Batch]:
         """Sequences without overlap from the start of each recording; of one that is too short, all of it."""
-        batches, offset = [], 0
+        batches = []
+        offset = 0
         for name, length in zip(self.names, self.lengths, strict=True):
             steps = min(length, training.validation_steps)
             if steps <= training.settling_steps:
@@ -376,7 +375,9 @@ def _phase(
     validation: _Drives,
 ) -> Phase:
     """Squared errors, each output with its weight, over sequences at random places of the drives."""
-    steps, truncated, dtype = training.sequence_steps, training.truncate_steps, train.inputs.dtype
+    steps = training.sequence_steps
+    truncated = training.truncate_steps
+    dtype = train.inputs.dtype
     if max(train.lengths) < steps:
         lengths = ", ".join(
             f"'{name}' {length}" for name, length in zip(train.names, train.lengths, strict=True)

@@ -72,7 +72,8 @@ class WindowedEstimator(Network):
 
         from vehest.training.supervised import train_members
 
-        first, dtype = members[0], getattr(torch, training.dtype)
+        first = members[0]
+        dtype = getattr(torch, training.dtype)
         train, validation = (
             windows_of(part, first.channels, TARGET, first.window)
             for part in (data.train, data.validation)

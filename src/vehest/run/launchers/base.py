@@ -41,7 +41,9 @@ class RunOptions:
 
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
     """A command's launcher; without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or `MissingError`."""
-    name, address, jobs = options.launcher, options.address, options.jobs
+    name = options.launcher
+    address = options.address
+    jobs = options.jobs
     if name not in LAUNCHERS:
         raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{name}'")
     if address and name == "local":
@@ -58,7 +60,8 @@ def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> La
         raise ConfigurationError(
             f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{address}'"
         )
-    parameters, package = slurm_parameters(options.slurm), "submitit" if name == "slurm" else "ray"
+    parameters = slurm_parameters(options.slurm)
+    package = "submitit" if name == "slurm" else "ray"
     if importlib.util.find_spec(package) is None:
         raise MissingError(
             f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'"

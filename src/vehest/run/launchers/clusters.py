@@ -178,7 +178,9 @@ class RayLauncher:
         self, address: str | None, jobs: int | None, output: Path, messages: Messages
     ) -> None:
         self._address = address or os.environ.get("RAY_ADDRESS") or "local"
-        self._jobs, self._output, self._messages = jobs, output, messages
+        self._jobs = jobs
+        self._output = output
+        self._messages = messages
         self._ray: Any = None
         self._task: Any = None
         self._mark = Path()
@@ -198,7 +200,9 @@ class RayLauncher:
         """See `LocalLauncher`."""
         if self._ray is None:
             self._connect()
-        waiting, running, stopping = deque(range(len(groups))), dict[Any, int](), False
+        waiting = deque(range(len(groups)))
+        running = dict[Any, int]()
+        stopping = False
         with stop.deferred():
             while waiting or running:
                 if stop.requested() and not stopping:
@@ -255,7 +259,8 @@ class RayLauncher:
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _begin(self, position: int, group: Group) -> Any:
-        spec, copies = task_of(position, group, self._output, self._mark), []
+        spec = task_of(position, group, self._output, self._mark)
+        copies = []
         if self._stored is not None:
             inputs = inputs_of(group)
             self._stored |= {
@@ -357,12 +362,10 @@ class SlurmLauncher:
             raise MissingError(
                 "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local"
             )
-        self._cluster, self._parameters, self._output, self._messages = (
-            cluster,
-            parameters,
-            output,
-            messages,
-        )
+        self._cluster = cluster
+        self._parameters = parameters
+        self._output = output
+        self._messages = messages
         self._jobs = jobs or (default_jobs() if cluster == "local" else None)
         self._executor: Any = None
         self._running: dict[Any, int] = {}

@@ -101,7 +101,8 @@ def _launch_in_processes(
     tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
 ) -> Iterator[Done]:
     context = get_context("spawn")
-    stopping, messages = context.Event(), context.SimpleQueue()
+    stopping = context.Event()
+    messages = context.SimpleQueue()
     pool = ProcessPoolExecutor(jobs, context, _start_worker, (stopping, messages, current_limits()))
     with stop.deferred(), pool:
         futures = {
@@ -147,7 +148,8 @@ def _end_with_parent() -> None:
 
 def _work(position: int, task: Task) -> Done | None:
     """Run a task in a worker; none if it was stopped before it began."""
-    stopping, messages = _worker["stopping"], _worker["messages"]
+    stopping = _worker["stopping"]
+    messages = _worker["messages"]
     if stopping.is_set():
         return None
     messages.put((position, None))

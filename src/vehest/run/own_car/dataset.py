@@ -48,7 +48,8 @@ REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
 GAIN_APART = (
     1.15  # factor between the gains of two files, of which each half is beyond the other file's
 )
-LEAST_TURN, TURNING_SECONDS = 0.05, 5.0  # rad/s, and how long a half of a file turns as fast [s]
+LEAST_TURN = 0.05
+TURNING_SECONDS = 5.0  # rad/s, and how long a half of a file turns as fast [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,8 @@ def draft(examined: Examined) -> Draft:
         if one not in whole
     ]
     examined = replace(examined, proposals=examined.proposals.keeping(whole, gaps))
-    proposals, vehicle = examined.proposals, examined.vehicle
+    proposals = examined.proposals
+    vehicle = examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")
     dataset = _dataset(examined)
@@ -100,14 +102,16 @@ def draft(examined: Examined) -> Draft:
         else []
     )
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
-    bridging, notes = _bridging(examined, recordings), [*proposals.notes]
+    bridging = _bridging(examined, recordings)
+    notes = [*proposals.notes]
     if bridging:
         recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
         notes.append(
             "a few samples beyond what a vehicle can do are bridged by lines (bridge_impossible)"
         )
     longest = max(recordings, key=lambda own: own.duration)
-    late, ratio = late_channels(longest), None
+    late = late_channels(longest)
+    ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
         why = f"written twice, or {BRIDGED:g} s and more without a sample"
         notes.append(
@@ -177,7 +181,8 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
         own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)
     }
     by_file.pop(longest.provenance.get("file"), None)
-    unlike, gains = [], _gains(longest)
+    unlike = []
+    gains = _gains(longest)
     for own in by_file.values():
         found += [
             (f"in '{own.id}', ", one)
@@ -205,7 +210,8 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
     if not {"vx", "yaw_rate"} <= set(recording.channels):
         return {}
     for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
-        speed, rate = recording["vx"][half], recording["yaw_rate"][half]
+        speed = recording["vx"][half]
+        rate = recording["yaw_rate"][half]
         used = (
             (speed > 0.2 * float(np.quantile(speed, 0.99)))
             & (np.abs(rate) > LEAST_TURN)
@@ -213,7 +219,8 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         )
         if np.count_nonzero(used) < TURNING_SECONDS * recording.rate_hz:
             return {}
-        speed, rate = speed[used], rate[used]
+        speed = speed[used]
+        rate = rate[used]
         turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)
         if "ay" in recording:
             found.setdefault("ay", []).append(rms(recording["ay"][half][used]) / rms(turn[:, 1]))
@@ -225,7 +232,9 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
-    log, name, proposals = examined.log, examined.name, examined.proposals
+    log = examined.log
+    name = examined.name
+    proposals = examined.proposals
     dataset: dict[str, Any] = {
         "name": name,
         "title": f"Recordings of {name}",
@@ -305,7 +314,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 
 def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
     """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
-    unit, factor, si = one.unit, one.factor, CHANNELS[one.channel].unit
+    unit = one.unit
+    factor = one.factor
+    si = CHANNELS[one.channel].unit
     if factor == 1.0 and (own := plain_unit(header)) and own != unit:
         unit, factor = own, float(f"{factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
     sign = {"sign": one.sign} if one.sign != 1 else {}
@@ -346,7 +357,8 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     )
     found = np.zeros(len(values))
     for run in log.runs:
-        times, known = seconds[run], np.isfinite(values[run])
+        times = seconds[run]
+        known = np.isfinite(values[run])
         edges = np.concatenate([times[:1], times[known], times[-1:]])
         lengths = np.diff(edges) if known.any() else np.array([math.inf])
         found[run] = np.where(
@@ -356,7 +368,9 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
 
 
 def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
-    channels, rates, paused = {}, [], False
+    channels = {}
+    rates = []
+    paused = False
     for one in proposals:
         rate, gap = _rate_and_gap(columns[one.column], BRIDGED)
         rates.append(rate)

@@ -37,11 +37,9 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
-MOST_COMPARED, USUAL, EXACT = (
-    4_000,
-    0.99,
-    0.999,
-)  # rows, share of them, and correlation of a column with another's difference
+MOST_COMPARED = 4_000
+USUAL = 0.99
+EXACT = 0.999  # rows, share of them, and correlation of a column with another's difference
 TABLES = ("tabular", "text_log")
 LAYOUT = {
     "delimiter": ",",
@@ -173,7 +171,8 @@ def inspect(
     timed = longest.seconds is not None or any(
         column.stamps is not None for column in longest.columns
     )
-    place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
+    place = _place(files, longest.source)
+    rate = None if timed else proposals.rate_hz
     return Examined(
         name,
         tuple(files),
@@ -313,10 +312,8 @@ def _evidence(
         cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
         factor = max(math.floor(rate / EVIDENCE_HZ), 1)
         whole = (n_rows - 2 * cut) // factor * factor
-        samples, rate = (
-            samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2),
-            rate / factor,
-        )
+        samples = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2)
+        rate = rate / factor
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
     columns = [
         (own, values)

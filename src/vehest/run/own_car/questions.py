@@ -80,7 +80,9 @@ def ask(
 
 def questions_of(examined: Examined) -> Iterator[Question]:
     """Questions that the logs leave open, those of the vehicle left out."""
-    proposals, clock, rate = examined.proposals, examined.log.clock, examined.rate_hz
+    proposals = examined.proposals
+    clock = examined.log.clock
+    rate = examined.rate_hz
     if rate is not None:
         text = f"'{examined.log.file.name}' has no column of times: at how many Hz was it sampled?"
         evidence = (
@@ -163,7 +165,9 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    key, answer, proposals = question.key, answer.strip() or question.proposed, examined.proposals
+    key = question.key
+    answer = answer.strip() or question.proposed
+    proposals = examined.proposals
     if answer == question.proposed != LEAVE_OUT:
         return examined
     if key == "rate":

@@ -192,7 +192,9 @@ def _is_too_short(made: Draft) -> bool:
 
 def _split_text(made: Draft) -> str:
     """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
-    name, ids, cut = made.examined.name, _kept(made), _cut(made)
+    name = made.examined.name
+    ids = _kept(made)
+    cut = _cut(made)
     if len(cut) == len(made.contents):
         blocks = {
             "name": name,
@@ -226,11 +228,9 @@ def _split_text(made: Draft) -> str:
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
-    name, file, longest = (
-        made.examined.name,
-        made.examined.files[0],
-        max(made.contents, key=lambda own: made.durations[own.id]),
-    )
+    name = made.examined.name
+    file = made.examined.files[0]
+    longest = max(made.contents, key=lambda own: made.durations[own.id])
     commands = [f"vehest data check {name}", f"vehest data usable {name}"]
     if plan.sweeps:
         return [*commands, f"vehest run {name} --minutes 15"]
@@ -320,13 +320,12 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 
 def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
-    contents, vehicle = made.contents, made.examined.vehicle
-    plan, values, slowest, cut = (
-        Plan(),
-        _car(vehicle),
-        min(own.rate_hz for own in contents),
-        _cut(made),
-    )
+    contents = made.contents
+    vehicle = made.examined.vehicle
+    plan = Plan()
+    values = _car(vehicle)
+    slowest = min(own.rate_hz for own in contents)
+    cut = _cut(made)
     shares = (
         [0.2 * made.durations[own] for own in cut]
         if cut
@@ -382,8 +381,10 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
 
 
 def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
-    wheelbase, mass = vehicle["wheelbase"] or 0.0, vehicle["mass"] or 0.0
-    half, stiffness = 0.5 * wheelbase, 0.5 * STIFFNESS * mass * GRAVITY
+    wheelbase = vehicle["wheelbase"] or 0.0
+    mass = vehicle["mass"] or 0.0
+    half = 0.5 * wheelbase
+    stiffness = 0.5 * STIFFNESS * mass * GRAVITY
     values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
     values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
     values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}

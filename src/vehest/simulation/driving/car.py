@@ -105,7 +105,8 @@ _OWN_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
 
 
 def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
-    vehicle, parameters = plant.vehicle, plant.parameters
+    vehicle = plant.vehicle
+    parameters = plant.parameters
     unknown = sorted(set(own) - set(_OWN_VALUES))
     if unknown:
         raise ConfigurationError(

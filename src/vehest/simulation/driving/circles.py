@@ -58,7 +58,9 @@ class SteadyCircle(Manoeuvre):
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the radius, the side and the habits of this seed."""
         draw = Draws(seed)
-        radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
+        radius = draw(self.radius)
+        severity = draw(self.severity)
+        side = draw.side(self.side)
         driver = draw_driver(seed)
         final_ay = min(
             severity * car.grip * OpenArea(surface, seed).lowest,
@@ -66,7 +68,8 @@ class SteadyCircle(Manoeuvre):
         )
         first_ay = min(self.start_ay, 0.5 * final_ay)
         speed = math.sqrt(first_ay * radius)
-        run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
+        run_in = (SETTLING_TIME + 1.0) * speed
+        transition = 1.5 * speed
         entered = (run_in + transition) / speed - SETTLING_TIME
         growing = (final_ay - first_ay) / self.ay_rate
 
@@ -122,14 +125,18 @@ class BrakingInTurn(Manoeuvre):
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the radius, the speed, the brakes and the habits of this seed."""
         draw = Draws(seed)
-        radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
-        deceleration, turn_time = draw(self.deceleration), draw(self.turn_time)
+        radius = draw(self.radius)
+        severity = draw(self.severity)
+        side = draw.side(self.side)
+        deceleration = draw(self.deceleration)
+        turn_time = draw(self.turn_time)
         driver = draw_driver(seed)
         speed = min(
             math.sqrt(severity * car.grip * OpenArea(surface, seed).mean * radius),
             FASTEST_SHARE * car.top_speed,
         )
-        run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
+        run_in = (SETTLING_TIME + 1.0) * speed
+        transition = 1.5 * speed
         brakes_at = (run_in + transition) / speed - SETTLING_TIME + turn_time
         line = circle(radius, side, run_in, speed * (turn_time + 30.0), transition)
         plan = plan_along(line, speed, surface, seed)
@@ -147,8 +154,10 @@ class TurnBraker(LineDriver):
         self, manoeuvre: BrakingInTurn, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any]
     ) -> None:
         super().__init__(plan, car, driver, drawn)
-        self._brakes_at, self._deceleration = drawn["brakes_at"], drawn["deceleration"]
-        self._held, self._until_speed = manoeuvre.steering == "held", manoeuvre.until_speed
+        self._brakes_at = drawn["brakes_at"]
+        self._deceleration = drawn["deceleration"]
+        self._held = manoeuvre.steering == "held"
+        self._until_speed = manoeuvre.until_speed
 
     def command(self, time: float, seen: Observation) -> Command:
         """Around the circle, then braking, with the steering held or not."""

@@ -57,16 +57,19 @@ class DoubleLaneChange(Manoeuvre):
 
     def gates(self, width: float) -> tuple[Gate, ...]:
         """Gates for a car of a width [m], along the x axis from the first gate on, with the other lane on the left."""
-        first, last = 1.1 * width + 0.25, 1.3 * width + 0.25
+        first = 1.1 * width + 0.25
+        last = 1.3 * width + 0.25
         if self.layout == "iso_3888_1":
-            second, offset = 1.2 * width + 0.25, 3.5
+            second = 1.2 * width + 0.25
+            offset = 3.5
             lanes = (
                 (0.0, 15.0, first, 0.0),
                 (45.0, 70.0, second, offset),
                 (95.0, 125.0, last, 0.0),
             )
         else:
-            second, last = width + 1.0, max(last, 3.0)
+            second = width + 1.0
+            last = max(last, 3.0)
             offset = 0.5 * first + 1.0 + 0.5 * second  # one metre between the lanes
             lanes = (
                 (0.0, 12.0, first, 0.0),
@@ -124,7 +127,8 @@ def _between_cones(
     seed: int,
 ) -> Controller:
     draw = Draws(seed)
-    severity, side = draw(manoeuvre.severity), draw.side(manoeuvre.side)
+    severity = draw(manoeuvre.severity)
+    side = draw.side(manoeuvre.side)
     own_speed = draw(manoeuvre.speed) if manoeuvre.speed is not None else None
     usual = draw_driver(seed)  # who looks less far ahead and steers faster between cones
     driver = replace(

@@ -23,10 +23,8 @@ from vehest.simulation.road.lines import Line
 
 DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
-LOWEST_CORRECTION, HIGHEST_CORRECTION = (
-    0.5,
-    2.0,
-)  # frequencies between which a driver corrects [Hz]; assumed
+LOWEST_CORRECTION = 0.5
+HIGHEST_CORRECTION = 2.0  # frequencies between which a driver corrects [Hz]; assumed
 
 WAVELENGTHS = (
     310.0,
@@ -69,10 +67,8 @@ class DrivingStyle:
     line_phases: tuple[float, ...]  # phase of each sine of the line [rad]
 
     def __post_init__(self) -> None:
-        low, high = (
-            self.grip_fraction - abs(self.grip_ripple),
-            self.grip_fraction + abs(self.grip_ripple),
-        )
+        low = self.grip_fraction - abs(self.grip_ripple)
+        high = self.grip_fraction + abs(self.grip_ripple)
         if not (low > 0.0 and high <= 1.0 + 1e-9):
             raise ConfigurationError(
                 f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1"
@@ -212,7 +208,9 @@ def speed_profile(
     lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
     cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))
     speed = np.minimum(cornering, np.minimum(highest_speed, car.top_speed)).tolist()
-    bend, limit, most = np.abs(curvature).tolist(), lateral.tolist(), used.tolist()
+    bend = np.abs(curvature).tolist()
+    limit = lateral.tolist()
+    most = used.tolist()
     downhill = (GRAVITY * np.sin(grade) + np.zeros_like(used)).tolist()
 
     def spare(i: int) -> float:
@@ -286,7 +284,10 @@ class Follower:
         hands: Hands | None = None,
     ) -> None:
         self._hands = hands
-        self.plan, self.car, self.driver, self.progress = plan, car, driver, progress
+        self.plan = plan
+        self.car = car
+        self.driver = driver
+        self.progress = progress
         self._speed_at = speed_at
         self._per_metre = 1.0 / float(plan.distance[1])
         self._last_cell = len(plan.distance) - 2
@@ -309,14 +310,17 @@ class Follower:
 
     def command(self, time: float, seen: Observation) -> Command:
         """The command at a time [s] for an observation of the car."""
-        car, driver = self.car, self.driver
-        speed, sideslip = seen.speed, seen.sideslip
+        car = self.car
+        driver = self.driver
+        speed = seen.speed
+        sideslip = seen.sideslip
         lateral_error, heading_error, here, share = self._locate(seen, sideslip)
         ahead, share_ahead = self._cell(
             self.progress + speed * (driver.steering_lag + driver.response * speed)
         )
         friction = max(_between(self._friction, ahead, share_ahead), 0.05)
-        bank, grade = _between(self._bank, here, share), _between(self._grade, here, share)
+        bank = _between(self._bank, here, share)
+        grade = _between(self._grade, here, share)
         grip = car.grip * friction
 
         preview = max(speed * driver.preview_time, 3.0)
@@ -366,7 +370,8 @@ class Follower:
 
     def _per_curvature(self, speed: float, friction: float) -> float:
         """Steering angle per curvature [rad m] at half of the grip."""
-        car, moderate = self.car, 0.5 * self.car.grip * friction
+        car = self.car
+        moderate = 0.5 * self.car.grip * friction
         return car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
 
     def _locate(self, seen: Observation, sideslip: float) -> tuple[float, float, int, float]:
@@ -374,11 +379,10 @@ class Follower:
         for _ in range(2):
             cell, share = self._cell(self.progress)
             heading = _between(self._heading, cell, share)
-            dx, dy = (
-                seen.x - _between(self._x, cell, share),
-                seen.y - _between(self._y, cell, share),
-            )
-            along, across = math.cos(heading), math.sin(heading)
+            dx = seen.x - _between(self._x, cell, share)
+            dy = seen.y - _between(self._y, cell, share)
+            along = math.cos(heading)
+            across = math.sin(heading)
             self.progress = max(self.progress + dx * along + dy * across, 0.0)
         error = dy * along - dx * across
         cell, share = self._cell(self.progress)

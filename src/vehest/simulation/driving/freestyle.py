@@ -71,18 +71,18 @@ class FreestyleDriver:
     """Drives one car for the time of one recording."""
 
     def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, draw: Draws) -> None:
-        self._style, self._car, self._area, self._draw, self._generator = (
-            style,
-            car,
-            area,
-            draw,
-            draw.generator,
-        )
+        self._style = style
+        self._car = car
+        self._area = area
+        self._draw = draw
+        self._generator = draw.generator
         self.duration = draw(style.duration)
         self.drawn = {"duration": self.duration}
         self._progress = self._speed_until = self._steer_until = self._gas_until = 0.0
         self._wanted = self._steer = self._gas = 0.0
-        self._side, self._held_sideslip, self._saves = 1.0, draw(style.sideslip), False
+        self._side = 1.0
+        self._held_sideslip = draw(style.sideslip)
+        self._saves = False
 
     def inputs(self, time: float, seen: Observation) -> Inputs:
         """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
@@ -92,9 +92,11 @@ class FreestyleDriver:
             self._saves, self._held_sideslip = True, self._draw(self._style.sideslip)
         elif self._saves and abs(sideslip) < CALM:
             self._saves = False
-        steer, gas = self._next_steer(time), self._next_gas(time, seen)
+        steer = self._next_steer(time)
+        gas = self._next_gas(time, seen)
         if self._saves:
-            steer, gas = COUNTERSTEER * sideslip, 0.0
+            steer = COUNTERSTEER * sideslip
+            gas = 0.0
         elif gas < 0.0 and abs(sideslip) > CALM:
             gas = 0.0
         return Inputs(steer, gas, self._area.friction_at(self._progress))
@@ -102,7 +104,8 @@ class FreestyleDriver:
     def _next_steer(self, time: float) -> float:
         """At a stop mostly, to one side and then to the other."""
         if time >= self._steer_until:
-            generator, kind = self._generator, self._generator.uniform()
+            generator = self._generator
+            kind = self._generator.uniform()
             self._side = -self._side if generator.uniform() < 0.6 else self._side
             self._steer = self._side * self._car.largest_steer
             self._steer_until = time + float(generator.gamma(1.5, 1.0))
@@ -116,14 +119,17 @@ class FreestyleDriver:
 
     def _next_gas(self, time: float, seen: Observation) -> float:
         """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast, and at random."""
-        generator, style, largest = self._generator, self._style, self._car.largest_current
+        generator = self._generator
+        style = self._style
+        largest = self._car.largest_current
         if time >= self._speed_until:
             self._wanted = float(generator.uniform(*as_range(style.speed)))
             self._speed_until = time + float(generator.uniform(1.0, 4.0))
         if seen.vx < SLOW and self._gas <= 0.0:
             self._gas_until = time
         if time >= self._gas_until:
-            kind, current = generator.uniform(), float(generator.uniform(*style.current))
+            kind = generator.uniform()
+            current = float(generator.uniform(*style.current))
             self._gas_until = time + float(generator.uniform(0.15, 0.6))
             if seen.vx < SLOW:
                 self._gas = max(current, 0.4 * largest)

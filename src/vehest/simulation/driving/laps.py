@@ -86,7 +86,8 @@ class Laps(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the style and the habits of this seed."""
-        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        course = _course(self.course, self.flat)
+        driver = draw_driver(seed)
         low, high = as_range(self.severity)
         room = 1.0 - self.ripple
         style = draw_style(seed, (min(low, room), min(high, room)), self.ripple, self.line_offset)
@@ -117,7 +118,8 @@ class Laps(Manoeuvre):
 
     def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
         """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are drawn lap by lap."""
-        cells, spacing = len(course.arc_length) - 1, float(course.arc_length[1])
+        cells = len(course.arc_length) - 1
+        spacing = float(course.arc_length[1])
         speeds = np.full(n_laps * cells + 1, highest)
         for lap in range(n_laps):
             generator = np.random.default_rng(
@@ -171,7 +173,8 @@ class SpeedLaps(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the line and the habits of this seed."""
-        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        course = _course(self.course, self.flat)
+        driver = draw_driver(seed)
         severity = Draws(seed)(self.severity)
         style = draw_style(seed, (severity, severity), 0.0, self.line_offset)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
@@ -221,7 +224,8 @@ class FastLap(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver who uses as much of the grip as the mean speed takes; raises `ConfigurationError` where the car is too slow for it."""
-        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        course = _course(self.course, self.flat)
+        driver = draw_driver(seed)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
 
         def plan(severity: float) -> Plan:
@@ -233,7 +237,8 @@ class FastLap(Manoeuvre):
         def mean(severity: float) -> float:
             return course.length / _lap_time(plan(severity), course.length)
 
-        low, high = 0.02, FASTEST_SEVERITY
+        low = 0.02
+        high = FASTEST_SEVERITY
         if mean(high) < self.mean_speed:
             raise ConfigurationError(
                 f"manoeuvre 'fast_lap': vehicle '{car.name}' laps '{course.name}' at {mean(high):.1f} m/s at most, "
@@ -307,9 +312,11 @@ def _lap_time(plan: Plan, length: float) -> float:
 
 def _eased(speed: FloatArray, course: Course, rate: float) -> FloatArray:
     """Speeds [m/s] along the way without steps: they change by a constant acceleration around each step."""
-    spacing, eased = float(course.arc_length[1]), speed.copy()
+    spacing = float(course.arc_length[1])
+    eased = speed.copy()
     for at in np.flatnonzero(np.diff(speed)).tolist():
-        before, after = speed[at], speed[at + 1]
+        before = speed[at]
+        after = speed[at + 1]
         cells = max(round(abs(after**2 - before**2) / (2.0 * rate) / spacing), 1)
         eased[at + 1 : at + 1 + cells] = np.sqrt(np.linspace(before**2, after**2, cells + 1)[1:])[
             : len(eased) - at - 1

@@ -88,11 +88,9 @@ class LineDriver(Follower):
         **following: Any,
     ) -> None:
         super().__init__(plan, car, driver, **following)
-        self.drawn, self._end, self._end_time = (
-            drawn,
-            plan.length - 1.0 if end is None else end,
-            end_time,
-        )
+        self.drawn = drawn
+        self._end = plan.length - 1.0 if end is None else end
+        self._end_time = end_time
 
     def command(self, time: float, seen: Observation) -> Command:
         """As planned, until the end."""

@@ -63,7 +63,8 @@ class StepSteer(Manoeuvre):
         severity, steer_time, turn_time = (
             draw(values) for values in (self.severity, self.steer_time, self.turn_time)
         )
-        side, begin = draw.side(self.side), draw((1.0, 2.0))
+        side = draw.side(self.side)
+        begin = draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
 
@@ -115,20 +116,17 @@ class Spiral(Manoeuvre):
         severity, ramp, hold = (
             draw(values) for values in (self.severity, self.ramp_time, self.hold_time)
         )
-        side, begin = draw.side(self.side), draw((1.0, 2.0))
+        side = draw.side(self.side)
+        begin = draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
         back = min(0.4 * ramp, 3.0)
-        times, angles = (
-            [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back],
-            [0.0, angle, angle, 0.0],
-        )
+        times = [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back]
+        angles = [0.0, angle, angle, 0.0]
         if self.turns == 2:
             again = times[-1]
-            times, angles = (
-                [*times, again + ramp, again + ramp + hold, again + ramp + hold + back],
-                [*angles, -angle, -angle, 0.0],
-            )
+            times = [*times, again + ramp, again + ramp + hold, again + ramp + hold + back]
+            angles = [*angles, -angle, -angle, 0.0]
 
         def steer_at(time: float) -> float:
             return float(np.interp(time, times, angles))
@@ -212,19 +210,20 @@ class OpenLoop:
         end_time: float,
         drawn: dict[str, Any],
     ) -> None:
-        self.drawn, self.start = drawn, (0.0, 0.0, 0.0, speed)
-        self._car, self._area, self._speed, self._steer_at, self._end_time = (
-            car,
-            area,
-            speed,
-            steer_at,
-            end_time,
-        )
-        self._progress, self._before = 0.0, -SETTLING_TIME
+        self.drawn = drawn
+        self.start = (0.0, 0.0, 0.0, speed)
+        self._car = car
+        self._area = area
+        self._speed = speed
+        self._steer_at = steer_at
+        self._end_time = end_time
+        self._progress = 0.0
+        self._before = -SETTLING_TIME
 
     def command(self, time: float, seen: Observation) -> Command:
         """Steering by the clock; throttle or brakes as the speed wants them and the grip allows."""
-        car, speed = self._car, seen.speed
+        car = self._car
+        speed = seen.speed
         self._progress += speed * (time - self._before)
         self._before = time
         friction = self._area.friction_at(self._progress)

@@ -107,10 +107,8 @@ def _unpack(vector, friction):  # type: ignore[no-untyped-def]
         values[place] *= friction
     steering = SteeringValues(*to_fixed_tuple(values[_STEERING:], _LENGTHS[0]))
     longitudinal = LongitudinalValues(*to_fixed_tuple(values[_LONGITUDINAL:], _LENGTHS[1]))
-    front, rear = (
-        TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2])),
-        TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2])),
-    )
+    front = TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2]))
+    rear = TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2]))
     return MultiBodyValues(*to_fixed_tuple(values, _STEERING), steering, longitudinal, front, rear)  # type: ignore[call-arg]
 
 
@@ -123,7 +121,8 @@ def _sliding_friction(tyre):  # type: ignore[no-untyped-def]
 @_kernel
 def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def]
     """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order and the wheels' axes."""
-    regime, inputs = contact[0], contact[1]
+    regime = contact[0]
+    inputs = contact[1]
     forces = multi_body(x, inputs[0], _engine_limit(x, inputs[1], p), contact, p, derivatives)
     derivatives[VY_FRONT] += inputs[4]
     derivatives[VY_REAR] += inputs[4]
@@ -136,8 +135,10 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
         derivatives[YAW_RATE] += moment / (p.I_z - p.I_xz_s**2 / p.I_Phi_s)
         derivatives[ROLL_RATE] += moment * p.I_xz_s / p.I_z / (p.I_Phi_s - p.I_xz_s**2 / p.I_z)
         return forces
-    sine, cosine = math.sin(x[YAW]), math.cos(x[YAW])
-    derivatives[0], derivatives[1] = x[VX] * cosine - x[VY] * sine, x[VX] * sine + x[VY] * cosine
+    sine = math.sin(x[YAW])
+    cosine = math.cos(x[YAW])
+    derivatives[0] = x[VX] * cosine - x[VY] * sine
+    derivatives[1] = x[VX] * sine + x[VY] * cosine
     if regime == SLOW:
         acceleration = acceleration_limit(x[VX], inputs[1], p.longitudinal)
         derivatives[VX], derivatives[VY], derivatives[YAW_RATE] = slow_motion(
@@ -161,7 +162,8 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
 @_kernel
 def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
     """Wanted acceleration, within power at the speed of the driven wheels; the library's limit takes the car's speed."""
-    front, rear = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1], x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
+    front = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1]
+    rear = x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
     velocity = 0.5 * p.R_w * (p.T_se * front + (1.0 - p.T_se) * rear)
     if velocity > OVERSPEED * p.longitudinal.v_max:
         return min(acceleration, 0.0)
@@ -222,10 +224,14 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before
     held = np.empty(8)
     for i in range(4):
         held[i] = held[4 + i] = held_before[i]
-    friction_front, friction_rear = _sliding_friction(p.tire), _sliding_friction(p.tire_rear)
+    friction_front = _sliding_friction(p.tire)
+    friction_rear = _sliding_friction(p.tire_rear)
     x = state.copy()
     stage = np.empty(N_STATES)
-    k1, k2, k3, k4 = np.empty(N_STATES), np.empty(N_STATES), np.empty(N_STATES), np.empty(N_STATES)
+    k1 = np.empty(N_STATES)
+    k2 = np.empty(N_STATES)
+    k3 = np.empty(N_STATES)
+    k4 = np.empty(N_STATES)
     slid = False
     for _ in range(n_steps):
         regime = next_regime(regime, x, p)
@@ -268,7 +274,8 @@ def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignor
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     held = np.empty(8)
     n_samples = len(states)
-    derivatives, forces = np.empty((n_samples, N_STATES)), np.empty((n_samples, N_FORCES))
+    derivatives = np.empty((n_samples, N_STATES))
+    forces = np.empty((n_samples, N_FORCES))
     for k in range(n_samples):
         p = _unpack(vector, frictions[k])
         for i in range(4):
@@ -282,7 +289,8 @@ def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignor
             held,
         )
         wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
-        sine, cosine = math.sin(states[k, STEER]), math.cos(states[k, STEER])
+        sine = math.sin(states[k, STEER])
+        cosine = math.cos(states[k, STEER])
         for i in range(N_FORCES):
             forces[k, i] = wheels[i]
         for i in range(2):

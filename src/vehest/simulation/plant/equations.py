@@ -49,7 +49,8 @@ SMALLEST_WHEEL_VELOCITY = 0.5
 SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
 
 HEAVE_RATE = 12
-JOINT_FRONT, JOINT_REAR = 27, 28
+JOINT_FRONT = 27
+JOINT_REAR = 28
 
 # Places of an axle's lateral velocity and of the lateral play of its joint among the states, and its parameters. Roll, roll rate, lateral
 # velocity, heave and heave rate of an axle follow one another.
@@ -182,26 +183,29 @@ def _axles(p):  # type: ignore[no-untyped-def]
 @_kernel
 def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: ignore[no-untyped-def]
     """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump stops are left out."""
-    roll, roll_rate, heave, heave_rate = (
-        x[axle.vy - 2],
-        x[axle.vy - 1],
-        x[axle.vy + 1],
-        x[axle.vy + 2],
-    )
-    sine, cosine = math.sin(x[ROLL]), math.cos(x[ROLL])
-    relative_roll, relative_roll_rate = x[ROLL] - roll, x[ROLL_RATE] - roll_rate
-    above, above_rate = height - radius + heave - x[HEAVE], heave_rate - x[HEAVE_RATE]
+    roll = x[axle.vy - 2]
+    roll_rate = x[axle.vy - 1]
+    heave = x[axle.vy + 1]
+    heave_rate = x[axle.vy + 2]
+    sine = math.sin(x[ROLL])
+    cosine = math.cos(x[ROLL])
+    relative_roll = x[ROLL] - roll
+    relative_roll_rate = x[ROLL_RATE] - roll_rate
+    above = height - radius + heave - x[HEAVE]
+    above_rate = heave_rate - x[HEAVE_RATE]
 
-    middle, middle_rate = (
-        above / cosine - height + radius + axle.lever * x[PITCH],
-        above_rate + axle.lever * x[PITCH_RATE],
-    )
-    lean, lean_rate = 0.5 * relative_roll * axle.track, 0.5 * relative_roll_rate * axle.track
-    left, right = middle + lean, middle - lean
-    left_rate, right_rate = middle_rate + lean_rate, middle_rate - lean_rate
+    middle = above / cosine - height + radius + axle.lever * x[PITCH]
+    middle_rate = above_rate + axle.lever * x[PITCH_RATE]
+    lean = 0.5 * relative_roll * axle.track
+    lean_rate = 0.5 * relative_roll_rate * axle.track
+    left = middle + lean
+    right = middle - lean
+    left_rate = middle_rate + lean_rate
+    right_rate = middle_rate - lean_rate
     twist = relative_roll * axle.torsion / axle.track
 
-    arm, play = axle.joint_height - radius, x[axle.joint]
+    arm = axle.joint_height - radius
+    play = x[axle.joint]
     joint_rate = x[VY] + axle.lever * x[YAW_RATE] - x[axle.vy]
     joint = above * sine - play * cosine - arm * math.sin(relative_roll)
     leaning = (above * cosine + play * sine) * x[ROLL_RATE] + above_rate * sine
@@ -228,13 +232,14 @@ def _slip(velocity, turning):  # type: ignore[no-untyped-def]
 @_kernel
 def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical, tyre):  # type: ignore[no-untyped-def]
     """Tyre forces and loads of an axle; ``vertical`` is the vertical stiffness of a tyre [N/m]."""
-    roll, roll_rate, heave = x[axle.vy - 2], x[axle.vy - 1], x[axle.vy + 1]
+    roll = x[axle.vy - 2]
+    roll_rate = x[axle.vy - 1]
+    heave = x[axle.vy + 1]
     half = 0.5 * axle.track
-    middle, lean = heave + radius * (math.cos(roll) - 1.0), half * math.sin(roll)
-    load_left, load_right = (
-        max((middle - lean) * vertical, SMALLEST_LOAD),
-        max((middle + lean) * vertical, SMALLEST_LOAD),
-    )
+    middle = heave + radius * (math.cos(roll) - 1.0)
+    lean = half * math.sin(roll)
+    load_left = max((middle - lean) * vertical, SMALLEST_LOAD)
+    load_right = max((middle + lean) * vertical, SMALLEST_LOAD)
     sideways = x[VY] + axle.lever * x[YAW_RATE] - roll_rate * (radius - heave)
     angle_left = (
         math.atan(sideways / max(x[VX] + half * x[YAW_RATE], SMALLEST_WHEEL_VELOCITY)) - steer
@@ -258,9 +263,11 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
     ``across`` is the lateral force of both wheels in the body's axes; left and right are lateral force and load of each in its own.
     """
     roll = x[axle.vy - 2]
-    height, half = radius * math.sin(roll), 0.5 * axle.track
+    height = radius * math.sin(roll)
+    half = 0.5 * axle.track
     reach = half * math.cos(roll)
-    sine, cosine = math.sin(x[ROLL]), math.cos(x[ROLL])
+    sine = math.sin(x[ROLL])
+    cosine = math.cos(x[ROLL])
     both = suspension.left + suspension.right
     moment = (
         half * suspension.right
@@ -295,13 +302,13 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     )
     front, rear = _axles(p)
     radius = p.R_w
-    at_front, at_rear = (
-        _suspension(x, front, p.h_s, radius, p.K_ras, p.K_rad),
-        _suspension(x, rear, p.h_s, radius, p.K_ras, p.K_rad),
-    )
+    at_front = _suspension(x, front, p.h_s, radius, p.K_ras, p.K_rad)
+    at_rear = _suspension(x, rear, p.h_s, radius, p.K_ras, p.K_rad)
     v0, v1, v2, v3 = wheel_velocities(x, p)
-    slip0, slip1 = _slip(v0, radius * x[FIRST_WHEEL]), _slip(v1, radius * x[FIRST_WHEEL + 1])
-    slip2, slip3 = _slip(v2, radius * x[FIRST_WHEEL + 2]), _slip(v3, radius * x[FIRST_WHEEL + 3])
+    slip0 = _slip(v0, radius * x[FIRST_WHEEL])
+    slip1 = _slip(v1, radius * x[FIRST_WHEEL + 1])
+    slip2 = _slip(v2, radius * x[FIRST_WHEEL + 2])
+    slip3 = _slip(v3, radius * x[FIRST_WHEEL + 3])
     f = _wheels(x, front, at_front, x[STEER], slip0, slip1, radius, p.K_zt, p.tire)
     r = _wheels(x, rear, at_rear, 0.0, slip2, slip3, radius, p.K_zt, p.tire_rear)
     along = f.along_left, f.along_right, r.along_left, r.along_right
@@ -309,11 +316,10 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     loads = f.load_left, f.load_right, r.load_left, r.load_right
     x0, x1, x2, x3, y0, y1, y2, y3 = forces_of_contact(contact, x, u, p, along, across, loads)
 
-    sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
-    front_along, front_across = (
-        (x0 + x1) * cosine - (y0 + y1) * sine,
-        (y0 + y1) * cosine + (x0 + x1) * sine,
-    )
+    sine = math.sin(x[STEER])
+    cosine = math.cos(x[STEER])
+    front_along = (x0 + x1) * cosine - (y0 + y1) * sine
+    front_across = (y0 + y1) * cosine + (x0 + x1) * sine
     _axle_rates(
         x,
         front,
@@ -329,7 +335,8 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
         x, rear, at_rear, y2 + y3, (y2, loads[2]), (y3, loads[3]), radius, p.K_lt, derivatives
     )
 
-    half_front, half_rear = 0.5 * p.T_f, 0.5 * p.T_r
+    half_front = 0.5 * p.T_f
+    half_rear = 0.5 * p.T_r
     yaw_moment = (
         (y0 + y1) * p.a * cosine
         + (x0 + x1) * p.a * sine
@@ -338,7 +345,8 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
         + (x2 - x3) * 0.5 * p.T_r
         - (y2 + y3) * p.b
     )
-    sine, cosine = math.sin(x[ROLL]), math.cos(x[ROLL])
+    sine = math.sin(x[ROLL])
+    cosine = math.cos(x[ROLL])
     front_arm = (
         p.h_s - x[HEAVE] - radius + x[VY_FRONT + 1] - (p.h_raf - radius) * math.cos(x[VY_FRONT - 2])
     )
@@ -358,13 +366,13 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
         - p.b * (at_rear.left + at_rear.right)
         + (front_along + x2 + x3) * (p.h_s - x[HEAVE])
     )
-    springs, joints = (
-        at_front.left + at_rear.left + at_front.right + at_rear.right,
-        at_front.joint + at_rear.joint,
-    )
+    springs = at_front.left + at_rear.left + at_front.right + at_rear.right
+    joints = at_front.joint + at_rear.joint
 
-    course, speed = math.atan(x[VY] / x[VX]) + x[YAW], math.sqrt(x[VX] ** 2 + x[VY] ** 2)
-    derivatives[0], derivatives[1] = math.cos(course) * speed, math.sin(course) * speed
+    course = math.atan(x[VY] / x[VX]) + x[YAW]
+    speed = math.sqrt(x[VX] ** 2 + x[VY] ** 2)
+    derivatives[0] = math.cos(course) * speed
+    derivatives[1] = math.sin(course) * speed
     derivatives[STEER] = u[0]
     derivatives[VX] = (
         1.0 / p.m * (x2 + x3 + (x0 + x1) * math.cos(x[STEER]) - (y0 + y1) * math.sin(x[STEER]))
@@ -384,7 +392,8 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     derivatives[HEAVE] = x[HEAVE_RATE]
     derivatives[HEAVE_RATE] = GRAVITY - 1.0 / p.m_s * (springs * cosine - joints * sine)
 
-    share, torque = p.T_se if u[1] > 0.0 else p.T_sb, p.m * radius * u[1]
+    share = p.T_se if u[1] > 0.0 else p.T_sb
+    torque = p.m * radius * u[1]
     pulls = x0, x1, x2, x3
     for i in range(4):
         of_axle = share if i < 2 else 1.0 - share

@@ -23,10 +23,8 @@ def ramp_steer(
     scales that of the tyres; the direction is 1 to the left, -1 to the right.
     """
     steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
-    state, per_sample = (
-        plant.initial_state(0.0, 0.0, 0.0, speed),
-        round(1.0 / (RATE_HZ * plant.step)),
-    )
+    state = plant.initial_state(0.0, 0.0, 0.0, speed)
+    per_sample = round(1.0 / (RATE_HZ * plant.step))
     states: list[PlantState] = []
     inputs: list[FloatArray] = []
     integral = largest = 0.0

@@ -54,7 +54,8 @@ STEADY_SHARE = 0.93
 
 The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
 
-HEAVE_FRONT, HEAVE_REAR = 16, 21
+HEAVE_FRONT = 16
+HEAVE_REAR = 21
 MIRRORED = (
     1,
     0,
@@ -79,12 +80,11 @@ class PlantState:
     # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag
     held: FloatArray = field(default_factory=lambda: np.zeros(4))
 
-    x, y = _state(X, "Position on the ground [m]."), _state(Y, "Position on the ground [m].")
+    x = _state(X, "Position on the ground [m].")
+    y = _state(Y, "Position on the ground [m].")
     yaw = _state(YAW, "Heading, not wrapped [rad].")
-    vx, vy = (
-        _state(VX, "Forward velocity [m/s]."),
-        _state(VY, "Lateral velocity, positive to the left [m/s]."),
-    )
+    vx = _state(VX, "Forward velocity [m/s].")
+    vy = _state(VY, "Lateral velocity, positive to the left [m/s].")
     yaw_rate = _state(YAW_RATE, "Positive to the left [rad/s].")
     steer = _state(STEER, "Road-wheel angle of the front axle, positive to the left [rad].")
 
@@ -135,7 +135,8 @@ class MultiBodyPlant:
     @cached_property
     def _at_rest(self) -> FloatArray:
         """The state in which the springs carry the car, at the origin; (29,)."""
-        p, values = self.parameters, np.zeros(compiled.N_STATES)
+        p = self.parameters
+        values = np.zeros(compiled.N_STATES)
         values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (
             2.0 * p.K_zt
         )
@@ -210,7 +211,9 @@ class MultiBodyPlant:
         """
         derivatives, forces = self.evaluate(states, inputs, friction)
         values = np.array([state.values for state in states])
-        vx, vy, yaw_rate = values[:, VX], values[:, VY], values[:, YAW_RATE]
+        vx = values[:, VX]
+        vy = values[:, VY]
+        yaw_rate = values[:, YAW_RATE]
 
         def per_sample(value: ArrayLike) -> FloatArray:
             return np.broadcast_to(np.asarray(value, dtype=np.float64), len(values)).copy()

@@ -125,10 +125,8 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
 
     Raises `ConfigurationError` where a key is missing or unknown, or a value of the wrong type, and as `Vehicle` does.
     """
-    given, where = (
-        {key: value for key, value in configuration.items() if value is not None},
-        f"vehicle '{configuration.get('name')}'",
-    )
+    given = {key: value for key, value in configuration.items() if value is not None}
+    where = f"vehicle '{configuration.get('name')}'"
     lengths = given.pop("relaxation", {})
     if not isinstance(lengths, Mapping) or set(lengths) - {"front", "rear"}:
         raise ConfigurationError(
@@ -147,7 +145,8 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     if mass == 0.0:
         return vehicle
     p = library_parameters(vehicle)
-    total, wheelbase = p.m + mass, p.a + p.b
+    total = p.m + mass
+    wheelbase = p.a + p.b
     shift = forward * mass / total
     if mass < 0.0 or not (p.a - shift > 0.0 and p.b + shift > 0.0):
         raise ConfigurationError(

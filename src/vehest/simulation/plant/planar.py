@@ -36,8 +36,13 @@ STICTION_SPEED = (
 SHORTEST = 0.2  # share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step
 
 X, Y, YAW, VX, VY, YAW_RATE = range(6)
-FIRST_WHEEL, FIRST_SLIP_X, FIRST_SLIP_Y = 6, 10, 14
-LOAD_AX, LOAD_AY, STEER, CURRENT = 18, 19, 20, 21
+FIRST_WHEEL = 6
+FIRST_SLIP_X = 10
+FIRST_SLIP_Y = 14
+LOAD_AX = 18
+LOAD_AY = 19
+STEER = 20
+CURRENT = 21
 N_STATES = 22
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
@@ -57,13 +62,11 @@ def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
 def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type: ignore[no-untyped-def]
     """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its load."""
     rate = np.empty(N_STATES)
-    vx, vy, yaw_rate, steer, current = (
-        state[VX],
-        state[VY],
-        state[YAW_RATE],
-        state[STEER],
-        state[CURRENT],
-    )
+    vx = state[VX]
+    vy = state[VY]
+    yaw_rate = state[YAW_RATE]
+    steer = state[STEER]
+    current = state[CURRENT]
     wheelbase = p.cg_to_front_axle + p.cg_to_rear_axle
     along = 0.5 * p.mass * state[LOAD_AX] * p.cg_height / wheelbase
     across = p.mass * state[LOAD_AY] * p.cg_height / p.track
@@ -76,11 +79,10 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
     sum_x = sum_y = moment = traction = 0.0
     rolling = np.empty(4)
     for wheel in range(4):
-        front, left = wheel < 2, wheel % 2 == 0
-        x, y = (
-            (p.cg_to_front_axle if front else -p.cg_to_rear_axle),
-            (0.5 if left else -0.5) * p.track,
-        )
+        front = wheel < 2
+        left = wheel % 2 == 0
+        x = p.cg_to_front_axle if front else -p.cg_to_rear_axle
+        y = (0.5 if left else -0.5) * p.track
         angle = steer if front else 0.0
         static = (
             0.5
@@ -93,9 +95,12 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
         load = max(
             static + (-along if front else along) + (-across if left else across) * share, 0.0
         )
-        cosine, sine = math.cos(angle), math.sin(angle)
-        point_x, point_y = vx - yaw_rate * y, vy + yaw_rate * x
-        wheel_x, wheel_y = point_x * cosine + point_y * sine, point_y * cosine - point_x * sine
+        cosine = math.cos(angle)
+        sine = math.sin(angle)
+        point_x = vx - yaw_rate * y
+        point_y = vy + yaw_rate * x
+        wheel_x = point_x * cosine + point_y * sine
+        wheel_y = point_y * cosine - point_x * sine
         rim = p.wheel_radius * state[FIRST_WHEEL + wheel]
         reference = max(abs(wheel_x), abs(rim), SLOWEST)
         missing_x = (rim - wheel_x) / reference - state[FIRST_SLIP_X + wheel]
@@ -112,13 +117,12 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
         per_slip = _per_slip(math.hypot(slip_x, slip_y), stiffness, p.shape_factor)
         relative = load / (0.25 * p.mass * GRAVITY) - 1.0
         grip = scale * p.friction * max(1.0 - p.load_sensitivity * relative, 0.1) * load
-        force_x, force_y = grip * per_slip * slip_x, grip * per_slip * slip_y
+        force_x = grip * per_slip * slip_x
+        force_y = grip * per_slip * slip_y
         rolling[wheel] = p.wheel_radius * force_x
         traction += rolling[wheel]
-        forces[wheel, 0], forces[wheel, 1] = (
-            force_x * cosine - force_y * sine,
-            force_x * sine + force_y * cosine,
-        )
+        forces[wheel, 0] = force_x * cosine - force_y * sine
+        forces[wheel, 1] = force_x * sine + force_y * cosine
         forces[wheel, 2] = load
         sum_x += forces[wheel, 0]
         sum_y += forces[wheel, 1]
@@ -138,17 +142,16 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
             )
             rate[first + side] = (0.25 * drive + lock - rolling[wheel]) / p.wheel_inertia
     drag = p.air_drag * math.hypot(vx, vy)
-    ax, ay = (sum_x - drag * vx) / p.mass, (sum_y - drag * vy) / p.mass
-    rate[X], rate[Y] = (
-        vx * math.cos(state[YAW]) - vy * math.sin(state[YAW]),
-        vx * math.sin(state[YAW]) + vy * math.cos(state[YAW]),
-    )
-    rate[YAW], rate[YAW_RATE] = yaw_rate, moment / p.yaw_inertia
-    rate[VX], rate[VY] = ax + vy * yaw_rate, ay - vx * yaw_rate
-    rate[LOAD_AX], rate[LOAD_AY] = (
-        (ax - state[LOAD_AX]) / p.load_time,
-        (ay - state[LOAD_AY]) / p.load_time,
-    )
+    ax = (sum_x - drag * vx) / p.mass
+    ay = (sum_y - drag * vy) / p.mass
+    rate[X] = vx * math.cos(state[YAW]) - vy * math.sin(state[YAW])
+    rate[Y] = vx * math.sin(state[YAW]) + vy * math.cos(state[YAW])
+    rate[YAW] = yaw_rate
+    rate[YAW_RATE] = moment / p.yaw_inertia
+    rate[VX] = ax + vy * yaw_rate
+    rate[VY] = ay - vx * yaw_rate
+    rate[LOAD_AX] = (ax - state[LOAD_AX]) / p.load_time
+    rate[LOAD_AY] = (ay - state[LOAD_AY]) / p.load_time
     turning = (min(max(wanted_steer, -p.largest_steer), p.largest_steer) - steer) / p.steering_time
     rate[STEER] = min(max(turning, -p.steering_rate), p.steering_rate)
     rate[CURRENT] = (
@@ -186,13 +189,15 @@ class PlanarPlant:
     """A car and its equations of motion, integrated by ``step`` [s]."""
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
-        self.car, self.step = car, step
+        self.car = car
+        self.step = step
         self._values = PlanarValues(**car.parameters)
 
     def initial_state(self, speed: float = 0.0, yaw: float = 0.0) -> FloatArray:
         """Rolling straight ahead from the origin at a speed [m/s] and heading [rad], (22,)."""
         state = np.zeros(N_STATES)
-        state[YAW], state[VX] = yaw, speed
+        state[YAW] = yaw
+        state[VX] = speed
         state[FIRST_WHEEL : FIRST_WHEEL + 4] = speed / self.car.wheel_radius
         return state
 
@@ -215,14 +220,13 @@ class PlanarPlant:
         self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float
     ) -> Motion:
         """Motion from the states (22,) and the inputs at each sample."""
-        values, car = np.array(states), self.car
+        values = np.array(states)
+        car = self.car
         found = [
             self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)
         ]
-        rates, forces = (
-            np.array([rate for rate, _ in found]),
-            np.array([force for _, force in found]),
-        )
+        rates = np.array([rate for rate, _ in found])
+        forces = np.array([force for _, force in found])
         level = np.zeros(len(values))
         wheel_speed = values[:, FIRST_WHEEL : FIRST_WHEEL + len(WHEELS)]
         return Motion(

@@ -46,7 +46,8 @@ SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes
 
 
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
-VY_FRONT, VY_REAR = 15, 20
+VY_FRONT = 15
+VY_REAR = 20
 FIRST_WHEEL = 23  # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names
 
 _kernel = numba.njit(
@@ -57,7 +58,9 @@ _kernel = numba.njit(
 @_kernel
 def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
     """The regime that holds from the state x on."""
-    vx, vy, yaw_rate = x[VX], x[VY], x[YAW_RATE]
+    vx = x[VX]
+    vy = x[VY]
+    yaw_rate = x[YAW_RATE]
     if regime == ROLLING:
         if abs(vy) > math.tan(SPUN_SIDESLIP) * vx:
             return SLIDING
@@ -77,7 +80,8 @@ def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
 def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[no-untyped-def]
     """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes or a slope hold it."""
     wheelbase = p.a + p.b
-    least, most = _adhesion(p, p.T_sb), _adhesion(p, p.T_se)
+    least = _adhesion(p, p.T_sb)
+    most = _adhesion(p, p.T_se)
     wanted = min(max(acceleration, -least), most) + inputs[3]
     change = wanted * p.m / (p.m + 4.0 * p.I_y_w / p.R_w**2)
     if x[VX] <= 0.0 and change <= 0.0:
@@ -97,9 +101,11 @@ def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[
 @_kernel
 def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
     """Velocity of the four wheels along their own planes, in the library's order [m/s]."""
-    sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
+    sine = math.sin(x[STEER])
+    cosine = math.cos(x[STEER])
     sideways = (x[VY] + p.a * x[YAW_RATE]) * sine
-    front, rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
+    front = 0.5 * p.T_f * x[YAW_RATE]
+    rear = 0.5 * p.T_r * x[YAW_RATE]
     return (
         (x[VX] + front) * cosine + sideways,
         (x[VX] - front) * cosine + sideways,
@@ -133,17 +139,21 @@ def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[n
         )
     if regime == ROLLING:
         return *along, *across
-    sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
+    sine = math.sin(x[STEER])
+    cosine = math.cos(x[STEER])
     if regime == SLOW:
         front_x, rear_x, front_y, rear_y = _forces_needed(x, u, inputs, p)
         front_x, front_y = (
             0.5 * (front_x * cosine + front_y * sine),
             0.5 * (front_y * cosine - front_x * sine),
         )
-        rear_x, rear_y = 0.5 * rear_x, 0.5 * rear_y
+        rear_x = 0.5 * rear_x
+        rear_y = 0.5 * rear_y
         return front_x, front_x, rear_x, rear_x, front_y, front_y, rear_y, rear_y
-    half_front, half_rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
-    front_vy, rear_vy = x[VY] + p.a * x[YAW_RATE], x[VY] - p.b * x[YAW_RATE]
+    half_front = 0.5 * p.T_f * x[YAW_RATE]
+    half_rear = 0.5 * p.T_r * x[YAW_RATE]
+    front_vy = x[VY] + p.a * x[YAW_RATE]
+    rear_vy = x[VY] - p.b * x[YAW_RATE]
     x0, y0 = _coulomb(friction_front * loads[0], x[VX] + half_front, front_vy)
     x1, y1 = _coulomb(friction_front * loads[1], x[VX] - half_front, front_vy)
     x2, y2 = _coulomb(friction_rear * loads[2], x[VX] + half_rear, rear_vy)
@@ -175,7 +185,8 @@ def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
     vx_change, vy_change, yaw_acceleration = slow_motion(x, u[0], u[1], inputs, p)
     along = p.m * (vx_change - x[VY] * x[YAW_RATE] - inputs[3])
     across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
-    moment, wheelbase = p.I_z * yaw_acceleration, p.a + p.b
+    moment = p.I_z * yaw_acceleration
+    wheelbase = p.a + p.b
     front_share = p.T_sb if along < 0.0 else p.T_se
     return (
         front_share * along,

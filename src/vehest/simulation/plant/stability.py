@@ -73,7 +73,8 @@ def stability_control(plant: MultiBodyPlant) -> StabilityControl:
     the rest is left for cornering.
     """
     parameters = plant.parameters
-    cornering_front, cornering_rear = abs(parameters.tire.p_ky1), abs(parameters.tire_rear.p_ky1)
+    cornering_front = abs(parameters.tire.p_ky1)
+    cornering_rear = abs(parameters.tire_rear.p_ky1)
     friction = min(parameters.tire.p_dx1, parameters.tire_rear.p_dx1)
     brake_arm = 0.25 * (parameters.T_f + parameters.T_r)
     return StabilityControl(

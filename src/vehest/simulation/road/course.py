@@ -93,7 +93,8 @@ def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
 
 
 def _headings_of_straights(segments: Sequence[Segment]) -> FloatArray:
-    headings, heading = [], 0.0
+    headings = []
+    heading = 0.0
     for segment in segments:
         heading += segment.angle
         if isinstance(segment, Straight):
@@ -151,7 +152,8 @@ class _HeadingProfile:
     """Heading [rad] as a function of arc length: the exact integral of a piecewise linear curvature."""
 
     def __init__(self, nodes: FloatArray, curvatures: FloatArray) -> None:
-        self._nodes, self._curvatures = nodes, curvatures
+        self._nodes = nodes
+        self._curvatures = curvatures
         areas = 0.5 * np.diff(nodes) * (curvatures[1:] + curvatures[:-1])
         self._headings = np.concatenate([[0.0], np.cumsum(areas)])
 

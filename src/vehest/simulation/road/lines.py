@@ -47,16 +47,16 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     axis, over ``run_in`` before the first gate and the last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends
     swing out a little where the line turns, is covered by the clearance.
     """
-    begin, end = gates[0].begin - run_in, gates[-1].end + run_out
-    straight_until, straight_from = (
-        gates[0].begin - min(run_in, 40.0),
-        gates[-1].end + run_out / 3.0,
-    )
+    begin = gates[0].begin - run_in
+    end = gates[-1].end + run_out
+    straight_until = gates[0].begin - min(run_in, 40.0)
+    straight_from = gates[-1].end + run_out / 3.0
     places = np.linspace(
         straight_until, straight_from, max(round((straight_from - straight_until) / _KNOTS), 8) + 1
     )
     room = 0.5 * width + CLEARANCE
-    lower, upper = np.full(len(places), -np.inf), np.full(len(places), np.inf)
+    lower = np.full(len(places), -np.inf)
+    upper = np.full(len(places), np.inf)
     for gate in gates:
         # A gate holds at its ends too, which lie between two points: the nearest points outside them count as inside.
         inside = (places > gate.begin - 0.75 * _KNOTS) & (places < gate.end + 0.75 * _KNOTS)
@@ -64,7 +64,8 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
         upper[inside] = np.minimum(upper[inside], gate.left - room)
     tight = lower > upper - 1e-3  # the gate is hardly wider than the car: right through the middle
     middle = 0.5 * (lower[tight] + upper[tight])
-    lower[tight], upper[tight] = middle - 5e-4, middle + 5e-4
+    lower[tight] = middle - 5e-4
+    upper[tight] = middle + 5e-4
     step = places[1] - places[0]
     padded = np.eye(len(places) + 6)[:, 3:-3]  # straight on both sides
     bends = np.diff(padded, 2, axis=0) / step**2

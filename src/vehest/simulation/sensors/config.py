@@ -124,7 +124,8 @@ def _changed_value(old: Any, change: Any, where: str) -> Any:
 
 def _off_at(levels: Any, path: list[str], name: str) -> Any:
     """Levels with the errors at a path off; ``name`` is the whole path, for messages."""
-    key, rest = path[0], path[1:]
+    key = path[0]
+    rest = path[1:]
     choices = [entry.name for entry in fields(levels) if entry.name not in NO_ERRORS]
     if key not in choices:
         raise ConfigurationError(

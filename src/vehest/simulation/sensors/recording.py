@@ -90,7 +90,8 @@ def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
     The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
     along its vertical axis are left out.
     """
-    grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
+    grade = motion.grade * tilt.grade
+    bank = motion.bank * tilt.bank
     road = np.stack(
         [
             motion.ax - GRAVITY * np.sin(grade),
@@ -106,13 +107,12 @@ def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
 
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
     """
-    roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch
-    sin_roll, cos_roll, sin_pitch, cos_pitch = (
-        np.sin(roll),
-        np.cos(roll),
-        np.sin(pitch),
-        np.cos(pitch),
-    )
+    roll = motion.roll * tilt.roll
+    pitch = motion.pitch * tilt.pitch
+    sin_roll = np.sin(roll)
+    cos_roll = np.cos(roll)
+    sin_pitch = np.sin(pitch)
+    cos_pitch = np.cos(pitch)
     return np.stack(
         [
             motion.roll_rate - motion.yaw_rate * sin_pitch,
@@ -125,7 +125,8 @@ def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
 def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
     """True angular velocities and specific forces where the inertial unit sits, along its axes."""
     mounting = levels.imu
-    rates, force = body_rates(motion, levels.tilt), specific_force(motion, levels.tilt)
+    rates = body_rates(motion, levels.tilt)
+    force = specific_force(motion, levels.tilt)
     lever = np.array([[mounting.lever_x], [mounting.lever_y], [mounting.lever_z]])
     if lever.any():  # dω/dt × l + ω × (ω × l), as of a rigid body
         angular = (
@@ -181,17 +182,21 @@ def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, Flo
     )
     left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
     heading = shown(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
-    cosine, sine = np.cos(heading), np.sin(heading)
+    cosine = np.cos(heading)
+    sine = np.sin(heading)
     yaw_rate = shown(motion.yaw_rate, reference.yaw_rate, rate_hz, seed, "yaw_rate_ref")
     seen_forward = shown(forward * cosine + left * sine, reference.vx, rate_hz, seed, "vx_ref")
     seen_left = shown(left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref")
-    lever_x, lever_y = reference.lever_x, reference.lever_y
+    lever_x = reference.lever_x
+    lever_y = reference.lever_y
     if reference.lever_error:
         error_x, error_y = reference.lever_error * stream(
             seed, "reference.lever_error"
         ).standard_normal(2)
-        lever_x, lever_y = lever_x + error_x, lever_y + error_y
-    vx, vy = seen_forward + yaw_rate * lever_y, seen_left - yaw_rate * lever_x
+        lever_x = lever_x + error_x
+        lever_y = lever_y + error_y
+    vx = seen_forward + yaw_rate * lever_y
+    vy = seen_left - yaw_rate * lever_x
     return {
         "vx_ref": vx,
         "vy_ref": vy,

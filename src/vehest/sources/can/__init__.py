@@ -90,7 +90,8 @@ class CanSource(SignalSource):
             for name, value in found.items():
                 stamps[name].append(frame.timestamp)
                 values[name].append(value)
-        signals, rates = {}, {}
+        signals = {}
+        rates = {}
         for name, one in wanted.items():
             if len(stamps[name]) < 2:
                 raise DataError(never_occurs(file, name, one, len(stamps[name]), bus))

@@ -25,7 +25,8 @@ class Frames:
     def __iter__(self) -> Iterator[Any]:
         from can import Message
 
-        data, at = self.arrays["data"].tobytes(), 0
+        data = self.arrays["data"].tobytes()
+        at = 0
         names = ("time", "identifier", "extended", "fd", "fast", "length", "bus")
         for time, identifier, extended, fd, fast, length, bus in zip(
             *(self.arrays[name].tolist() for name in names), strict=True

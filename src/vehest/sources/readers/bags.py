@@ -69,7 +69,10 @@ def survey_topics(
     bag: Path, ignored: Sequence[str], most_fields: int
 ) -> tuple[Arrays, dict[str, Any]]:
     """All topics whose messages are of ROS's own types, with their plain numbers."""
-    types, arrays, found, skipped = _types({}), Arrays(), [], []
+    types = _types({})
+    arrays = Arrays()
+    found = []
+    skipped = []
     with _opened(bag) as reader:
         topics = {
             connection.topic: connection.msgtype
@@ -123,7 +126,8 @@ def _opened(bag: Path) -> Reader:
 
 def _types(layouts: Mapping[str, str]) -> Any:
     """Standard message types and the declared ones: rosbags makes code of these, never of a bag's own definitions."""
-    types, declared = get_typestore(Stores.ROS2_HUMBLE), {}
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    declared = {}
     for name, text in layouts.items():
         try:
             declared.update(get_types_from_msg(text, name))
@@ -154,7 +158,9 @@ def _part(message: Any, part: str) -> Any:
 
 
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
-    node, detail, parts = Nodetype.NAME, kind, path.split(".")
+    node = Nodetype.NAME
+    detail = kind
+    parts = path.split(".")
     for part in parts:
         inner: dict[str, Any] = {}
         if node == Nodetype.NAME:
@@ -176,7 +182,9 @@ def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any
 def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arrays:
     columns: dict[str, array[Any]] = {}
     takers: dict[str, list[tuple[Callable[[Any], None], Callable[[Any], Any]]]] = {}
-    counts, keys, wanted = {}, {}, []
+    counts = {}
+    keys = {}
+    wanted = []
     for name, kind, paths in topics:
         getters = {f"{name}.{path}": _getter(types, name, kind, path) for path in paths}
         if dict(types.fielddefs[kind][1]).get("header") == (Nodetype.NAME, "std_msgs/msg/Header"):
@@ -248,7 +256,8 @@ def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) ->
 
 def _definitions(connection: Connection) -> Mapping[str, Any]:
     """Types as the bag itself defines them, parsed only."""
-    form, text = connection.msgdef.format, connection.msgdef.data
+    form = connection.msgdef.format
+    text = connection.msgdef.data
     if form == MessageDefinitionFormat.NONE:
         return {}
     if form == MessageDefinitionFormat.MSG:

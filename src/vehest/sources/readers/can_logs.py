@@ -33,7 +33,10 @@ def read_frames(
         if wanted is None
         else {(int(identifier), bool(extended)) for identifier, extended in wanted}
     )
-    times, identifiers, buses, data = array("d"), array("L"), array("L"), bytearray()
+    times = array("d")
+    identifiers = array("L")
+    buses = array("L")
+    data = bytearray()
     flags = {name: bytearray() for name in ("extended", "fd", "fast", "length")}
     numbers: dict[Any, int] = {}
     count = 0

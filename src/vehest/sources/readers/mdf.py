@@ -24,7 +24,8 @@ from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
-FINISHED, UNFINISHED = b"MDF     ", b"UnFinMF "
+FINISHED = b"MDF     "
+UNFINISHED = b"UnFinMF "
 EVALUATED = {
     v2_v3_blocks.ChannelConversion: {
         v3.CONVERSION_TYPE_FORMULA,
@@ -123,7 +124,8 @@ def with_signals(
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
-        measurement, new = asammdf.MDF(io.BytesIO(stream.read()), **OPTIONS), io.BytesIO()
+        measurement = asammdf.MDF(io.BytesIO(stream.read()), **OPTIONS)
+        new = io.BytesIO()
         if measurement.version < "4":
             raise DataError(
                 f"'{file}' is of MDF {measurement.version}, which gets no channels; write a .mat file, or save the log as MDF 4"
@@ -180,7 +182,8 @@ def _refuse_formulas(measurement: Any, file: Path) -> None:
 
 
 def _conversions(conversion: Any) -> Iterator[Any]:
-    waiting, seen = [conversion], set()
+    waiting = [conversion]
+    seen = set()
     while waiting:
         found = waiting.pop()
         if type(found) in EVALUATED and id(found) not in seen:
@@ -321,7 +324,8 @@ def _group_of(
 
 def _require_number(measurement: Any, group: int, index: int, where: str) -> None:
     described = measurement.groups[group]
-    channel, dependencies = described.channels[index], described.channel_dependencies[index]
+    channel = described.channels[index]
+    dependencies = described.channel_dependencies[index]
     if dependencies:
         raise DataError(
             f"{where} holds an array or structure; numbers are needed: name another signal"

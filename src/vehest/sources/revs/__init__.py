@@ -100,7 +100,9 @@ class RevsSource(FileSource):
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
-        files, path, options = self._files_of(recording_id), self._path(recording_id), self.options
+        files = self._files_of(recording_id)
+        path = self._path(recording_id)
+        options = self.options
         own, origin = (
             self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
         )

@@ -31,7 +31,8 @@ def read_csv(
     In the units of the file, with these units and the provenance: lines about the drive, of which there are ``preamble_lines`` above the
     names, and rows dropped at the head. Raises `DataError`: a column or cell cannot be read.
     """
-    time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
+    time = columns[0]
+    head = read_head(file).split(b"\n")[: preamble_lines + 2]
     lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
     names, units = (
         [cell.strip() for cell in next(csv.reader(line.splitlines()), [])]

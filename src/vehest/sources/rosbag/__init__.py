@@ -91,7 +91,8 @@ class RosbagSource(FileSource):
         wanted = [
             [topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()
         ]
-        most_bytes, layouts = int(1e9 * self.options.unpacked_limit), self.options.messages or {}
+        most_bytes = int(1e9 * self.options.unpacked_limit)
+        layouts = self.options.messages or {}
         reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)
         series = {
             name: self._series(topic, self.fields[name], reading, file)
@@ -104,7 +105,8 @@ class RosbagSource(FileSource):
         grid = ticks_within(*common_span(spans, f"'{file}'"), self.options.rate_hz, f"'{file}'")
         channels = {}
         for name, one in self.channels.items():
-            held, values = series[one.topic], series[one.topic].fields[one.field]
+            held = series[one.topic]
+            values = series[one.topic].fields[one.field]
             values = self.columns[name].to_si(
                 values - one.offset if one.offset else values, channel(name).unit
             )
@@ -140,11 +142,10 @@ class RosbagSource(FileSource):
 
     def _series(self, topic: Topic, fields: Iterable[str], reading: Reading, path: Path) -> Series:
         """One topic's samples with their times, in seconds after the bag's first message."""
-        where, name = f"'{path}': topic '{topic.topic}'", topic.topic
-        received, stamped = (
-            reading.arrays[f"{name}@received"],
-            reading.arrays.get(f"{name}@stamped"),
-        )
+        where = f"'{path}': topic '{topic.topic}'"
+        name = topic.topic
+        received = reading.arrays[f"{name}@received"]
+        stamped = reading.arrays.get(f"{name}@stamped")
         if topic.stamps == "header" and stamped is None:
             raise ConfigurationError(
                 f"{where}: messages of type '{topic.type}' have no header; set stamps: received"
@@ -207,7 +208,8 @@ class RosbagSource(FileSource):
         where = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
         plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, where)
-        times, rate_hz = series.times, series.rate_hz
+        times = series.times
+        rate_hz = series.rate_hz
         if rate_hz is None:
             plane = np.stack([np.interp(grid, times, plane[:, axis]) for axis in (0, 1)], axis=1)
             times, yaw, rate_hz = grid, np.interp(grid, times, yaw), self.options.rate_hz

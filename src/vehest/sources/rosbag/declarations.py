@@ -78,7 +78,8 @@ class RosbagOptions:
     unpacked_limit: Positive = 8.0
 
     def __post_init__(self) -> None:
-        topics, channels = self.topics or {}, self.channels or {}
+        topics = self.topics or {}
+        channels = self.channels or {}
         names = [topic.topic for topic in topics.values()]
         if doubled := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"topics lists '{doubled[0]}' twice; name its channels under one")

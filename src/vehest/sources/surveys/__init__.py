@@ -25,7 +25,9 @@ from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
-MDF, BAGS, CAN = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip"), (".blf", ".asc", ".trc")
+MDF = (".mf4", ".mdf", ".dat")
+BAGS = (".db3", ".mcap", ".zip")
+CAN = (".blf", ".asc", ".trc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
 MOST_FIELDS = 60  # of a message
@@ -104,7 +106,9 @@ def _survey(path: Path) -> Log:
 def _survey_bag(path: Path) -> Log:
     """Numbers in messages of ROS's own types, each field with the times of its messages."""
     reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
-    arrays, topics, columns = reading.arrays, reading.summary["topics"], []
+    arrays = reading.arrays
+    topics = reading.summary["topics"]
+    columns = []
     times = {
         name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
         for name, *_ in topics
@@ -163,7 +167,8 @@ def _survey_vbo(file: Path) -> Log:
         RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, ""))
         for name, samples in wanted.items()
     )
-    clock, seconds = Stamps("time", "s", "clock time of the format"), log.seconds - log.seconds[0]
+    clock = Stamps("time", "s", "clock time of the format")
+    seconds = log.seconds - log.seconds[0]
     runs, options = between_pauses(seconds, float(np.median(np.diff(seconds))))
     runs.sort(key=lambda rows: rows.start - rows.stop)
     return Log(file, "vbo", columns, options, clock, seconds, tuple(runs), skipped)

@@ -43,22 +43,25 @@ def find_clock(
 
     With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's options by which runs begin.
     """
-    best, likely, step = None, -1, 0.0
+    best = None
+    likely = -1
+    step = 0.0
     for name, values in columns.items():
-        unit, named = (
-            SPELLINGS.get(units.get(name, "").strip().lower(), ""),
-            bool(NAMED.match(plain_name(name))),
-        )
+        unit = SPELLINGS.get(units.get(name, "").strip().lower(), "")
+        named = bool(NAMED.match(plain_name(name)))
         own = _step(values, named=named)
         counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
         if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
-            best, likely, step = stamps, 2 * bool(unit) + named, own
+            best = stamps
+            likely = 2 * bool(unit) + named
+            step = own
     n_rows = len(next(iter(columns.values())))
     if best is None:
         return None, None, (slice(0, n_rows),), {}
     values = columns[best.column]
-    steps, seconds = np.diff(values), (values - values[0]) * UNITS[best.unit]
+    steps = np.diff(values)
+    seconds = (values - values[0]) * UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)
     options: dict[str, Any] = {"runs": counted_by}
     if counted_by:
@@ -71,8 +74,10 @@ def find_clock(
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
     """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option ``max_gap``, if they pause."""
-    steps, longest = np.diff(seconds), float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
-    runs, pauses = stretches(steps < 0, len(seconds)), steps > longest
+    steps = np.diff(seconds)
+    longest = float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
+    runs = stretches(steps < 0, len(seconds))
+    pauses = steps > longest
     stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
     cut = (
         timed_runs(seconds, longest, restarts=True)

@@ -41,7 +41,8 @@ LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 WIDE = re.compile(
     r"[ぁ-ヿ一-鿿]{2}"
 )  # letters of Japanese, which accents in Windows-1252 make only one by one
-CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
+CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
+MOST_CONTROLS = 0.01
 MARKS = frozenset(
     {
         "-",
@@ -115,7 +116,9 @@ def survey_table(file: Path) -> Log:
     else:
         shape = shape_of(file)
         values, clocks, marks, skipped = _columns(file, shape)
-        units, always, usual = dict(shape.units), ("delimiter", "decimal"), asdict(TextLayout())
+        units = dict(shape.units)
+        always = ("delimiter", "decimal")
+        usual = asdict(TextLayout())
         options = {
             name: option
             for name, option in asdict(shape.layout).items()
@@ -152,7 +155,8 @@ def survey_table(file: Path) -> Log:
         for name, times in {**clocks, **named}.items()
         if stamps is None or name != stamps.column
     ]
-    options, beside = {**options, **cuts}, {stamps.column if stamps else None, cuts.get("runs")}
+    options = {**options, **cuts}
+    beside = {stamps.column if stamps else None, cuts.get("runs")}
     columns = [
         RawColumn(name, written[name], samples, {"column": name})
         for name, samples in values.items()
@@ -168,7 +172,8 @@ def survey_table(file: Path) -> Log:
 def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
-    back, same = int((steps < 0).sum()), int((steps == 0).sum())
+    back = int((steps < 0).sum())
+    same = int((steps == 0).sum())
     what = (
         f"goes backwards {back} times"
         if back

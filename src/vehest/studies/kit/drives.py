@@ -146,7 +146,8 @@ def band_blocks(
 ) -> list[Block]:
     """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands."""
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
-    rows, drawn = [], []
+    rows = []
+    drawn = []
     for name, (title, seed) in chosen.items():
         own = {
             metric: values_of(values, name, [seed], test_set, metric)[0]

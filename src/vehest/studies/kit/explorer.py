@@ -56,15 +56,19 @@ def explorer_of(
         for name in CHANNELS
         if all(name in part for part in parts) and not CHANNELS[name].is_reference
     ]
-    vx, vy_ref, step = measured("vx"), measured("vy_ref"), 1.0 / artefacts.protocol.rate_hz
+    vx = measured("vx")
+    vy_ref = measured("vy_ref")
+    step = 1.0 / artefacts.protocol.rate_hz
     columns: dict[str, FloatArray | None] = {
         "vx": vx,
         "vy": vy_ref,
         "ay": measured("ay") if "ay" in names else None,
     }
-    inputs, candidates = [], []
+    inputs = []
+    candidates = []
     for i, name in enumerate(names[:MOST_INPUTS]):
-        channel, values = CHANNELS[name], measured(name)
+        channel = CHANNELS[name]
+        values = measured(name)
         columns[f"input{i}"] = np.degrees(values) if channel.is_angular else values
         unit = (
             {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit

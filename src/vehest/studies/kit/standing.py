@@ -51,7 +51,8 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
 
 def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
     """The interval of a row with `standing_columns`: ``0.31 … 0.38``."""
-    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    low = row["rmse_sideslip_low"]
+    high = row["rmse_sideslip_high"]
     return f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
 
 
@@ -88,7 +89,8 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) 
 
 
 def _reasons(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    best, reasons = ranking.order[0], []
+    best = ranking.order[0]
+    reasons = []
     if best[0] in BASELINES:
         reasons.append("which is a baseline")
     level = [titles[name] for name in ranking.not_told_apart]

@@ -47,7 +47,8 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
 
     An error that is lower than the bound shows that the car itself tells what the bound does not know of.
     """
-    level, found = _level(artefacts, artefacts.split.tests[test_set]), []
+    level = _level(artefacts, artefacts.split.tests[test_set])
+    found = []
     if level < LITTLE_SIDESLIP:
         found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
     bound, error = (
@@ -88,7 +89,8 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
     """Tests whose reference is about as noisy as the lowest error is large, or whose inputs say little of v."""
-    runs, found = runs_of(artefacts), list[str]()
+    runs = runs_of(artefacts)
+    found = list[str]()
     for test_set, spans in artefacts.split.tests.items():
         error, noise, bound = (
             _lowest(runs, test_set, name)
@@ -114,11 +116,13 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
     """Where a test goes beyond what was learnt from, in lateral acceleration, sideslip or speed."""
     if not artefacts.split.train:
         return []
-    learnt, found = _reference(artefacts, artefacts.split.train), []
+    learnt = _reference(artefacts, artefacts.split.train)
+    found = []
     words = {"ay": "lateral acceleration", "sideslip": "sideslip", "vx": "speed"}
     for test_set, spans in artefacts.split.tests.items():
         tested = _reference(artefacts, spans)
-        beyond, short = [], []
+        beyond = []
+        short = []
         for name, word in words.items():
             if not (name in tested and name in learnt):
                 continue
@@ -144,7 +148,8 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
-    runs, found = runs_of(artefacts), list[str]()
+    runs = runs_of(artefacts)
+    found = list[str]()
     for name, models in by_name(artefacts.models).items():
         ended = 0
         for model in models:
