@@ -11,6 +11,7 @@ import numpy as np
 from c_build import method_files, write
 from exports import LARGEST, WEIGHTS, model
 
+from vehest.data.channels import CHANNELS
 from vehest.export.program import program_files
 from vehest.trust.bands import Bands, Quantity
 from vehest.trust.contract import GuardedStepper
@@ -65,7 +66,7 @@ def trust_by_hand():
         limits=tuple(4.0 + 0.25 * number for number in range(22)),
     )
     own = {
-        name: ChannelLimits(-size, size, size / 4.0, 0.5)
+        name: ChannelLimits(max(-size, CHANNELS[name].low), size, size / 4.0, 0.5)
         for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)
     }
     v, angle = (

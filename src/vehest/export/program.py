@@ -31,11 +31,10 @@ from vehest.export.rendering import (
     whole,
 )
 from vehest.trust import bands as band_rules
-from vehest.trust import health_kernel, verdict, watch
+from vehest.trust import clock, health_kernel, verdict, watch
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.front_end import CUTOFF, FrontEnd
 from vehest.trust.guard import (
-    BRIDGED_SECONDS,
     ENDLESS,
     STANDSTILL_SPEED,
     STANDSTILL_YAW_RATE,
@@ -169,6 +168,8 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "remembering": math.exp(-interval / watch.REMEMBERED_SECONDS),
         "fading": math.exp(-interval / watch.FADE_SECONDS),
         "w": vars(watch),
+        "clock": stepper._clock,
+        "clock_rules": vars(clock),
         "verdict": vars(verdict),
         "k": vars(health_kernel),
         "h": health,
@@ -180,7 +181,6 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "starts_anew": monitor._starts_anew,
         "rollback": monitor._rollback,
         "bands": band_table(stepper),
-        "most_bridged": math.ceil(BRIDGED_SECONDS * stepper._rate) + 1,
         "pi": math.pi,
     }
 

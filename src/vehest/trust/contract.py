@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -29,9 +28,9 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, Stepper
+from vehest.trust.clock import REPEATED, STOPPED, SampleClock
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import (
-    BRIDGED_SECONDS,
     RESTART,
     USE,
     WAIT,
@@ -40,7 +39,7 @@ from vehest.trust.guard import (
     GuardLimits,
     usual_limits,
 )
-from vehest.trust.health import Health
+from vehest.trust.health import INVALID, Health
 from vehest.trust.record import Trust
 from vehest.trust.verdict import Monitor, starts_anew
 from vehest.trust.watch import Watch, Watched
@@ -50,9 +49,6 @@ FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, Val
 
 NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
 MOTION = ("vx", "yaw_rate", "ay")
-RATE_INTERVALS = 20
-RATE_TOLERANCE = 0.2
-"""Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
@@ -370,7 +366,7 @@ class GuardedStepper(Stepper):
         self._places = [
             estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
         ]
-        self._clock = _Clock(self._rate)
+        self._clock = SampleClock(self._rate)
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
@@ -385,19 +381,30 @@ class GuardedStepper(Stepper):
 
         Args:
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
-            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged; what is no number counts as unknown.
+            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged. While stamps stand still, go back, jump
+                or are uneven, the estimate is invalid (docs/trust.md, Clocks). None, or no number: the sample is the next one at the rate.
 
         Returns:
             ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
             ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
-        if isinstance(time, Real):
-            skipped = self._clock.skipped(time)
-            if skipped < 0:
-                return self.last
-            for _ in range(min(skipped, math.ceil(BRIDGED_SECONDS * self._rate) + 1)):
+        if not isinstance(time, Real):
+            self._clock.unstamped()
+            return self._received(sample)
+        try:
+            missing = self._clock.missing_before(float(time))
+        except OverflowError:  # a whole number beyond every float
+            missing = self._clock.missing_before(math.inf)
+        if missing == STOPPED:
+            self._received(None)
+        elif missing != REPEATED:
+            for _ in range(missing):
                 self._received(None)
-        return self._received(sample)
+            self._received(sample)
+        reason = 10_000.0 * self._clock.fault
+        if reason and self.last.get("health_reason") != reason:  # between two estimates
+            self.last = {**self.last, "health": float(INVALID), "health_reason": reason}
+        return self.last
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
         row: FloatArray | None = self._row
@@ -418,6 +425,9 @@ class GuardedStepper(Stepper):
     def _stepped(self, row: FloatArray) -> dict[str, float]:
         cleaned = self._guard(row)
         verdict = self._monitor.before(row, cleaned)
+        if self._clock.fault:
+            verdict.status[0] = INVALID
+            verdict.reason[0] = self._clock.fault * 10_000
         self._raw[0], vx, self._variance[0], failed = self._estimated(cleaned)
         motion = self._motion
         flow = cleaned.flow[0]
@@ -467,36 +477,3 @@ class GuardedStepper(Stepper):
             name: value for name, value in found.items() if name not in ("vy", "vy_variance")
         }
         return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan), False
-
-
-class _Clock:
-    """Times of samples: finds repeated and missing ones, and warns once of another rate."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._rate = rate_hz
-        self._last = math.nan
-        self._gaps: list[float] = []
-
-    def skipped(self, time: float) -> int:
-        """Samples that are missing before this one; -1 if it is a repeated one."""
-        gap = time - self._last
-        if len(self._gaps) < RATE_INTERVALS and not math.isnan(gap):
-            self._note(gap)
-        if -1.0 < gap <= 0.5 / self._rate:
-            return -1
-        self._last = time
-        return max(round(gap * self._rate) - 1, 0) if 0.0 < gap < math.inf else 0
-
-    def _note(self, gap: float) -> None:
-        self._gaps.append(gap)
-        middle = float(np.median(self._gaps))
-        if (
-            len(self._gaps) == RATE_INTERVALS
-            and middle > 0
-            and abs(middle * self._rate - 1.0) > RATE_TOLERANCE
-        ):
-            found = f"{1.0 / middle:.3g}"
-            warnings.warn(
-                f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}",
-                stacklevel=4,
-            )

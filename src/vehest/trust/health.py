@@ -25,6 +25,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
+from vehest.trust.clock import CLOCK_JUMPED, CLOCK_STOPPED, CLOCK_UNEVEN
 from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, longest_run, stops_of
 from vehest.trust.health_kernel import N_LEVELS, Layout, Model, State, health_kernel
@@ -113,6 +114,9 @@ REASONS: dict[int, tuple[str, float]] = {
     NO_ESTIMATE: ("there is no estimate", 0.0),
     BEYOND_SPEED: ("the estimate exceeds what the speed allows", 0.0),
     TOO_WIDE: ("the band of sideslip exceeds 6 degrees", 0.0),
+    CLOCK_STOPPED: ("the time stamps do not advance", 0.0),
+    CLOCK_JUMPED: ("the time stamps jump, or all samples are missing", 0.0),
+    CLOCK_UNEVEN: ("the time stamps are uneven, or come at another rate", 0.0),
 }
 """Kind of a reason -> text, and priority over others: the most specific is given.
 

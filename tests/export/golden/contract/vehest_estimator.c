@@ -55,7 +55,7 @@ static const bool SKIPPABLE[C] = { false, false, false }; /* channels that the m
 
 /* Limits at the method's rate. */
 static const guard_limits LIMITS[C] = {
-    { -120.0f, 120.0f, 30.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 50U }, /* vx */
+    { -40.0f, 120.0f, 30.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 50U }, /* vx */
     { -4.0f, 4.0f, 1.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 50U }, /* yaw_rate */
     { -40.0f, 40.0f, 10.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 50U }, /* ay */
 };
@@ -64,7 +64,7 @@ static const guard_limits LIMITS[C] = {
 
 /* Limits at the bus's rate. */
 static const guard_limits BUS_LIMITS[C] = {
-    { -120.0f, 120.0f, 30.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 250U }, /* vx */
+    { -40.0f, 120.0f, 30.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 250U }, /* vx */
     { -4.0f, 4.0f, 1.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 250U }, /* yaw_rate */
     { -40.0f, 40.0f, 10.0f, -VEHEST_INFINITY, VEHEST_INFINITY, 250U }, /* ay */
 };
@@ -243,6 +243,122 @@ static bool front_end_step(vehest_front_end *front, vehest_real row[C])
         front->phase -= PHASE_OF;
     }
     return due;
+}
+
+/* Clock: which samples repeat, which are missing, whether time stamps can be trusted (vehest.trust.clock).
+ * While the clock stands still the calls measure time, at the input rate.
+ */
+
+#define FAULT_CALLS 100U /* of stamps that do not advance or are uneven, after which the clock is not trusted */
+#define RECOVERY_CALLS 500U /* of even stamps, after which it is trusted again */
+#define MAX_MISSING 251 /* missing samples that are replaced; longer gaps end all that is known, too */
+#define CLOCK_STOPPED 33
+#define CLOCK_JUMPED 34
+#define CLOCK_UNEVEN 35
+#define REPEATED (-1) /* the sample is not new: pass it over */
+#define STOPPED (-2) /* the sample is not new: count it as missing */
+
+static void clock_start(vehest_clock *clock)
+{
+    clock->last = (double)NAN;
+    clock->previous = (double)NAN;
+    clock->stalled = 0U;
+    clock->uneven = 0U;
+    clock->recovering = 0U;
+    clock->fault = 0;
+}
+
+static void clock_suspect(vehest_clock *clock, int32_t fault)
+{
+    clock->fault = fault;
+    clock->recovering = RECOVERY_CALLS;
+}
+
+static void clock_recover(vehest_clock *clock)
+{
+    clock->uneven -= (clock->uneven > 0U) ? 1U : 0U;
+    clock->recovering -= (clock->recovering > 0U) ? 1U : 0U;
+    if (clock->recovering == 0U) {
+        clock->fault = 0;
+    }
+}
+
+static void clock_count_uneven(vehest_clock *clock)
+{
+    clock->uneven += (clock->uneven < FAULT_CALLS) ? 1U : 0U;
+    if (clock->uneven == FAULT_CALLS) {
+        clock_suspect(clock, CLOCK_UNEVEN);
+    }
+}
+
+/* Count a sample whose time is not known as the next one at the input rate. */
+static void clock_assume_next(vehest_clock *clock)
+{
+    clock->last += (double)1.0f / (double)VEHEST_INPUT_RATE_HZ;
+    clock->previous = clock->last;
+}
+
+static void clock_unstamped(vehest_clock *clock)
+{
+    clock_assume_next(clock);
+    clock_recover(clock);
+}
+
+/* Take a stamp that is a number after others [s]. */
+static int32_t clock_compare(vehest_clock *clock, double time)
+{
+    const double gap = time - clock->last;
+    const double interval = (time - clock->previous) * (double)VEHEST_INPUT_RATE_HZ;
+    const bool is_reset = (gap <= -(double)1.0f);
+    const bool advances = (gap > ((double)0.5f / (double)VEHEST_INPUT_RATE_HZ));
+    const bool is_even = advances && (interval >= (double)0.6f) && (interval <= (double)1.6f);
+    int32_t missing = 0;
+    clock->previous = time;
+    if (advances) {
+        const double before = rint(gap * (double)VEHEST_INPUT_RATE_HZ) - (double)1.0f; /* this one */
+        missing = (before < (double)MAX_MISSING) ? (int32_t)before : MAX_MISSING;
+        missing = (missing > 0) ? missing : 0;
+    }
+    if (advances || is_reset) {
+        clock->stalled = 0U;
+    } else {
+        clock->stalled += (clock->stalled < FAULT_CALLS) ? 1U : 0U;
+    }
+    if (is_even) {
+        clock_recover(clock);
+    } else if ((interval < (double)0.0f) || (interval > (double)0.0f)) { /* the same stamp again is a repeated sample */
+        clock_count_uneven(clock);
+    } else {
+        /* nothing speaks for or against it */
+    }
+    if (is_reset || (missing == MAX_MISSING)) {
+        clock_suspect(clock, CLOCK_JUMPED);
+    }
+    if (clock->stalled == FAULT_CALLS) {
+        clock_suspect(clock, CLOCK_STOPPED);
+        missing = STOPPED;
+    } else if (advances || is_reset) {
+        clock->last = time;
+    } else {
+        missing = REPEATED;
+    }
+    return missing;
+}
+
+/* Take the stamp of a sample [s]; returns how many are missing before it, REPEATED or STOPPED. */
+static int32_t clock_missing_before(vehest_clock *clock, double time)
+{
+    int32_t missing = 0;
+    if (!(fabs(time) < (double)INFINITY)) { /* true for NaN */
+        clock_assume_next(clock);
+        clock_count_uneven(clock);
+    } else if (clock->last < (double)INFINITY) { /* false for NaN, before the first stamp */
+        missing = clock_compare(clock, time);
+    } else {
+        clock->last = time;
+        clock->previous = time;
+    }
+    return missing;
 }
 
 /* Watch: bound, bridge and judge what the method says (vehest.trust.watch). */
@@ -488,6 +604,10 @@ static void step_row(vehest_state *state, const vehest_real row[C])
     guard_step(&state->guard, LIMITS, BRIDGED, PERSISTS, true, row, &sample);
     estimate->health = vehest_health_step(&state->health, row, cleaned->measured, &estimate->reason);
     isolate(state, estimate->health, estimate->reason, &sample);
+    if (state->clock.fault != 0) {
+        estimate->health = VEHEST_INVALID;
+        estimate->reason = state->clock.fault * 10000;
+    }
     failed = run_method(state, cleaned, &output);
     vx = ((cleaned->flow != WAIT) || cleaned->measured[VEHEST_VX]) ? cleaned->row[VEHEST_VX] : VEHEST_NAN;
     vx = is_nan(vx) ? output.vx : vx;
@@ -541,7 +661,7 @@ void vehest_start(vehest_state *state)
     state->fresh = true;
     watch_start(&state->watch);
     state->vx = VEHEST_NAN;
-    state->last_time = (double)NAN;
+    clock_start(&state->clock);
     state->last.vy = VEHEST_NAN;
     state->last.sideslip = VEHEST_NAN;
     state->last.vx = VEHEST_NAN;
@@ -553,7 +673,7 @@ void vehest_start(vehest_state *state)
     state->last.marks = 0U;
 }
 
-bool vehest_step(vehest_state *state, const vehest_sample *sample, vehest_estimate *estimate)
+static bool step_sample(vehest_state *state, const vehest_sample *sample, vehest_estimate *estimate)
 {
     vehest_real row[C];
     row[VEHEST_VX] = sample->vx;
@@ -562,7 +682,7 @@ bool vehest_step(vehest_state *state, const vehest_sample *sample, vehest_estima
     return step_received(state, row, estimate);
 }
 
-bool vehest_missing(vehest_state *state, vehest_estimate *estimate)
+static bool step_missing(vehest_state *state, vehest_estimate *estimate)
 {
     vehest_real row[C];
     for (int32_t c = 0; c < C; c++) {
@@ -571,26 +691,36 @@ bool vehest_missing(vehest_state *state, vehest_estimate *estimate)
     return step_received(state, row, estimate);
 }
 
-#define MOST_BRIDGED 251 /* missing samples that are stood for; longer gaps end all that is known, too */
+bool vehest_step(vehest_state *state, const vehest_sample *sample, vehest_estimate *estimate)
+{
+    clock_unstamped(&state->clock);
+    return step_sample(state, sample, estimate);
+}
+
+bool vehest_missing(vehest_state *state, vehest_estimate *estimate)
+{
+    clock_unstamped(&state->clock);
+    return step_missing(state, estimate);
+}
 
 bool vehest_step_at(vehest_state *state, double time, const vehest_sample *sample, vehest_estimate *estimate)
 {
-    const double gap = time - state->last_time; /* NaN at the first sample */
-    const bool repeated = (gap <= ((double)0.5f / (double)VEHEST_INPUT_RATE_HZ)) && (gap > -(double)1.0f);
+    const int32_t missing = clock_missing_before(&state->clock, time);
     bool due = false;
-    if (repeated) {
-        *estimate = state->last;
-    } else {
-        int32_t missing = 0;
-        if ((gap > (double)0.0f) && (gap < (double)INFINITY)) {
-            const double before = rint(gap * (double)VEHEST_INPUT_RATE_HZ) - (double)1.0f; /* this one */
-            missing = (before < (double)MOST_BRIDGED) ? (int32_t)before : MOST_BRIDGED;
-        }
-        state->last_time = time;
+    if (missing == STOPPED) {
+        due = step_missing(state, estimate);
+    } else if (missing != REPEATED) {
         for (int32_t n = 0; n < missing; n++) {
-            due = vehest_missing(state, estimate) || due;
+            due = step_missing(state, estimate) || due;
         }
-        due = vehest_step(state, sample, estimate) || due;
+        due = step_sample(state, sample, estimate) || due;
+    } else {
+        /* the last estimate again */
     }
+    if (state->clock.fault != 0) { /* between two estimates, too */
+        state->last.health = VEHEST_INVALID;
+        state->last.reason = state->clock.fault * 10000;
+    }
+    *estimate = state->last;
     return due;
 }

@@ -84,6 +84,15 @@ typedef struct {
 } vehest_watch;
 
 typedef struct {
+    double last; /* stamp of the last sample that was used [s]; NaN: none yet */
+    double previous; /* stamp of the last call [s] */
+    uint32_t stalled; /* calls since a stamp advanced */
+    uint32_t uneven; /* uneven intervals less even ones */
+    uint32_t recovering; /* even samples until the clock is trusted again */
+    int32_t fault; /* kind of reason why it is not trusted; 0 while it is */
+} vehest_clock;
+
+typedef struct {
     vehest_front_end front_end;
     vehest_guard guard;
     vehest_health health;
@@ -93,7 +102,7 @@ typedef struct {
     bool fresh; /* whether the method has seen nothing since its start */
     vehest_watch watch;
     vehest_real vx; /* last speed that was known [m/s]; NaN: none yet */
-    double last_time; /* of vehest_step_at [s]; NaN: none yet */
+    vehest_clock clock; /* of vehest_step_at */
     vehest_estimate last;
 } vehest_state;
 
@@ -110,7 +119,8 @@ bool vehest_step(vehest_state *state, const vehest_sample *sample, vehest_estima
 bool vehest_missing(vehest_state *state, vehest_estimate *estimate);
 
 /* The same by the sample's time [s], from any zero: repeated samples are passed over, missing ones bridged.
- * For buses without a fixed clock; use it for all samples of a drive or for none.
+ * For buses without a fixed clock. The estimate is VEHEST_INVALID where time stamps stand still, go back or are uneven
+ * for 0.2 s or jump, until they have been even for 1.0 s. While the clock stands still, calls measure time: call it once a sample.
  */
 bool vehest_step_at(vehest_state *state, double time, const vehest_sample *sample, vehest_estimate *estimate);
 
