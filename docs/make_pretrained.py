@@ -3,7 +3,7 @@
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
 stopped; bands of the filter from 30 other simulated cars and the development cars of ``make unseen_car``, which needs VEHEST_DATA.
-``--trust`` makes them anew for the models as they are.
+``--trust`` makes them anew for the models as they are, ``--digest`` only writes into trust.yaml which model it belongs to.
 """
 
 from __future__ import annotations
@@ -19,7 +19,12 @@ from make_unseen_car import CARS, drives_of
 
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import load_model, read_description, save_model
+from vehest.estimators.model_files import (
+    load_model,
+    model_digest,
+    read_description,
+    save_model,
+)
 from vehest.estimators.registry import estimator_class
 from vehest.report.style import fixed
 from vehest.run.calibrate import Stretch, learn_trust, plan_calibrate
@@ -127,7 +132,7 @@ def write_its_trust(step: str, output: Path) -> None:
         raise SystemExit(f"split '{split.name}' has no validation range")
     job[1](TARGET)
     write_trust(
-        replace(read_trust(TARGET), guard=None), TARGET
+        replace(read_trust(TARGET), guard=None), TARGET, model_digest(TARGET)
     )  # samples are held to what any car's sensors do, not to simulated ones
 
 
@@ -154,7 +159,8 @@ def write_filter(output: Path) -> None:
     if trust.bands is None:
         raise SystemExit(f"no bands: {trust.about.note}")
     bands = replace(trust.bands, vehicles=())  # of many cars, so that they hold for the next one
-    write_trust(replace(trust, bands=bands, guard=None, health=health), FILTER)
+    trust = replace(trust, bands=bands, guard=None, health=health)
+    write_trust(trust, FILTER, model_digest(FILTER))
 
 
 def development_drives(output: Path) -> list[Stretch]:
@@ -171,8 +177,12 @@ def development_drives(output: Path) -> list[Stretch]:
 
 def main() -> None:
     """Command line."""
-    if sys.argv[1:] not in ([], ["--trust"]):
+    if sys.argv[1:] not in ([], ["--trust"], ["--digest"]):
         sys.exit(__doc__)
+    if "--digest" in sys.argv:
+        for folder in (TARGET, FILTER):
+            write_trust(read_trust(folder), folder, model_digest(folder))
+        return
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
     row = chosen_step()
     if "--trust" not in sys.argv:

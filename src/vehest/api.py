@@ -24,6 +24,7 @@ from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span
 from vehest.estimators.base import Estimator as Estimator
 from vehest.estimators.base import FitData
+from vehest.estimators.model_files import model_digest
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.evaluation import metrics
 from vehest.run.calibrate import Stretch, learn_trust
@@ -157,7 +158,7 @@ def save_model(model: Estimator, folder: str | Path) -> None:
             {"n_parameters": model.n_parameters, "downsample": dict(model.preparation)},
         )
         if model in _TRUST:
-            write_trust(_TRUST[model], aside)
+            write_trust(_TRUST[model], aside, model_digest(aside))
 
 
 def read_recording(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
-from vehest.data.files import as_os_error, regular_file
+from vehest.data.files import as_os_error, regular_file, sha256_of
 from vehest.data.schema import FURTHER_KEYS, check_format, validated
 from vehest.data.text_files import first_line, read_yaml
 from vehest.data.transforms import Preparation
@@ -128,6 +130,23 @@ def read_description(folder: Path) -> Description:
     check_format(content["format"], FORMAT, f"'{path}'")
     described = validated(Description, content, f"'{path}'")
     return replace(described, settings=content["settings"])
+
+
+def model_digest(folder: Path) -> str:
+    """SHA-256 of what determines a model's estimates: its weights, and of its description all but words for people.
+
+    Raises `MissingError` or `DataError`: a file is missing or damaged.
+    """
+    described = read_description(folder)
+    content = {
+        "estimator": described.estimator,
+        "version": described.version,
+        "settings": described.settings,
+        "channels": described.channels,
+        "downsample": asdict(described.about.downsample),
+        "weights": sha256_of(regular_file(folder / WEIGHTS)),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _built(

@@ -7,6 +7,8 @@ A calibration knows no evaluation's protocol, and no test range.
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,7 +22,13 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import load_model, read_description
+from vehest.estimators.model_files import (
+    DESCRIPTION,
+    WEIGHTS,
+    load_model,
+    model_digest,
+    read_description,
+)
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
 from vehest.run.train import file_digest, recording_file
 from vehest.run.versions import code_of
@@ -174,12 +182,28 @@ def calibration_figures(folder: Path) -> dict[str, float]:
     }
 
 
-def trust_of(model_folder: Path, output: Path) -> Trust | None:
-    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root or in ``output``."""
-    if (model_folder / TRUST).is_file():
-        return read_trust(model_folder)
-    found = calibration_of(model_folder, output)
-    return None if found is None else read_trust(found.folder)
+def trust_of(
+    model_folder: Path, output: Path, say: Callable[[str], None] = warnings.warn
+) -> Trust | None:
+    """Bands, limits and health of a model.
+
+    They are in trust.yaml in its folder, else in its calibration in its own output root or in
+    ``output``. A file in its folder that names no model is read with a remark to ``say``.
+    Raises `DataError`: the file is damaged, or names another model.
+    """
+    path = model_folder / TRUST
+    if not os.path.lexists(path):
+        calibration = calibration_of(model_folder, output)
+        return None if calibration is None else read_trust(calibration.folder)
+    trust = read_trust(model_folder)
+    if not trust.about.model:
+        say(f"'{path}' does not say which model it belongs to; it is assumed to be this one")
+    elif trust.about.model != model_digest(model_folder):
+        raise DataError(
+            f"'{path}' belongs to another model, or {WEIGHTS} or {DESCRIPTION} has been changed "
+            f"since; calibrate the model again, or remove {TRUST}"
+        )
+    return trust
 
 
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:

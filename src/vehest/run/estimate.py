@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -101,7 +100,10 @@ def open_model(
     folder = find_model(name, output, say)
     model = load_model(folder)
     model.preparation = preparation_of(folder)
-    return folder, model, trust_of(folder, output)
+    trust = trust_of(folder, output, say)
+    if trust is not None:
+        trust.check_fit(model)
+    return folder, model, trust
 
 
 def estimate_file(
@@ -157,12 +159,8 @@ def estimate_file(
                 remarks.append("there is no channel ax: estimator.measured_ax=false")
         if settings:
             model = with_settings(model, settings)
-            if (
-                trust is not None
-                and trust.health is not None
-                and trust.health.channels != model.channels
-            ):
-                trust = replace(trust, health=None)  # of a channel that is not measured
+            if trust is not None:
+                trust = trust.for_settings(model)
         if car is not None:
             model = calibrated(model, read_car(car))
         if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):

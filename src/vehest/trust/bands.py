@@ -32,6 +32,7 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.kernels.compiling import entry
+from vehest.trust.checks import check_channels, check_number, check_numbers
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)
 SHOWN_LEVEL = 0.9  # of the channels band_vy and band_sideslip
@@ -50,6 +51,9 @@ COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")
 TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
 """Terms of s²: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over vx². ``variance`` is P."""
 
+MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
+MIN_TERM = 1e-30  # of the terms' sizes that are not 0
+MAX_TERM = 1e12  # of these and of weights
 _FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
 _HEAD = 5  # numbers before the weights in a `PackedBands`
 
@@ -71,13 +75,14 @@ class Quantity:
     effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
-        _check_terms("weights", self.weights)
+        _check_terms("weights", self.weights, 0.0)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
             raise DataError(
                 f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})"
             )
-        if not self.floor > 0 or min(self.factors) < 0:
-            raise DataError("factors must not be negative, and floor must be positive")
+        check_numbers("factors", self.factors, 0.0, MAX_FACTOR)
+        check_number("floor", self.floor, math.ulp(0.0), MAX_FACTOR)
+        check_number("effective_blocks", self.effective_blocks, 0.0)
 
     def beside(self, level: float) -> FloatArray:
         """Half widths of all `LEVELS` over that of one, (L,)."""
@@ -106,7 +111,11 @@ class Bands:
     sideslip: Quantity  # the band of β
 
     def __post_init__(self) -> None:
-        _check_terms("largest", self.largest)
+        check_channels("bands.channels", self.channels)
+        _check_terms("largest", self.largest, MIN_TERM)
+        check_number("bands.n_blocks", self.n_blocks, 0)
+        check_number("bands.seconds", self.seconds, 0.0)
+        check_number("bands.horizon_steps", self.horizon_steps, 0)
 
     def are_of(self, vehicle: str) -> bool:
         """Whether they were calibrated on a vehicle."""
@@ -137,9 +146,12 @@ class Bands:
         return bands
 
 
-def _check_terms(what: str, numbers: Mapping[str, float]) -> None:
-    if not numbers.keys() <= set(TERMS) or min(numbers.values(), default=0.0) < 0:
+def _check_terms(what: str, numbers: Mapping[str, float], smallest: float) -> None:
+    if not numbers.keys() <= set(TERMS):
         raise DataError(f"{what} must be numbers from 0 on, of: {', '.join(TERMS)}")
+    for name, number in numbers.items():
+        if number != 0.0:
+            check_number(f"{what}.{name}", number, smallest, MAX_TERM)
 
 
 class PackedBands(NamedTuple):

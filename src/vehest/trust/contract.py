@@ -52,7 +52,9 @@ MOTION = ("vx", "yaw_rate", "ay")
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits learnt with an estimator, or those of any car."""
+    """The limits learnt with an estimator, or those of any car; `DataError` where ``trust`` was learnt with another one."""
+    if trust is not None:
+        trust.check_fit(estimator)
     own = trust.guard if trust is not None else None
     return own or usual_limits(estimator.channels, estimator.settings.rate_hz)
 

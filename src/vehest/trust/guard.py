@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
 from vehest.estimators.kernels.compiling import entry
+from vehest.trust.checks import check_channels, check_number
 
 BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
 PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is accepted
@@ -46,6 +48,10 @@ STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steerin
 
 ENDLESS = 1e300  # stops of channels that have none
 
+MAX_TOP_SPEED = MARGIN * CHANNELS["vx"].high  # [m/s] that can be learnt
+TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
+MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that can be learnt
+
 STANDSTILL_SPEED = 0.5
 STANDSTILL_YAW_RATE = 0.05  # m/s, rad/s: below both, nothing is expected to move
 
@@ -67,6 +73,14 @@ class ChannelLimits:
         ENDLESS,
     )  # between which alone it is expected to move [unit]
 
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise DataError(f"low must be below high, not {self.low:.4g} and {self.high:.4g}")
+        check_number("jump", self.jump, math.ulp(0.0))
+        check_number("run", self.run, 0.0)
+        if not self.stops[0] <= self.stops[1]:
+            raise DataError(f"stops must rise, not {self.stops[0]:.4g} and {self.stops[1]:.4g}")
+
 
 @dataclass(frozen=True)
 class GuardLimits:
@@ -77,6 +91,18 @@ class GuardLimits:
     largest_tan_sideslip: float = (
         1.0  # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
     )
+
+    def __post_init__(self) -> None:
+        check_channels("guard.channels", list(self.channels))
+        for name, limits in self.channels.items():
+            table = CHANNELS[name]
+            if limits.low < table.low or limits.high > table.high:
+                raise DataError(
+                    f"guard.channels.{name}: {limits.low:.4g} to {limits.high:.4g} {table.unit} is "
+                    f"wider than the channel's own range, {table.low:g} to {table.high:g}"
+                )
+        check_number("guard.top_speed", self.top_speed, math.ulp(0.0), MAX_TOP_SPEED)
+        check_number("guard.largest_tan_sideslip", self.largest_tan_sideslip, 1.0, MAX_TAN_SIDESLIP)
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
@@ -118,7 +144,7 @@ def learn_limits(
     )
     tangents = _largest([_tan_sideslip(recording) for recording in recordings])
     return GuardLimits(
-        found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, 1.2 * tangents)
+        found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, TAN_MARGIN * tangents)
     )
 
 

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
+from vehest.trust.checks import check_channels, check_number, check_numbers, check_shape
 from vehest.trust.clock import CLOCK_JUMPED, CLOCK_STOPPED, CLOCK_UNEVEN
 from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, longest_run, stops_of
@@ -36,6 +37,7 @@ from vehest.trust.relations import (
     Relation,
     learn_relations,
     least_speed_of,
+    relations_among,
     residuals_of,
     speed_channel,
     without_glitches,
@@ -202,6 +204,59 @@ class HealthModel:
             object.__setattr__(
                 self, name, _present_limits(getattr(self, name), channels, relations)
             )
+        self._check_shapes()
+        self._check_ranges()
+
+    def _check_shapes(self) -> None:
+        """Raise `DataError` unless everything has the length that the kernel's arrays have."""
+        check_channels("health.channels", self.channels)
+        channels = len(self.channels)
+        for name in ("constant", "deviation", "usual", "largest", "longest_gap"):
+            check_shape(f"health.{name}", getattr(self, name), channels)
+        check_number("health: the order of coefficients", len(self.coefficients), 1, MAX_ORDER)
+        order = len(self.coefficients)
+        check_shape("health.coefficients", self.coefficients, order, channels, channels)
+        check_shape("health.precision", self.precision, channels, channels)
+        check_shape("health.speeds", self.speeds, N_LEVELS)
+        check_shape("health.levels", self.levels, N_LEVELS, channels)
+        for name in ("healthy", "heaviest"):
+            check_shape(f"health.{name}", getattr(self, name), len(getattr(self, name)), channels)
+        if self.stops and len(self.stops) != channels:
+            raise DataError(f"health.stops has {len(self.stops)} entries, not {channels}")
+        allowed = relations_among(self.channels)
+        pairs = {(target, partner) for target, partner, _, _ in allowed}
+        for relation in self.relations:
+            if (relation.target, relation.partner) not in pairs:
+                raise DataError(
+                    f"health.relations: there is none of '{relation.target[:40]}' against "
+                    f"'{relation.partner[:40]}' among its channels"
+                )
+        if len(self.relations) > len(allowed):
+            raise DataError(f"health.relations has {len(self.relations)} entries of {len(allowed)}")
+        for name in ("limits", "limits_behind_front_end"):
+            limits = getattr(self, name)
+            if limits and len(limits) != len(self.statistics):
+                raise DataError(
+                    f"health.{name} has {len(limits)} entries, not {len(self.statistics)}"
+                )
+
+    def _check_ranges(self) -> None:
+        """Raise `DataError` unless numbers can be what training leaves behind."""
+        check_number("health.rate_hz", self.rate_hz, math.ulp(0.0), HIGHEST_RATE)
+        for name in ("deviation", "largest", "longest_gap", "spin", "speeds"):
+            check_numbers(f"health.{name}", getattr(self, name), 0.0)
+        check_numbers("health.standstill", self.standstill, 0.0)
+        check_number("health.standstill", self.standstill[0], math.ulp(0.0))
+        for row in self.levels:
+            check_numbers("health.levels", row, math.ulp(0.0))
+        check_numbers("health.precision", np.diag(np.array(self.precision)), 0.0)
+        for row in self.heaviest:
+            check_numbers("health.heaviest", row, 0.0)
+        for name in ("limits", "limits_behind_front_end"):
+            check_numbers(f"health.{name}", getattr(self, name), math.ulp(0.0), ENDLESS)
+        for lower, upper in self.stops:
+            if not lower <= upper:
+                raise DataError(f"health.stops must rise, not {lower:.4g} and {upper:.4g}")
 
     @property
     def layout(self) -> Layout:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import yaml
@@ -12,6 +12,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_yaml
+from vehest.estimators.base import Estimator
 from vehest.trust.bands import Bands
 from vehest.trust.guard import GuardLimits
 from vehest.trust.health import HealthModel
@@ -27,6 +28,7 @@ class About:
     estimator: str  # name in the registry
     variant: str = ""  # what the paper calls it
     note: str = ""  # why something is missing, for people; empty where nothing is
+    model: str = ""  # digest of the model beside which it is kept; empty in a folder of its own
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,47 @@ class Trust:
     guard: GuardLimits | None = None  # limits of plausible samples
     health: HealthModel | None = None  # residuals and thresholds of the health flag
 
+    def check_fit(self, estimator: Estimator) -> None:
+        """Raise `DataError` unless this was learnt with an estimator of this family, channels, rate and horizon."""
+        expected = (estimator.name, tuple(estimator.channels), estimator.settings.rate_hz)
+        differences: list[tuple[str, object, object]] = [
+            ("about.estimator", self.about.estimator, expected[0])
+        ]
+        if self.bands is not None:
+            differences += [
+                ("bands.channels", self.bands.channels, expected[1]),
+                ("bands.horizon_steps", self.bands.horizon_steps, estimator.horizon_steps),
+            ]
+        if self.health is not None:
+            differences += [
+                ("health.channels", self.health.channels, expected[1]),
+                ("health.rate_hz", self.health.rate_hz, expected[2]),
+            ]
+        for name, value, needed in differences:
+            if value != needed:
+                raise DataError(
+                    f"{TRUST} belongs to another model: its {name} is {_shown(value)}, that of the "
+                    f"model is {_shown(needed)}; calibrate the model again, or remove {TRUST}"
+                )
+
+    def for_settings(self, estimator: Estimator) -> Trust:
+        """The parts that apply to the same model with other settings, by which it may read fewer channels.
+
+        Health is that of all channels together and is left out where these differ; a band counts
+        a channel that is not read as not measured.
+        """
+        channels = tuple(estimator.channels)
+        health = self.health
+        if health is not None and (health.channels, health.rate_hz) != (
+            channels,
+            estimator.settings.rate_hz,
+        ):
+            health = None
+        bands = self.bands
+        if bands is not None:
+            bands = replace(bands, channels=channels, horizon_steps=estimator.horizon_steps)
+        return replace(self, bands=bands, health=health)
+
 
 def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
@@ -46,16 +89,25 @@ def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     )
 
 
-def write_trust(trust: Trust, folder: Path) -> None:
-    """Write trust.yaml into an existing folder; raises `OSError` where it cannot be written."""
+def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
+    """Write trust.yaml into an existing folder; raises `OSError` where it cannot be written.
+
+    ``model`` is the digest of the model in the same folder (`model_digest`). Without it the file
+    names no model: the manifest of a calibration does.
+    """
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
+    del content["about"]["model"]
+    content["about"] |= {"model": model} if model else {}
     (folder / TRUST).write_text(
         yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8"
     )
 
 
 def read_trust(folder: Path) -> Trust:
-    """Read trust.yaml of a folder back; raises `MissingError` where there is none, `DataError` where it is damaged or of another format."""
+    """Read trust.yaml of a folder back.
+
+    Raises `MissingError`: there is none. Raises `DataError`: it is damaged, of another format, or something else than a file.
+    """
     path = folder / TRUST
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:
@@ -65,3 +117,9 @@ def read_trust(folder: Path) -> Trust:
         return validated(Trust, content, f"'{path}'")
     except DataError as error:
         raise DataError(str(error) if str(path) in str(error) else f"'{path}': {error}") from None
+
+
+def _shown(value: object) -> str:
+    """A value in a message, short."""
+    text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return text if len(text) <= 80 else f"{text[:80]} …"

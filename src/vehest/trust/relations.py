@@ -22,8 +22,10 @@ import numpy as np
 import scipy
 
 from vehest.constants import FloatArray
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.trust.health_kernel import SLIDE_SECONDS
+from vehest.trust.checks import check_shape
+from vehest.trust.health_kernel import INSTANT_FEATURES, SLIDE_SECONDS
 
 SPEEDS = (
     "vx",
@@ -92,6 +94,13 @@ class Relation:
         default_factory=dict
     )  # feature, or `RATE`, -> coefficient; the target's units over the feature's
     instant: bool = False  # whether it holds for each sample and not only on average
+
+    def __post_init__(self) -> None:
+        usable = (*(FEATURES[:INSTANT_FEATURES] if self.instant else FEATURES), RATE)
+        for name, coefficient in self.terms.items():
+            if name not in usable:
+                raise DataError(f"terms: '{name[:40]}' is not one of: {', '.join(usable)}")
+            check_shape(f"terms.{name}", coefficient)
 
     def involves(self, channel: str, speed: str | None) -> int:
         """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all; ``speed`` is the channel that u stands for."""
