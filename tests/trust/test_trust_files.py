@@ -11,6 +11,7 @@ from trust_mutations import PLACED, mutations, place
 from vehest.data.errors import VehestError
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import model_digest
+from vehest.run.car_record import with_settings
 from vehest.run.estimate import estimate_recording, open_model, pretrained_folder
 from vehest.trust.bands import MAX_FACTOR, MAX_TERM, MIN_TERM
 from vehest.trust.contract import GuardedStepper
@@ -159,3 +160,21 @@ def test_the_models_that_come_with_vehest_name_themselves(name):
     folder, _, trust = open_model(name, Path("nowhere"), remarks.append)
     assert remarks == []
     assert trust.about.model == model_digest(folder)
+
+
+def test_bands_of_a_filter_without_ax_count_it_as_not_measured():
+    """The columns of the bands are those of the channels that are read, also where a setting leaves one out."""
+    _, model, trust = open_model("self_calibrating", Path("nowhere"), lambda remark: None)
+    fewer = with_settings(model, {"measured_ax": False})
+    assert fewer.channels == ("yaw_rate", "vx", "ay")
+    with pytest.raises(VehestError, match="belongs to another model"):
+        GuardedStepper(fewer, trust)
+    fitted = trust.for_settings(fewer)
+    assert (fitted.bands.channels, fitted.health) == (fewer.channels, None)
+    row = np.array([[0.2, 20.0, 4.0]])
+    with_ax = np.array([[0.2, 20.0, 4.0, np.nan]])
+    estimate = np.ones(1)
+    np.testing.assert_array_equal(
+        fitted.bands.half_widths(row, estimate, estimate),
+        trust.bands.half_widths(with_ax, estimate, estimate),
+    )
