@@ -156,7 +156,9 @@ def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_fo
     )
     place, model, _ = evaluated
     write_trust(Trust(About("luenberger", note="mine")), model)
-    assert trust_of(model, place.folder / "outputs").about.note == "mine"
+    remarks = []
+    assert trust_of(model, place.folder / "outputs", remarks.append).about.note == "mine"
+    assert "does not say which model" in remarks[0]
     assert trust_of(tmp_path / "nothing", tmp_path) is None
 
 
