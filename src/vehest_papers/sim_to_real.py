@@ -346,7 +346,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         "lateral velocity.",
         "Ranges of training and validation are those with a yaw rate up to 1 rad/s, at 5 m/s or more, for 5 s or longer: a spin would move "
         "the last of a KS-NN's local models to where no car drives.",
-        f"{scoring(next(iter(artefacts.parts.values())).protocol)} FVU = var(v − v̂)/var(v).",
+        f"{scoring(next(iter(artefacts.parts.values())))} FVU = var(v − v̂)/var(v).",
         *_facts(artefacts),
     ]
     return [bullets("## How it was made", lines)]

@@ -1,6 +1,7 @@
 """Scores of bands, covariances, innovations, delays and misses of detections against closed forms and simulations."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +48,13 @@ def part_of(rng, seconds=100.0, deviation=0.1):
     angles = np.arctan2(vy + error, vx), np.arctan2(vy, vx)
     bands = {"vy": half, "sideslip": np.arctan2(half, vx)}
     return Scored(
-        np.arange(n) / 20.0, vy + error, vy, *angles, rng.uniform(0.0, 5.0, n), bands=bands
+        np.arange(n) / 20.0,
+        vy + error,
+        vy,
+        *angles,
+        rng.uniform(0.0, 5.0, n),
+        np.ones(n, dtype=bool),
+        bands=bands,
     )
 
 
@@ -142,6 +149,31 @@ def test_true_bands_cover_what_they_say():
     }
     low, high = intervals["coverage_90"]
     assert low < figures["coverage_90"] < high
+
+
+def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
+    """The second half stands still, with errors far outside of the bands."""
+    part = part_of(np.random.default_rng(3), seconds=800.0)
+    half = len(part.time) // 2
+    is_scored = np.arange(len(part.time)) < half
+    sideslip = np.where(is_scored, part.sideslip, 3.0)
+    stopping = replace(part, sideslip=sideslip, is_sideslip_scored=is_scored)
+    moving = replace(part.at(slice(half)), bands={q: b[:half] for q, b in part.bands.items()})
+    found = []
+    for own in (moving, stopping):
+        within = banded([own], BANDS)
+        figures = band_figures(within, [own], [None], 20.0)
+        found.append((figures, coverage_intervals(within, [own], 20.0)))
+    for name in ("coverage_90", "width_90", "interval_score", "crps"):
+        assert found[1][0][name] == pytest.approx(found[0][0][name], rel=1e-12)
+    assert found[1][0]["coverage_90"] == pytest.approx(0.9, abs=0.03)
+    assert found[1][1]["coverage_90"] == pytest.approx(found[0][1]["coverage_90"], rel=1e-12)
+    assert found[1][0]["width_90_vy"] == pytest.approx(2.0 * 0.1 * GAUSSIAN[2], rel=1e-12)
+    nothing = replace(part, is_sideslip_scored=np.zeros(len(part.time), dtype=bool))
+    within = banded([nothing], BANDS)
+    assert set(band_figures(within, [nothing], [None], 20.0)) == {
+        name for name in found[0][0] if name.endswith("_vy")
+    }
 
 
 def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():

@@ -1,6 +1,7 @@
 """Floors of a drive against closed forms, the information form of the bound, filters at work, and planted noise."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from vehest.data.splits import Span
 from vehest.evaluation import floors
 from vehest.evaluation.floors import (
     SETS,
+    Drive,
     Noise,
     cramer_rao_floor,
     drive_of,
@@ -304,3 +306,22 @@ def test_inputs_of_an_estimator_decide_which_bound_it_has_if_any():
     assert cramer_rao_floor(drives, SETS[1]) is None
     with pytest.raises(ValueError, match="inputs of a bound are vx, yaw_rate and some of"):
         cramer_rao_floor(drives, ("vx", "ay"))
+
+
+def test_floors_of_sideslip_are_those_of_the_samples_at_which_it_is_scored():
+    """A stop, of which any error of v makes an angle of which nothing is known."""
+    generator = np.random.default_rng(8)
+    n = 4000
+    vx = np.where(np.arange(n) < 3000, 20.0, 0.001)
+    vy = np.where(vx > 1.0, np.sin(np.arange(n) / 40.0), 0.0) + 0.01 * generator.standard_normal(n)
+    drive = Drive(20.0, {"vx": vx, "yaw_rate": np.zeros(n)}, vy, 0)
+    moving = replace(drive, min_sideslip_speed=1.0)
+    everywhere = reference_floor([drive])
+    floor = reference_floor([moving])
+    assert floor.vy == everywhere.vy == pytest.approx(0.01, rel=0.1)
+    assert floor.sideslip == pytest.approx(np.degrees(floor.vy / 20.0), rel=0.01)
+    assert everywhere.sideslip > 10.0
+    assert reference_spread([moving]).sideslip == pytest.approx(
+        np.degrees(math.sqrt(0.5) / 20.0), rel=0.01
+    )
+    assert math.isnan(reference_spread([replace(drive, min_sideslip_speed=100.0)]).sideslip)

@@ -12,9 +12,18 @@ from conftest import planar_drive
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.evaluation.blocks import segments_of
+from vehest.evaluation.blocks import figure_intervals, segments_of
 from vehest.evaluation.lever_arm import LONGEST, lever_arm_figures
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_errors
+from vehest.evaluation.metrics import (
+    UNITS,
+    Protocol,
+    Scored,
+    accuracy,
+    min_sideslip_speed,
+    score,
+    weighted_errors,
+)
+from vehest.evaluation.ranking import rank
 from vehest_papers.cnn_ukf.manoeuvres import (
     error_distribution,
     group_of,
@@ -38,6 +47,7 @@ def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
         np.radians([1.0, 2.0, 3.0, 4.0]),
         np.zeros(4),
         np.array([1.0, 5.0, -6.0, 0.0]),
+        np.ones(4, dtype=bool),
     )
     figures = accuracy([part])
     assert figures["rmse_vy"] == pytest.approx(math.sqrt((0.01 + 0.01 + 0.09 + 0.09) / 4))
@@ -57,6 +67,7 @@ def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
         np.radians([179.0, -170.0]),
         np.radians([-178.0, 170.0]),
         np.zeros(2),
+        np.ones(2, dtype=bool),
     )
     figures = accuracy([part])
     assert figures["max_error_sideslip"] == pytest.approx(20.0)
@@ -71,6 +82,7 @@ def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
         drive["sideslip_ref"],
         drive["sideslip_ref"],
         drive["ay"],
+        np.ones(len(drive), dtype=bool),
     )
     figures = accuracy([part])
     assert figures["fvu"] == pytest.approx(0.0, abs=1e-12)
@@ -95,7 +107,8 @@ def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
 def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_have_their_states():
     zero = np.zeros(2)
     others = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
-    part = Scored(np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, others)
+    is_scored = np.ones(2, dtype=bool)
+    part = Scored(np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, is_scored, others)
     figures = accuracy([part])
     absolute = [0.2225, 3 * 0.5064 + 2 * 0.1566]
     assert figures["mse_weighted"] == pytest.approx((0.2225 + 9 * 0.5064 + 4 * 0.1566) / 2)
@@ -106,8 +119,8 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_
         pytest.approx(math.sqrt(2.0)),
     )
     assert set(figures) <= set(UNITS)
-    with_vx = Scored(zero, zero, zero, zero, zero, zero, {"vx": (zero, zero)})
-    without = Scored(zero, zero, zero, zero, zero, zero)
+    with_vx = Scored(zero, zero, zero, zero, zero, zero, is_scored, {"vx": (zero, zero)})
+    without = Scored(zero, zero, zero, zero, zero, zero, is_scored)
     assert "rmse_vx" in accuracy([with_vx])
     assert "mse_weighted" not in accuracy([with_vx])
     assert not {"rmse_vx", "rmse_yaw_rate", "nees", "nis"} & set(accuracy([with_vx, without]))
@@ -128,21 +141,62 @@ def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
     assert (held.vy <= held.time + 1e-9).all()
 
 
-def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
-    """Half a second at 0.0003 m/s: 0.1 m/s of v would be a sideslip of 90 degrees there."""
+def stopping(drive):
+    """The drive with half a second at 0.0003 m/s."""
     vx = drive["vx"].copy()
     vy = drive["vy_ref"].copy()
     vx[500:510] = 0.0003
     vy[500:510] = 0.0
-    own = replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
-    estimate = _estimate(own.time, vy + np.where(vx < 1.0, 0.1, 0.0), 20.0, 0.0)
-    counted, without = (
-        accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])[
-            "max_error_sideslip"
-        ]
-        for least in (0.0, 0.1)
+    return replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
+
+
+def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_not(drive):
+    """An error of 0.1 m/s everywhere; at 0.0003 m/s it would be a sideslip of 90 degrees."""
+    own = stopping(drive)
+    estimate = _estimate(own.time, own["vy_ref"] + 0.1, 20.0, 0.0)
+    everywhere, moving = (
+        accuracy([score(estimate, own, Span("d", "drive"), protocol)])
+        for protocol in (Protocol(min_sideslip_speed=0.0), Protocol())
     )
-    assert (counted > 80.0, without) == (True, 0.0)
+    kept = (own.time >= 1.5) & (own["vx"] > 1.0)
+    true = np.arctan2(own["vy_ref"], own["vx"])
+    error = np.degrees(np.arctan2(own["vy_ref"] + 0.1, own["vx"]) - true)[kept]
+    assert everywhere["max_error_sideslip"] > 80.0
+    assert moving["max_error_sideslip"] == pytest.approx(np.abs(error).max())
+    assert moving["rmse_sideslip"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert moving["share_below_min_speed"] == pytest.approx(10 / (own.time >= 1.5).sum())
+    assert everywhere["share_below_min_speed"] == 0.0
+    assert moving["rmse_vy"] == everywhere["rmse_vy"] == pytest.approx(0.1)
+    assert moving["mse_sideslip"] == everywhere["mse_sideslip"]  # of a paper: all samples
+
+
+def test_a_car_that_stands_throughout_has_no_sideslip_error_but_one_of_lateral_velocity(drive):
+    standing = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
+    own = replace(drive, channels={**drive.channels, **standing})
+    estimate = _estimate(own.time, np.full(len(own), 0.1), 20.0, 0.0)
+    part = score(estimate, own, Span("d", "drive"), Protocol())
+    figures = accuracy([part])
+    assert (figures["rmse_vy"], figures["share_below_min_speed"]) == (pytest.approx(0.1), 1.0)
+    for name in ("rmse_sideslip", "max_error_sideslip", "p99_sideslip"):
+        assert math.isnan(figures[name])
+    segments = segments_of([part], 20.0)
+    assert set(figure_intervals(segments)) == {"rmse_vy"}
+    ranking = rank({("a", ""): [segments], ("zero", ""): [segments]}, 20.0)
+    assert (list(ranking.order), ranking.winner, ranking.n_blocks) == ([], None, 0)
+
+
+def test_speed_from_which_sideslip_is_scored_follows_the_wheelbase_unless_it_is_given():
+    assert min_sideslip_speed(None) == min_sideslip_speed(2.7) == 1.0
+    assert min_sideslip_speed(0.324) == pytest.approx(0.3464, abs=1e-4)
+    by_car = Protocol().with_wheelbases({"car": 2.7, "model": 0.675, "unknown": None})
+    speeds = [by_car.min_sideslip_speed_on(name) for name in ("car", "model", "unknown", "other")]
+    assert speeds == [1.0, 0.5, 1.0, 1.0]
+    assert by_car.describe_min_sideslip_speed(["car", "model"]) == "1 m/s (car), 0.5 m/s (model)"
+    given = Protocol(min_sideslip_speed=0.1).with_wheelbases({"car": 2.7})
+    assert given.min_sideslip_speed_on("car") == 0.1
+
+
+def test_an_estimate_with_holes_has_no_score(drive):
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
     assert "has no estimate for 1 of" in refusal(
@@ -196,7 +250,9 @@ def scored(recording, vy):
     vy = vy[-len(cut) :]
     sideslip = np.arctan2(vy, cut["vx"])
     reference = np.arctan2(cut["vy_ref"], cut["vx"])
-    return Scored(cut.time, vy, cut["vy_ref"], sideslip, reference, np.full(len(cut), np.nan))
+    nothing = np.full(len(cut), np.nan)
+    is_scored = np.ones(len(cut), dtype=bool)
+    return Scored(cut.time, vy, cut["vy_ref"], sideslip, reference, nothing, is_scored)
 
 
 def figures(recording, vy):
@@ -250,7 +306,9 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
 def driven_by(errors_deg, ay):
     zero = np.zeros(len(ay))
     error = np.radians(errors_deg)
-    return Scored(np.arange(len(ay)) * 0.01, 20.0 * np.tan(error), zero, error, zero, np.array(ay))
+    time = np.arange(len(ay)) * 0.01
+    is_scored = np.ones(len(ay), dtype=bool)
+    return Scored(time, 20.0 * np.tan(error), zero, error, zero, np.array(ay), is_scored)
 
 
 CALM = driven_by([1.0, -0.5, 0.5, 0.5], [0.0, 1.0, -2.0, 3.0])

@@ -13,6 +13,7 @@ from vehest.evaluation.blocks import (
     _window,
     block_labels,
     block_sums,
+    figure_intervals,
     politis_white_length,
     read_segments,
     segments_of,
@@ -32,7 +33,9 @@ def scored(error, vy_ref=None):
     time = np.arange(len(error)) / RATE
     beta = np.arctan2(reference + error, 20.0)
     beta_ref = np.arctan2(reference, 20.0)
-    return Scored(time, reference + error, reference, beta, beta_ref, np.zeros_like(error))
+    is_scored = np.ones(len(error), dtype=bool)
+    ay = np.zeros_like(error)
+    return Scored(time, reference + error, reference, beta, beta_ref, ay, is_scored)
 
 
 def coloured(generator, n, memory=0.95):
@@ -65,6 +68,40 @@ def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
     assert all(np.array_equal(getattr(back, name), getattr(segments, name)) for name in COLUMNS)
     (tmp_path / "blocks.csv").write_text("test_set,piece\ntest,0\n")
     assert "start" in refusal(lambda: read_segments(tmp_path / "blocks.csv"))
+
+
+def with_stop(part, seconds=12.0):
+    """The same range with a stop at its end, in which sideslip is not scored and its error is 90 degrees."""
+    n = round(seconds * RATE)
+    columns = {"vy": 0.0, "vy_ref": 0.0, "sideslip": np.pi / 2, "sideslip_ref": 0.0, "ay": 0.0}
+    stopped = {
+        name: np.append(getattr(part, name), np.full(n, own)) for name, own in columns.items()
+    }
+    return Scored(
+        time=np.arange(len(part.time) + n) / RATE,
+        is_sideslip_scored=np.append(part.is_sideslip_scored, np.zeros(n, dtype=bool)),
+        **stopped,
+    )
+
+
+def test_a_stop_changes_no_ranking_and_no_interval_of_sideslip():
+    generator = np.random.default_rng(5)
+    errors = {"zero": 0.5, "static_map": 0.4, "good": 0.05}
+    parts = {name: scored(size * coloured(generator, 2000)) for name, size in errors.items()}
+    rankings = [
+        rank({(name, ""): [segments_of([own], RATE)] for name, own in those.items()}, RATE)
+        for those in (parts, {name: with_stop(own) for name, own in parts.items()})
+    ]
+    assert rankings[0] == rankings[1]
+    assert rankings[1].winner == ("good", "")
+    part = parts["zero"]
+    moving, stopping = (
+        figure_intervals(segments_of([own], RATE)) for own in (part, with_stop(part))
+    )
+    assert stopping["rmse_sideslip"] == moving["rmse_sideslip"]
+    assert stopping["rmse_vy"] != moving["rmse_vy"]
+    assert "mse_sideslip" in moving
+    assert "mse_sideslip" not in stopping  # of all samples, those of the stop too
 
 
 @pytest.mark.parametrize("memory", [0.3, 0.5, 0.9, 0.95])

@@ -10,7 +10,7 @@ import pytest
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.regimes import AY_BANDS, REGIMES, errors_by_regime, regimes_of, slope
 
 RATE = 20.0
@@ -109,3 +109,23 @@ def test_evaluation_writes_regimes_as_subsets_and_prints_figures_of_all_samples_
     assert set(by_subset["turning"]) == {"rmse_vy", "rmse_sideslip", "share"}
     assert {"floor_reference", "floor_cramer_rao"} <= set(by_subset["all"])
     assert "share" not in by_subset["all"]
+
+
+def test_the_speed_of_a_test_follows_the_car_of_its_data_set_and_another_car_evaluates_again(place):
+    run = ("estimator=static_map", "split=mine", "tracking=none")
+    assert place("train", *run)[0] == 0
+    folders = []
+    for wheelbase in (None, 10.8, 1e-1):
+        if wheelbase is not None:
+            file = place.folder / "conf" / "dataset" / "mine.yaml"
+            lines = [own for own in file.read_text().splitlines() if not own.startswith("car:")]
+            file.write_text("\n".join([*lines, f"car: {{wheelbase: {wheelbase}}}"]) + "\n")
+        printed = json.loads(place.done("eval", *run, "--json")[0])
+        folders.append(printed["folder"])
+        config = json.loads((Path(printed["folder"]) / "manifest.json").read_text())["config"]
+        speeds = config["protocol"]["min_sideslip_speed"]
+        assert speeds == {"mine": pytest.approx(min_sideslip_speed(wheelbase))}
+        assert "share_below_min_speed.test" in printed
+    assert len(set(folders)) == 3
+    refused = place.refused("eval", *run, "++evaluation.least_speed=0.1")[1]
+    assert "evaluation.least_speed is now evaluation.min_sideslip_speed" in refused

@@ -57,6 +57,7 @@ def planted_segments(fvu, test, seed):
         start=np.tile(np.arange(SEGMENTS // 2, dtype=float), 2),
         samples=np.full(SEGMENTS, float(SAMPLES)),
         squared_error_vy=fvu * variance * SAMPLES * share,
+        sideslip_samples=np.full(SEGMENTS, float(SAMPLES)),
         squared_error_sideslip=fvu * variance * SAMPLES * share * 4.0,
         error_vy=np.zeros(SEGMENTS),
         vy_ref=np.zeros(SEGMENTS),
@@ -253,9 +254,8 @@ def _of_pieces(squares):
     """Segments each in a piece of its own, so that each is a block."""
     zeros = np.zeros_like(squares)
     n = np.arange(len(squares), dtype=float)
-    return Segments(
-        n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares)
-    )
+    ones = np.ones_like(squares)
+    return Segments(n, zeros, ones, squares, ones, squares, zeros, zeros, ones)
 
 
 def test_masked_segments_without_a_mask_are_the_evaluations_own():
@@ -263,12 +263,13 @@ def test_masked_segments_without_a_mask_are_the_evaluations_own():
     time = np.arange(90) / 20.0
     vy = generator.normal(size=90)
     reference = generator.normal(size=90)
-    part = Scored(time, vy, reference, vy / 20.0, reference / 20.0, np.zeros(90))
+    is_scored = time >= 1.0
+    part = Scored(time, vy, reference, vy / 20.0, reference / 20.0, np.zeros(90), is_scored)
     own = masked_segments([part], [np.ones(90)], 20.0)
     plain = segments_of([part], 20.0)
     assert all(np.allclose(getattr(own, name), getattr(plain, name)) for name in vars(plain))
     half = masked_segments([part], [(time < 2.0).astype(float)], 20.0)
-    assert half.samples.sum() == 40
+    assert (half.samples.sum(), half.sideslip_samples.sum()) == (40, 20)
     assert half.squared_error_vy.sum() == pytest.approx(np.sum((vy - reference)[:40] ** 2))
 
 

@@ -282,7 +282,9 @@ def made_run(candidate, errors, seed=0, validation=None, ay=5.0):
 
     def scored(error):
         zero = np.zeros(len(error))
-        return Scored(np.arange(len(error)) / 100.0, zero, zero, np.radians(error), zero, zero + ay)
+        time = np.arange(len(error)) / 100.0
+        is_scored = np.ones(len(error), dtype=bool)
+        return Scored(time, zero, zero, np.radians(error), zero, zero + ay, is_scored)
 
     names = ["slalom_0", *(f"j_turn_{number}" for number in range(1, len(errors)))]
     test = {name: [scored(error)] for name, error in zip(names, errors, strict=True)}
@@ -340,7 +342,7 @@ def test_validation_chooses_the_seed_and_a_filter_that_does_not_listen_is_called
 
 def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_cut():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
-    part = Scored(np.arange(4.0), angle, angle, angle, angle, angle)
+    part = Scored(np.arange(4.0), angle, angle, angle, angle, angle, np.ones(4, dtype=bool))
     assert len(until(part, 0.21).time) == 2
     assert len(until(part, 0.3).time) == 4
 

@@ -205,7 +205,8 @@ N = 20 * 300
 def _part(error):
     time = np.arange(N) / 20.0
     vy_ref = np.random.default_rng(9).standard_normal(N)
-    return Scored(time, vy_ref + error, vy_ref, np.zeros(N), np.zeros(N), np.zeros(N))
+    zero = np.zeros(N)
+    return Scored(time, vy_ref + error, vy_ref, zero, zero, zero, np.ones(N, dtype=bool))
 
 
 def _noise(size, seed):

@@ -2,6 +2,8 @@
 
 import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +14,8 @@ from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.run.compare_files import compare_estimates, read_estimate_table
+from vehest.run.compare_files import compare_estimates, compare_files, read_estimate_table
+from vehest.run.inspect_data import check
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +58,88 @@ def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_pat
         tmp_path / "nameless.csv", index=False
     )
     read_estimate_table(tmp_path / "nameless.csv", drive)
-    assert "nameless.csv': sideslip_ref: " in (said := capsys.readouterr().err)
+    said = capsys.readouterr().err
+    assert "nameless.csv': column 'beta', read as sideslip_ref: " in said
+    assert said.count("warning: ") == 1
     assert "beyond what a vehicle can do" in said
+
+
+def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, tmp_path):
+    """Ten seconds at standstill, at which 0.02 m/s of v are an angle of any size."""
+    standing = drive.time > 110.0
+    stopped = {name: np.where(standing, 0.0, drive[name]) for name in ("vx", "vy_ref", "yaw_rate")}
+    own = replace(drive, channels={**drive.channels, **stopped})
+    estimate = read_estimate_table(written(tmp_path, "mine", own, 0.02), own)
+    found = compare_estimates(own, {"mine": estimate})
+    assert found["rows"][0]["estimate"] == "mine"
+    assert found["rows"][0]["rmse_sideslip"] < 0.1
+    assert found["share_below_min_speed"] == pytest.approx(10.0 / 120.0, abs=0.005)
+    assert "has the lowest sideslip error" in found["verdict"]
+    assert compare_estimates(own, {"mine": estimate}, 0.3)["min_sideslip_speed"] == pytest.approx(
+        1 / 3
+    )
+    still = {name: np.zeros(len(own)) for name in ("vx", "vy_ref")}
+    parked = compare_estimates(replace(own, channels={**own.channels, **still}), {"mine": estimate})
+    assert parked["share_below_min_speed"] == 1.0
+    assert parked["verdict"].startswith("Sideslip is not scored: the car is slower than 1 m/s")
+    assert parked["rows"][0]["estimate"] == "zero"
+    assert all(math.isnan(row["rmse_sideslip"]) for row in parked["rows"])
+    assert all(math.isfinite(row["rmse_vy"]) for row in parked["rows"])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "warning"),
+    [
+        (lambda vy: 3.6 * vy, "vy_ref is in km/h; set its unit"),
+        (lambda vy: -vy, "disagree in sign"),
+        (np.zeros_like, "never changes: 0 m/s throughout"),
+        (lambda vy: vy, ""),
+    ],
+)
+def test_references_and_estimates_in_another_unit_or_sign_are_warned_of(
+    drive, tmp_path, monkeypatch, capsys, spoil, warning
+):
+    """As `vehest data check` warns of the recording; once of the estimate alone, once of the reference alone."""
+    monkeypatch.chdir(tmp_path)
+    names = ("vx", "yaw_rate", "ax", "ay")
+    table = pd.DataFrame({"time": drive.time} | {name: drive[name] for name in names})
+    table.assign(vy_ref=drive["vy_ref"]).to_csv("right.csv", index=False)
+    table.assign(vy_ref=spoil(drive["vy_ref"])).to_csv("spoilt.csv", index=False)
+    rng = np.random.default_rng(0)
+    noise = 0.01 * np.convolve(rng.standard_normal(len(drive) + 49), np.ones(50) / 50, "valid")
+    for name, vy in (("good", drive["vy_ref"] + noise), ("bad", spoil(drive["vy_ref"]))):
+        pd.DataFrame({"time": drive.time, "vy": vy}).to_csv(f"{name}.csv", index=False)
+    said = {}
+    for recording, estimate in (("spoilt", "good"), ("right", "bad")):
+        outcome, _ = compare_files(Path(f"{recording}.csv"), [f"{estimate}.csv"], [])
+        said[recording] = capsys.readouterr().err
+        if recording == "spoilt":
+            rows, _ = check("spoilt.csv", [])
+            assert outcome["findings"] == [
+                ": ".join(filter(None, (row["channel"], row["message"])))
+                for row in rows
+                if row["level"] == "warning"
+            ]
+    if warning:
+        assert warning in said["spoilt"]
+        assert said["spoilt"].startswith("warning: 'spoilt.csv': ")
+        assert warning in said["right"]
+        assert "'bad.csv': column 'vy', read as vy_ref: " in said["right"]
+    else:
+        assert said == {"spoilt": "", "right": ""}
+
+
+@pytest.mark.parametrize("name", ["vy [dm/s]", "beta [grad]", "v (furlongs)"])
+def test_an_unknown_unit_in_a_name_is_an_error_and_not_si(drive, tmp_path, name):
+    file = tmp_path / "mine.csv"
+    pd.DataFrame({"time": drive.time, name: drive["vy_ref"]}).to_csv(file, index=False)
+    assert f"column '{name}' has the unknown unit" in refusal(
+        lambda: read_estimate_table(file, drive)
+    )
+    pd.DataFrame({"time [min]": drive.time, "vy": drive["vy_ref"]}).to_csv(file, index=False)
+    assert "has the unknown unit 'min' (known are s, sec," in refusal(
+        lambda: read_estimate_table(file, drive)
+    )
 
 
 def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):

@@ -10,10 +10,18 @@ from refusals import refusal
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config, missing_keys
+from vehest.run.ingest import plan_ingest
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.simulation.sensors.levels import SensorLevels
-from vehest.sources.base import kind_of, open_source, source_class, source_names
+from vehest.sources.base import (
+    CarValues,
+    car_of,
+    kind_of,
+    open_source,
+    source_class,
+    source_names,
+)
 from vehest.sources.simulated import SimulatedSource
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -154,3 +162,74 @@ def test_sensors_of_a_fleet_differ_and_references_do_not():
 )
 def test_a_simulation_that_is_misspelt_or_asks_for_too_much_is_refused_in_one_line(changes, said):
     assert said in refusal(lambda: SimulatedSource(simulated(**changes)), ConfigurationError)
+
+
+TABLE = {
+    "name": "mine",
+    "source": "tabular",
+    "vehicle": "mine",
+    "time": {"column": "time", "unit": "s"},
+}
+
+
+def test_a_data_set_holds_values_of_its_car_and_none_for_those_that_are_not_known():
+    assert car_of(TABLE) == CarValues(None, None, None, None)
+    values = {"wheelbase": 2.7, "mass": 1500, "cg_to_rear_axle": 1.3, "steering_ratio": 16}
+    assert car_of(TABLE | {"car": values}) == CarValues(2.7, 1500.0, 1.3, 16.0)
+    assert car_of(TABLE | {"car": {"wheelbase": None, "mass": 900}}) == CarValues(mass=900.0)
+
+
+def test_the_values_of_a_car_are_scaled_with_its_recordings():
+    scale = [{"name": "scale_to_wheelbase", "wheelbase": 0.3, "to": 2.7}]
+    car = {"wheelbase": 0.3, "mass": 5, "cg_to_rear_axle": 0.1, "steering_ratio": 2}
+    scaled = car_of(TABLE | {"car": car, "transforms": scale})
+    assert scaled.wheelbase == pytest.approx(2.7)
+    assert scaled.cg_to_rear_axle == pytest.approx(0.9)
+    assert (scaled.mass, scaled.steering_ratio) == (None, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("car", "message"),
+    [
+        ({"wheelbase": 0}, "dataset.car.wheelbase: .* 0.05, not 0"),
+        ({"mass": -5}, "dataset.car.mass: .* 0, not -5"),
+        ({"steering_ratio": "16:1"}, "steering_ratio must be a positive number, not '16:1'"),
+        ({"length": 4.0}, "dataset.car.length is not an option of dataset.car; options: wheelbase"),
+        ({"wheelbase": 2.0, "cg_to_rear_axle": 2.0}, r"below the wheelbase \(2 m\), not 2"),
+        (2.7, "dataset.car must be a mapping"),
+    ],
+)
+def test_values_that_are_of_no_car_are_refused_with_the_data_set(car, message):
+    with pytest.raises(ConfigurationError, match=f"data set 'mine': .*{message}"):
+        car_of(TABLE | {"car": car})
+
+
+def test_a_simulated_data_set_has_the_values_of_its_vehicle_unless_they_vary():
+    assert car_of(simulated()).wheelbase == pytest.approx(2.5789, abs=1e-4)
+    varied_lengths = [{"parameters": ["a", "b"], "factor": [0.9, 1.1]}]
+    varied_car = car_of(simulated(vary=varied_lengths))
+    assert (varied_car.wheelbase, varied_car.cg_to_rear_axle) == (None, None)
+    assert varied_car.mass == pytest.approx(1093.3, abs=0.1)
+    loaded_drive = drive("a", 3.0, payload={"mass": 100})
+    assert car_of(simulated(drives=[loaded_drive])).mass is None
+    config = compose_config("ingest", ["dataset=sim_tyre_sets"])["dataset"]
+    assert car_of(config) == CarValues(0.33, 5.1, 0.15)
+
+
+def test_the_values_of_the_car_change_no_key_of_an_ingest(tmp_path):
+    (tmp_path / "a.csv").write_text("time,vx\n0,1\n0.1,1\n", encoding="utf-8")
+    dataset = TABLE | {"path": str(tmp_path), "files": "*.csv"}
+    keys = {
+        plan_ingest({"dataset": own, "output": str(tmp_path)}).key
+        for own in (dataset, dataset | {"car": {"wheelbase": 2.4}}, dataset | {"car": None})
+    }
+    assert len(keys) == 1
+
+
+@pytest.mark.parametrize(
+    ("dataset", "wheelbase"),
+    [("ferrari_250lm", 2.4), ("f1tenth_as_full_size", 2.4057), ("dart_as_f1tenth", 0.330859375)],
+)
+def test_shipped_data_sets_have_the_documented_wheelbase(dataset, wheelbase):
+    config = compose_config("ingest", [f"dataset={dataset}", "root=elsewhere"])["dataset"]
+    assert car_of(config).wheelbase == pytest.approx(wheelbase, rel=1e-9)

@@ -6,27 +6,36 @@ A band is meant for v and β each: figures of β are in degrees, those of v have
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, block_sums, segments_of
-from vehest.evaluation.metrics import Scored
-from vehest.evaluation.regimes import AY_BANDS, Mask, is_known
+from vehest.evaluation.metrics import BoolArray, Scored
+from vehest.evaluation.regimes import AY_BANDS, Mask, is_known, is_long_enough
 from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, effective_blocks, intraclass_correlation
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
 SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
-Banded = tuple[
-    FloatArray, FloatArray
-]  # errors of all ranges, (N,) [deg] or [m/s], and half widths in the same unit, (N, L), of `LEVELS`
+
+
+class Banded(NamedTuple):
+    """Errors of a quantity and its bands at the samples of all ranges at which it is scored."""
+
+    errors: FloatArray  # (N,) [deg] or [m/s]
+    half: FloatArray  # half widths in the same unit, (N, L), of `LEVELS`
+    is_scored: BoolArray  # which of all samples these are, (K,), N of them True
 
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
-    """Errors and bands of ``vy`` [m/s] and ``sideslip`` [deg]; all levels are in proportion to that at 90 %."""
+    """Errors and bands of ``vy`` [m/s], at all samples, and ``sideslip`` [deg], at those at which it is scored.
+
+    All levels are in proportion to that at 90 %.
+    """
     turned = np.concatenate(
         [
             np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
@@ -45,7 +54,11 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
         * beside[name]
         for name in SUFFIXES
     }
-    return {name: (errors[name], half[name]) for name in SUFFIXES}
+    is_sideslip_scored = np.concatenate([part.is_sideslip_scored for part in parts])
+    is_scored = {"vy": np.ones_like(is_sideslip_scored), "sideslip": is_sideslip_scored}
+    return {
+        name: Banded(errors[name][own], half[name][own], own) for name, own in is_scored.items()
+    }
 
 
 def band_figures(
@@ -59,11 +72,17 @@ def band_figures(
     ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and ``crps`` as below; ``coverage_90_p10``
     and ``…_p90`` 10 and 90 % quantiles of the coverage of manoeuvres, which are the blocks that bands are calibrated by; ``error_icc``
     intraclass correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres these are spread over.
+    Nothing of a quantity that is scored at no sample.
     """
-    labels = np.concatenate(manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0])
+    manoeuvres = np.concatenate(
+        manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0]
+    )
     figures: dict[str, float] = {}
     for name, suffix in SUFFIXES.items():
-        errors, half = own[name]
+        errors, half, is_scored = own[name]
+        if not len(errors):
+            continue
+        labels = np.unique(manoeuvres[is_scored], return_inverse=True)[1]
         shown = half[:, LEVELS.index(SHOWN_LEVEL)]
         inside = np.abs(errors)[:, None] <= half
         by_block = block_sums(
@@ -91,16 +110,21 @@ def coverage_intervals(
     own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
-    segments = segments_of(parts, rate_hz)
+    all_segments = segments_of(parts, rate_hz)
     found = {}
-    starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
+    segment_of = np.repeat(np.arange(len(all_segments)), all_segments.samples.astype(np.int64))
     for name, suffix in SUFFIXES.items():
-        errors, half = own[name]
+        errors, half, is_scored = own[name]
+        if not len(errors):
+            continue
+        segments = all_segments if name == "vy" else all_segments.with_sideslip
+        places = np.unique(segment_of[is_scored], return_inverse=True)[1]
+        samples = np.bincount(places).astype(np.float64)
         for k, level in enumerate(LEVELS):
-            inside = np.add.reduceat((np.abs(errors) <= half[:, k]).astype(np.float64), starts)
-            labels = block_labels(segments, (1.0 - inside / segments.samples)[None])
+            inside = np.bincount(places, weights=np.abs(errors) <= half[:, k])
+            labels = block_labels(segments, (1.0 - inside / samples)[None])
             if labels.max() + 1 >= LEAST_BLOCKS:
-                sums = block_sums(np.stack([inside, segments.samples]), labels)
+                sums = block_sums(np.stack([inside, samples]), labels)
                 found[f"coverage_{100 * level:.0f}{suffix}"] = proportion_interval(*sums)
     return found
 
@@ -108,13 +132,17 @@ def coverage_intervals(
 def figures_by_regime(
     own: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float
 ) -> dict[str, dict[str, float]]:
-    """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only those that have 2 s of samples."""
+    """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only of what is scored at 2 s of samples."""
     found: dict[str, dict[str, float]] = {}
     for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
         found[regime] = {}
         inside = np.concatenate([mask[regime] for mask in masks])
         for name, suffix in SUFFIXES.items():
-            errors, half = (values[inside] for values in own[name])
+            chosen = inside[own[name].is_scored]
+            if not is_long_enough([chosen], rate_hz):
+                continue
+            errors = own[name].errors[chosen]
+            half = own[name].half[chosen]
             shown = half[:, LEVELS.index(SHOWN_LEVEL)]
             values = (
                 np.mean(np.abs(errors) <= shown),

@@ -32,13 +32,20 @@ class Segments:
     start: FloatArray  # time of its first sample [s]
     samples: FloatArray  # how many it has
     squared_error_vy: FloatArray  # sum of (v̂ - v)² [m²/s²]
-    squared_error_sideslip: FloatArray  # sum of (β̂ - β)² [deg²]
+    sideslip_samples: FloatArray  # how many of them have a sideslip that is scored
+    squared_error_sideslip: FloatArray  # sum of (β̂ - β)² over these [deg²]
     error_vy: FloatArray  # sum of v̂ - v [m/s]
     vy_ref: FloatArray  # sum of v [m/s]
     squared_vy_ref: FloatArray  # sum of v² [m²/s²]
 
     def __len__(self) -> int:
         return len(self.piece)
+
+    @property
+    def with_sideslip(self) -> Segments:
+        """Those in which sideslip is scored."""
+        chosen = self.sideslip_samples > 0
+        return Segments(**{name: getattr(self, name)[chosen] for name in COLUMNS})
 
 
 COLUMNS = tuple(field.name for field in fields(Segments))
@@ -55,7 +62,10 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
         summed = {
             "samples": np.ones_like(error),
             "squared_error_vy": np.square(error),
-            "squared_error_sideslip": np.square(np.degrees(turn)),
+            "sideslip_samples": part.is_sideslip_scored.astype(np.float64),
+            "squared_error_sideslip": np.where(
+                part.is_sideslip_scored, np.square(np.degrees(turn)), 0.0
+            ),
             "error_vy": error,
             "vy_ref": part.vy_ref,
             "squared_vy_ref": np.square(part.vy_ref),
@@ -196,28 +206,31 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
     """95 % intervals over blocks of the drive, of one training: what another drive of this kind would give.
 
     Returns:
-        Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer than `LEAST_BLOCKS` blocks.
+        Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer than `LEAST_BLOCKS` blocks, and none
+        of ``mse_sideslip``, which counts all samples, where sideslip is not scored at some.
     """
-    labels = block_labels(segments, (segments.squared_error_sideslip / segments.samples)[None])
+    found = {}
+    moving = segments.with_sideslip
+    if len(moving):
+        labels = block_labels(moving, _sideslip_loss(moving)[None])
+        if labels.max() + 1 >= LEAST_BLOCKS:
+            sideslip = root_interval(
+                block_sums(moving.squared_error_sideslip, labels)[None],
+                block_sums(moving.sideslip_samples, labels),
+            )
+            found["rmse_sideslip"] = (sideslip.low, sideslip.high)
+            if np.array_equal(segments.sideslip_samples, segments.samples):
+                found["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
+    labels = block_labels(segments, _sideslip_loss(segments)[None])
     if labels.max() + 1 < LEAST_BLOCKS:
-        return {}
+        return found
     sizes = block_sums(segments.samples, labels)
     summed = {
         name: block_sums(getattr(segments, name), labels)
-        for name in (
-            "squared_error_vy",
-            "squared_error_sideslip",
-            "error_vy",
-            "squared_vy_ref",
-            "vy_ref",
-        )
+        for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref")
     }
-    vy, sideslip = (
-        root_interval(summed[name][None], sizes)
-        for name in ("squared_error_vy", "squared_error_sideslip")
-    )
-    found = {"rmse_vy": (vy.low, vy.high), "rmse_sideslip": (sideslip.low, sideslip.high)}
-    found["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
+    vy = root_interval(summed["squared_error_vy"][None], sizes)
+    found["rmse_vy"] = (vy.low, vy.high)
     if summed["squared_vy_ref"].sum() > 0:
         fvu = unexplained_interval(
             summed["squared_error_vy"],
@@ -228,3 +241,13 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
         )
         found |= {"fvu": (fvu.low, fvu.high), "r2": (1.0 - fvu.high, 1.0 - fvu.low)}
     return found
+
+
+def _sideslip_loss(segments: Segments) -> FloatArray:
+    """Mean squared error of β of each segment, (K,) [deg²]; 0 where none is scored."""
+    samples = segments.sideslip_samples
+    nothing = np.zeros_like(samples)
+    loss: FloatArray = np.divide(
+        segments.squared_error_sideslip, samples, out=nothing, where=samples > 0
+    )
+    return loss

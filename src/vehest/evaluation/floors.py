@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +41,13 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.evaluation.metrics import Protocol, pieces_of, scored_range
+from vehest.evaluation.metrics import (
+    BoolArray,
+    Protocol,
+    is_fast_enough,
+    pieces_of,
+    scored_range,
+)
 from vehest.evaluation.regimes import filled
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
@@ -88,7 +94,7 @@ class Floor:
     """A standard deviation over the scored samples of a test set."""
 
     vy: float  # of lateral velocity [m/s]
-    sideslip: float  # of the sideslip angle [deg]
+    sideslip: float  # of the sideslip angle, where it is scored [deg]; NaN where it is at no sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +108,7 @@ class Drive:
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
     known_start: bool = False  # whether estimators start from the reference at the first sample
+    min_sideslip_speed: float = 0.0  # speed from which on sideslip is scored [m/s]
 
     @property
     def step(self) -> float:
@@ -112,7 +119,12 @@ class Drive:
     def scored(self) -> Drive:
         """The scored samples alone."""
         own = {name: samples[self.first :] for name, samples in self.inputs.items()}
-        return Drive(self.rate_hz, own, self.vy_ref[self.first :], 0)
+        return replace(self, inputs=own, vy_ref=self.vy_ref[self.first :], first=0)
+
+    @property
+    def is_sideslip_scored(self) -> BoolArray:
+        """Whether the car is fast enough."""
+        return is_fast_enough(self.inputs["vx"], self.vy_ref, self.min_sideslip_speed)
 
 
 def drives_of(
@@ -136,6 +148,7 @@ def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
         reference["vy_ref"][begin:end],
         first - begin,
         protocol.initial_state,
+        protocol.min_sideslip_speed_on(span.dataset),
     )
 
 
@@ -161,7 +174,8 @@ def inputs_of(channels: Collection[str]) -> frozenset[str] | None:
 def reference_spread(drives: Sequence[Drive]) -> Floor:
     """Root mean square of the reference itself, the error of v = 0; of a sideslip within a quarter turn, whichever way the car rolls."""
     velocity, speed = _joined(drives)
-    return Floor(_rms([velocity]), _rms([np.degrees(np.arctan2(velocity, np.abs(speed)))]))
+    sideslip = np.degrees(np.arctan2(velocity, np.abs(speed)))
+    return Floor(_rms([velocity]), _rms([sideslip[_is_sideslip_scored(drives)]]))
 
 
 # Noise of the reference
@@ -200,7 +214,8 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
     level = max(
         _robust_deviation(rest) / math.sqrt(20.0), quantisation_step(velocity) / math.sqrt(12.0)
     )
-    return Floor(level, _rms([_sideslip_deviation(np.full_like(velocity, level), velocity, speed)]))
+    sideslip = _sideslip_deviation(np.full_like(velocity, level), velocity, speed)
+    return Floor(level, _rms([sideslip[_is_sideslip_scored(drives)]]))
 
 
 def white_level(series: Sequence[FloatArray]) -> float:
@@ -287,7 +302,8 @@ def cramer_rao_floor(
     deviation = np.concatenate(
         [_deviation_along(drive, set(inputs), levels)[drive.first :] for drive in drives]
     )
-    return Floor(_rms([deviation]), _rms([_sideslip_deviation(deviation, velocity, speed)]))
+    sideslip = _sideslip_deviation(deviation, velocity, speed)
+    return Floor(_rms([deviation]), _rms([sideslip[_is_sideslip_scored(drives)]]))
 
 
 def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatArray:
@@ -537,8 +553,14 @@ def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
     )
 
 
+def _is_sideslip_scored(drives: Sequence[Drive]) -> BoolArray:
+    return np.concatenate([drive.scored.is_sideslip_scored for drive in drives])
+
+
 def _rms(series: Sequence[FloatArray]) -> float:
-    return float(np.sqrt(np.mean(np.square(np.concatenate(series)))))
+    """Root mean square; NaN of nothing."""
+    joined = np.concatenate(series)
+    return float(np.sqrt(np.mean(np.square(joined)))) if len(joined) else math.nan
 
 
 def _sideslip_deviation(

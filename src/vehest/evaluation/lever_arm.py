@@ -57,7 +57,6 @@ def lever_arm_figures(
     moved = []
     for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
         vy = part.vy - x * yaw_rate
-        standing = np.hypot(speed, part.vy_ref) < protocol.least_speed
-        moved.append(replace(part, vy=vy, sideslip=np.where(standing, 0.0, np.arctan2(vy, speed))))
+        moved.append(replace(part, vy=vy, sideslip=np.arctan2(vy, speed)))
     figures = accuracy(moved)
     return {**{name: figures[name] for name in METRICS}, "lever_arm": x}

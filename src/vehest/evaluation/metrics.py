@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -15,7 +16,12 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 
+BoolArray = NDArray[np.bool_]
+
 NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
+
+MIN_SIDESLIP_SPEED = 1.0  # m/s, of a car with the wheelbase below or an unknown one
+USUAL_WHEELBASE = 2.7  # m
 
 REFERENCES = {
     "vx": "vx_ref",
@@ -44,6 +50,7 @@ _NAMES = {
             "coverage_1sigma",
             "coverage_2sigma",
             "share",
+            "share_below_min_speed",
         ),
         *("n_sequences", "n_parameters", "epochs"),
     ),
@@ -101,14 +108,41 @@ class Protocol:
     # test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by their
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
-    least_speed: float = 0.0  # of the car by its reference [m/s]; slower samples have no direction, and count as β = 0 without error
+    # speed of the car by its reference, from which on sideslip is scored [m/s]: on every data set, or by data set; None, and data sets
+    # without one, by the wheelbase (`with_wheelbases`)
+    min_sideslip_speed: float | dict[str, float] | None = None
 
-    @property
-    def plain(self) -> dict[str, Any]:
-        """For a key; without a least speed it is that of a protocol that knows none."""
-        return {
-            name: value for name, value in asdict(self).items() if name != "least_speed" or value
-        }
+    def with_wheelbases(self, wheelbases: Mapping[str, float | None]) -> Protocol:
+        """The protocol with a speed for every data set, by its car's wheelbase [m], None where that is not known."""
+        asked = self.min_sideslip_speed
+        if not (asked is None or isinstance(asked, dict)):
+            return self
+        speeds = {name: min_sideslip_speed(wheelbases[name]) for name in sorted(wheelbases)}
+        return replace(self, min_sideslip_speed=speeds | (asked or {}))
+
+    def min_sideslip_speed_on(self, dataset: str) -> float:
+        """Speed from which on sideslip is scored on a data set [m/s]."""
+        speed = self.min_sideslip_speed
+        if isinstance(speed, dict):
+            return speed.get(dataset, MIN_SIDESLIP_SPEED)
+        return MIN_SIDESLIP_SPEED if speed is None else speed
+
+    def describe_min_sideslip_speed(self, datasets: Iterable[str]) -> str:
+        """Speed from which on sideslip is scored on these data sets: ``1 m/s``, or ``1 m/s (mine), 0.35 m/s (f1)``."""
+        speeds: dict[str, list[str]] = {}
+        for dataset in dict.fromkeys(datasets):
+            speed = f"{self.min_sideslip_speed_on(dataset):.3g} m/s"
+            speeds.setdefault(speed, []).append(dataset)
+        if len(speeds) == 1:
+            return next(iter(speeds))
+        return ", ".join(f"{speed} ({', '.join(names)})" for speed, names in speeds.items())
+
+    def describe_sideslip(self, datasets: Iterable[str]) -> str:
+        """A sentence, after a space, on the samples of these data sets at which sideslip is scored."""
+        return (
+            f" Sideslip is scored where the car moves at {self.describe_min_sideslip_speed(datasets)} or more by its reference, "
+            "lateral velocity at all samples."
+        )
 
     @property
     def sets_elsewhere(self) -> frozenset[str]:
@@ -137,6 +171,16 @@ class Protocol:
         return words
 
 
+def min_sideslip_speed(wheelbase: float | None) -> float:
+    """Speed from which on sideslip is scored [m/s]: 1 m/s · sqrt(wheelbase / 2.7 m), 1 m/s where the wheelbase [m] is None.
+
+    At standstill the direction of travel is noise. Cars of different size move alike at speeds that are as the roots of their lengths
+    (equal Froude numbers).
+    """
+    scale = 1.0 if wheelbase is None else math.sqrt(wheelbase / USUAL_WHEELBASE)
+    return MIN_SIDESLIP_SPEED * scale
+
+
 @dataclass(frozen=True, eq=False)
 class Scored:
     """Estimate and reference at the scored times; every array has shape (K,)."""
@@ -147,6 +191,7 @@ class Scored:
     sideslip: FloatArray  # estimated sideslip angle, atan2(vy, vx) with the measured vx [rad]
     sideslip_ref: FloatArray  # reference sideslip angle, atan2(vy_ref, vx) [rad]
     ay: FloatArray  # measured lateral acceleration [m/s²]; NaN where the recording has none
+    is_sideslip_scored: BoolArray  # whether the car is fast enough (`Protocol.min_sideslip_speed`)
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     covariance: FloatArray | None = (
@@ -165,6 +210,18 @@ class Scored:
         """Estimate - reference of ``vx``, ``vy`` [m/s] and ``yaw_rate`` [rad/s], of those that are there."""
         pairs = {**self.others, "vy": (self.vy, self.vy_ref)}
         return {name: pairs[name][0] - pairs[name][1] for name in REFERENCES if name in pairs}
+
+    def at(self, chosen: BoolArray | slice) -> Scored:
+        """Lateral velocity and sideslip at some of the samples; without other states, covariances, innovations and bands."""
+        return Scored(
+            self.time[chosen],
+            self.vy[chosen],
+            self.vy_ref[chosen],
+            self.sideslip[chosen],
+            self.sideslip_ref[chosen],
+            self.ay[chosen],
+            self.is_sideslip_scored[chosen],
+        )
 
 
 def sequences(
@@ -269,7 +326,6 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         return values
 
     vy = held("vy")
-    standing = np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
     measured = {
         name: scored[own]
         for name, own in REFERENCES.items()
@@ -296,9 +352,12 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         time=scored.time,
         vy=vy,
         vy_ref=scored["vy_ref"],
-        sideslip=np.where(standing, 0.0, np.arctan2(vy, scored["vx"])),
-        sideslip_ref=np.where(standing, 0.0, np.arctan2(scored["vy_ref"], scored["vx"])),
+        sideslip=np.arctan2(vy, scored["vx"]),
+        sideslip_ref=np.arctan2(scored["vy_ref"], scored["vx"]),
         ay=scored["ay"] if "ay" in scored else np.full(len(scored), np.nan),
+        is_sideslip_scored=is_fast_enough(
+            scored["vx"], scored["vy_ref"], protocol.min_sideslip_speed_on(span.dataset)
+        ),
         others=others,
         covariance=covariance,
         covariance_of=covariance_of,
@@ -306,6 +365,11 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         nis_dof=held("nis_dof") if innovations else None,
         bands=bands,
     )
+
+
+def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> BoolArray:
+    """Whether sideslip is scored, (K,): where the measured u and the reference v make ``min_speed`` or more, all in m/s."""
+    return np.asarray(np.hypot(vx, vy_ref) >= min_speed)
 
 
 def _require_all(values: FloatArray, what: str, span: Span) -> None:
@@ -323,6 +387,8 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
     ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none, or no a_y.
     ``…_weighted`` are the mean of squared `weighted_errors`, the mean and the 99th percentile of absolute ones.
+    ``rmse_sideslip``, ``max_error_sideslip`` and ``p99_sideslip`` are of the samples at which sideslip is scored, NaN where there are
+    none; ``share_below_min_speed`` is the share of the others. Metrics of a paper are of all samples, as it has them.
 
     Returns:
         Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and of innovations are there only if all
@@ -334,22 +400,25 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         np.concatenate([_turned(part.sideslip - part.sideslip_ref) for part in parts])
     )
     nonlinear = np.abs(np.concatenate([part.ay for part in parts])) >= NONLINEAR_AY
+    is_scored = np.concatenate([part.is_sideslip_scored for part in parts])
+    scored = error[is_scored] if is_scored.any() else np.full(1, np.nan)
     variance = float(np.var(vy_ref))
     fvu = float(np.var(vy_ref - vy)) / variance if variance > 0 else float("nan")
     return {
         "rmse_vy": float(np.sqrt(np.mean(np.square(vy - vy_ref)))),
         "fvu": fvu,
         "r2": 1.0 - fvu,
-        "rmse_sideslip": float(np.sqrt(np.mean(np.square(error)))),
+        "rmse_sideslip": float(np.sqrt(np.mean(np.square(scored)))),
         "mse_sideslip": float(np.mean(np.square(error))),
         "mse_sideslip_nonlinear": float(np.mean(np.square(error[nonlinear])))
         if nonlinear.any()
         else float("nan"),
-        "max_error_sideslip": float(np.abs(error).max()),
+        "max_error_sideslip": float(np.abs(scored).max()),
         "max_error_sideslip_nonlinear": float(np.abs(error[nonlinear]).max())
         if nonlinear.any()
         else float("nan"),
-        "p99_sideslip": float(np.quantile(np.abs(error), 0.99)),
+        "p99_sideslip": float(np.quantile(np.abs(scored), 0.99)),
+        "share_below_min_speed": float(1.0 - is_scored.mean()),
         **_state_accuracy(parts),
         **_consistency(parts),
     }

@@ -59,7 +59,7 @@ class Ranking:
         tuple[Name, Name], Comparison
     ]  # (first, second) -> comparison, of every pair that was compared, either way round
     n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
-    block_seconds: float  # mean length of a block [s]
+    block_seconds: float  # mean time in a block at which sideslip is scored [s]
     effective_blocks: float  # how many equal blocks the best one's squared error is spread over
 
     @property
@@ -113,7 +113,7 @@ def rank(
     rate_hz: float,
     asked: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Compare estimators on one test set by RMSE(β).
+    """Compare estimators on one test set by RMSE(β); without an order, and with NaN, where sideslip is scored at no sample.
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`differences_of_blocks`).
     Corrected together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
@@ -122,14 +122,16 @@ def rank(
         segments: of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
-    first = next(iter(segments.values()))[0]
+    first = next(iter(segments.values()))[0].with_sideslip
+    if not len(first):
+        return Ranking([], dict.fromkeys(segments, np.nan), {}, {}, 0, 0.0, 0.0)
     losses = {
-        name: np.stack([own.squared_error_sideslip for own in seeds])
+        name: np.stack([own.with_sideslip.squared_error_sideslip for own in seeds])
         for name, seeds in segments.items()
     }
-    per_sample = np.concatenate([own / first.samples for own in losses.values()])
+    per_sample = np.concatenate([own / first.sideslip_samples for own in losses.values()])
     labels = block_labels(first, per_sample)
-    sizes = block_sums(first.samples, labels)
+    sizes = block_sums(first.sideslip_samples, labels)
     sums = {name: block_sums(own, labels) for name, own in losses.items()}
     rmse = {
         name: float(np.sqrt(own.sum(axis=1).mean() / sizes.sum())) for name, own in sums.items()

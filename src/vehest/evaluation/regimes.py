@@ -33,7 +33,6 @@ TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}  # rad/s², m/s³
 SLOPE_SECONDS = 0.5
 LEAST_SECONDS = 2.0  # of samples in a regime, below which it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")
-_OF_SAMPLES = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")
 
 AY_BANDS = {
     f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high)
@@ -99,9 +98,14 @@ def filled(samples: FloatArray) -> FloatArray:
 
 def is_known(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
     """Whether every range tells a regime, and it has `LEAST_SECONDS` of samples in all, at ``rate_hz`` [Hz]."""
-    return all(regime in own for own in masks) and sum(
-        int(own[regime].sum()) for own in masks
-    ) >= max(LEAST_SECONDS * rate_hz, 1.0)
+    return all(regime in own for own in masks) and is_long_enough(
+        [own[regime] for own in masks], rate_hz
+    )
+
+
+def is_long_enough(chosen: Sequence[Mask], rate_hz: float) -> bool:
+    """Whether as many samples as `LEAST_SECONDS` at ``rate_hz`` [Hz] are chosen, over all ranges."""
+    return sum(int(own.sum()) for own in chosen) >= max(LEAST_SECONDS * rate_hz, 1.0)
 
 
 def errors_by_regime(
@@ -110,17 +114,16 @@ def errors_by_regime(
     """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at ``rate_hz`` [Hz].
 
     Returns:
-        Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples.
+        Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples; RMSE(β) is NaN where it is scored at
+        fewer.
     """
     total = sum(len(part.time) for part in parts)
     found = {}
     for name in (name for name in REGIMES if is_known(name, masks, rate_hz)):
-        chosen = [(part, own[name]) for part, own in zip(parts, masks, strict=True)]
-        inside = [
-            Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES))
-            for part, mask in chosen
-        ]
+        inside = [part.at(own[name]) for part, own in zip(parts, masks, strict=True)]
         figures = accuracy(inside)
+        if not is_long_enough([part.is_sideslip_scored for part in inside], rate_hz):
+            figures["rmse_sideslip"] = math.nan
         count = sum(len(part.time) for part in inside)
         found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
     return found

@@ -74,6 +74,8 @@ def flags_under_fault(
 ) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together, at ``rate_hz`` [Hz].
 
+    Errors count where sideslip is scored, flags at all samples.
+
     ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
@@ -86,7 +88,8 @@ def flags_under_fault(
     for part, (band, health), window in zip(parts, flagged, windows, strict=True):
         during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
         error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-        known = during & np.isfinite(band)
+        error[~part.is_sideslip_scored] = np.nan
+        known = during & np.isfinite(band) & part.is_sideslip_scored
         inside.append((np.abs(error) <= band)[known])
         valid.append(health[known] == 0)
         at = np.flatnonzero(during)
@@ -118,6 +121,10 @@ def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict
 
     vy = over_all(lambda part: part.vy - part.vy_ref)
     sideslip = np.degrees(over_all(lambda part: part.sideslip - part.sideslip_ref))
+    is_scored = np.concatenate(
+        [part.is_sideslip_scored[mask] for part, mask in zip(parts, masks, strict=True)]
+    )
+    sideslip = sideslip[is_scored] if is_scored.any() else np.full(1, np.nan)
     turned = np.abs(np.remainder(sideslip + 180.0, 360.0) - 180.0)
     return {
         "rmse_sideslip": float(np.sqrt(np.mean(np.square(turned)))),

@@ -8,14 +8,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
@@ -24,14 +25,14 @@ from vehest.data.store import read_estimate
 from vehest.estimators.model_files import read_description
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
-from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.estimate import estimate_recording, open_model, read_table
+from vehest.run.estimate import estimate_recording, finding_in_words, open_model
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
-from vehest.sources.base import read_single
+from vehest.sources.base import car_of, read_single
 from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
@@ -52,6 +53,9 @@ SPELLINGS = {
 }
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
+TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
+CHECKS_OF_ESTIMATES = ("impossible", "sign", "unit", "stuck")
+"""What concerns how an estimate was written; that it departs from the kinematics is for its score to say."""
 LEAST_SECONDS = 5.0
 LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
@@ -67,8 +71,18 @@ def compare_files(
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
     config = compose_config("estimate", overrides)
+    car = car_of(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):
-        drive = read_table(recording, overrides, references=True)
+        drive = read_single(config["dataset"], recording)
+        findings = [
+            finding_in_words(finding)
+            for finding in refuse_errors(
+                drive, config["dataset"].get("accept") or (), f"'{recording}'"
+            )
+            if finding.level != "note"
+        ]
+        for finding in findings:
+            complain(f"warning: '{recording}': {finding}")
         estimates = {file.stem: read_estimate_table(file, drive) for file in files}
         if len(estimates) < len(files):
             raise ConfigurationError(
@@ -83,13 +97,20 @@ def compare_files(
             ):
                 complain(f"warning: '{name}' learnt on this recording: its row is no test")
             estimates[name] = estimate_recording(model, drive.without_references(), trust)
-        found = compare_estimates(drive, estimates)
+        found = compare_estimates(drive, estimates, car.wheelbase)
     cells = [
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
         for row in found["rows"]
     ]
     scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
-    return found, [
+    of_wheelbase = (
+        "wheelbase not known" if car.wheelbase is None else f"wheelbase {car.wheelbase:g} m"
+    )
+    scored += (
+        f", sideslip from {found['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
+        f"{100 * found['share_below_min_speed']:.1f} % of the samples"
+    )
+    return found | {"findings": findings}, [
         TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
         scored,
         found["verdict"],
@@ -99,8 +120,9 @@ def compare_files(
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     """Read v or β from a table of any tool, or of ``vehest estimate``; raises `DataError` where it has neither, or no time.
 
-    Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
-    β is there, v = u tan β with the recording's u.
+    Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad; an unknown one
+    is a `DataError`. Where only β is there, v = u tan β with the recording's u. Prints a warning where unit or sign contradict the
+    recording.
     """
     if file.suffix == ".parquet":
         with suppress(DataError):  # a table of another tool
@@ -110,11 +132,8 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     for quantity, spellings in SPELLINGS.items():
         for name in names:
             if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
-                written = re.search(r"[\[(](.*?)[\])]", name)
-                unit = written and (
-                    written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
-                )
-                found.setdefault(quantity, {"column": name, "unit": unit or USUAL_UNITS[quantity]})
+                unit = _unit_of(quantity, name, file)
+                found.setdefault(quantity, {"column": name, "unit": unit})
     time = found.pop("time", None)
     channel = next(iter(found), None)
     if time is None or channel is None:
@@ -128,9 +147,7 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
         "gappy": [channel],
     }
     table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
-    for finding in checks_of_recording(table):
-        if finding.check == "impossible":
-            complain(f"warning: '{file}': {finding.channel}: {finding.message}")
+    _warn_of_estimate(file, found[channel]["column"], table, vx)
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
@@ -143,12 +160,50 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     )
 
 
-def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+def _unit_of(quantity: str, name: str, file: Path) -> str:
+    """The unit in brackets in a column's name, or the usual one where there are no brackets; raises `DataError` for an unknown one."""
+    written = re.search(r"[\[(](.*?)[\])]", name)
+    if written is None:
+        return USUAL_UNITS[quantity]
+    unit = TIME_UNITS.get(written[1]) if quantity == "time" else plain_unit(written[1])
+    if unit is None:
+        known = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
+        raise DataError(
+            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(written[1])}' (known are {known}); "
+            "convert it, or rename the column"
+        )
+    return unit
+
+
+def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recording) -> None:
+    """Print a warning where an estimate has another unit or sign than its column says, by the channels of the recording."""
+    (channel,) = table.channels
+    measured = drive.without_references()
+    values = np.interp(measured.time, table.time, table[channel], left=np.nan, right=np.nan)
+    beside = replace(
+        measured,
+        channels={**measured.channels, channel: values},
+        gappy=measured.gappy | {channel},
+    )
+    for finding in merged_findings([checks_of_recording(table), checks_of_recording(beside)]):
+        concerns = finding.channel == channel or (
+            not finding.channel and channel in finding.message
+        )
+        if concerns and finding.check in CHECKS_OF_ESTIMATES:
+            complain(
+                f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
+            )
+
+
+def compare_estimates(
+    drive: Recording, estimates: Mapping[str, Estimate], wheelbase: float | None = None
+) -> dict[str, Any]:
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
-    The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
-    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, and ``start`` and ``stop`` [s] and ``rate_hz`` of what is
-    scored.
+    Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m] (`min_sideslip_speed`). The map is fitted on one half
+    of the scored range and scored on the other, and vice versa, so that its samples are held out.
+    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and ``stop`` [s] and ``rate_hz`` of what is
+    scored, ``min_sideslip_speed`` [m/s] and ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
     Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
     """
     if not estimates:
@@ -165,7 +220,13 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> di
     )
     start, stop = _in_common(reference, estimates)
     span = Span("", drive.id, start, stop)
-    protocol = Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
+    min_speed = min_sideslip_speed(wheelbase)
+    protocol = Protocol(
+        rate_hz=reference.rate_hz,
+        warm_up_seconds=0.0,
+        skip_seconds=0.0,
+        min_sideslip_speed=min_speed,
+    )
     candidates = {**estimates, **_baselines(reference, start, stop)}
     scored = {
         (name, ""): score(estimate, reference, span, protocol)
@@ -179,14 +240,19 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> di
         name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0])
         for name in ranking.order
     }
-    verdict = verdict_sentences(ranking, titles, "this recording")
+    errors = {name: accuracy([own]) for name, own in scored.items()}
+    verdict = (
+        verdict_sentences(ranking, titles, "this recording")
+        if ranking.order
+        else f"Sideslip is not scored: the car is slower than {min_speed:.3g} m/s throughout."
+    )
     for words in ("**", " over its seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
     rows = []
-    for ranked in ranking.order:
-        errors = accuracy([scored[ranked]])
+    for ranked in ranking.order or sorted(errors, key=lambda name: errors[name]["rmse_vy"]):
         figures = {
-            key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
+            key: errors[ranked][key]
+            for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
         }
         rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
     return {
@@ -195,6 +261,8 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> di
         "start": start,
         "stop": stop,
         "rate_hz": reference.rate_hz,
+        "min_sideslip_speed": min_speed,
+        "share_below_min_speed": next(iter(errors.values()))["share_below_min_speed"],
     }
 
 

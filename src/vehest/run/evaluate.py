@@ -72,13 +72,20 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
+    if "least_speed" in config:
+        raise ConfigurationError(
+            "evaluation.least_speed is now evaluation.min_sideslip_speed: slower samples are left out of errors of sideslip, instead of "
+            "counting as 0; leave it out for 1 m/s · sqrt(wheelbase / 2.7 m)"
+        )
     protocol = settings_from_config(Protocol, config, "evaluation")
+    speeds = protocol.min_sideslip_speed
     if (
         protocol.rate_hz <= 0
-        or min(protocol.warm_up_seconds, protocol.skip_seconds, protocol.least_speed) < 0
+        or min(protocol.warm_up_seconds, protocol.skip_seconds) < 0
+        or min(speeds.values() if isinstance(speeds, dict) else [speeds or 0.0], default=0.0) < 0
     ):
         raise ConfigurationError(
-            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and least_speed must not be negative"
+            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and min_sideslip_speed must not be negative"
         )
     if protocol.sequence_seconds is not None:
         samples = protocol.sequence_seconds * protocol.rate_hz
@@ -143,7 +150,7 @@ class Evaluation:
             "sets": {
                 name: [str(span) for span in spans] for name, spans in test_sets(self.split).items()
             },
-            "protocol": self.protocol.plain,
+            "protocol": asdict(self.protocol),
             "kinds": dict(self.kinds),
             "split": self.split.name,
         }

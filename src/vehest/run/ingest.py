@@ -37,7 +37,7 @@ Report = Callable[
     [int, int, str], None
 ]  # recordings done, recordings in all, name of one that was begun
 PROSE = frozenset(
-    {"path", "title", "licence", "citation", "download"}
+    {"path", "title", "licence", "citation", "download", "car"}
 )  # of a data set's configuration; samples do not depend on it
 
 

@@ -195,6 +195,12 @@ def summary_of_leaderboard(
             for row in rows.to_dict("records")
         ]
         tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
+        share = float(rows["share_below_min_speed"].iloc[0])
+        if share > 0:
+            notes.append(
+                f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the samples, where the car is slower than "
+                f"{rows['min_sideslip_speed'].iloc[0]}"
+            )
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(
                 f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner"

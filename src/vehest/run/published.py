@@ -122,11 +122,7 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
                 f"calibrate {name}",
                 {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)},
             )
-        conditions: Any = {
-            key: value
-            for key, value in first["evaluation"].items()
-            if key != "least_speed" or value
-        }  # as `Protocol.plain`
+        conditions: Any = first["evaluation"]
         if faults:
             conditions = [conditions, *map(asdict, faults)]
         yield (

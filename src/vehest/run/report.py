@@ -92,7 +92,7 @@ def draw_report(
                 "training": list(part.facts),
                 "failed": part.failed,
                 "data_titles": part.data_titles,
-                "protocol": part.protocol.plain,
+                "protocol": asdict(part.protocol),
             }
             for name, part in artefacts.parts.items()
         },
@@ -302,7 +302,7 @@ def draw_sweep(
             .astype(object)
             .to_dict("records"),
             "failures": part.failed,
-            "protocol": part.protocol.plain,
+            "protocol": asdict(part.protocol),
             "kinds": part.kinds,
             "data_titles": part.data_titles,
             "facts": part.facts,

@@ -36,7 +36,7 @@ from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
-from vehest.sources.base import kind_of, open_source
+from vehest.sources.base import car_of, kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.health import SLOW_KERNEL
 from vehest.trust.record import read_trust
@@ -164,15 +164,16 @@ class Runner:
     ) -> Evaluation:
         """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
         split = self.split(config)
-        protocol = protocol_from_config(config["evaluation"])
+        datasets = {name: self.dataset_config(name, config)["dataset"] for name in split.datasets}
+        protocol = protocol_from_config(config["evaluation"]).with_wheelbases(
+            {name: car_of(dataset).wheelbase for name, dataset in datasets.items()}
+        )
         references = self.data_for(
             split,
             protocol.rate_hz,
             {**config, "downsample": {**config["downsample"], "transforms": []}},
         )
-        kinds = {
-            name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets
-        }
+        kinds = {name: kind_of(dataset) for name, dataset in datasets.items()}
         return Evaluation(split, data, references, kinds, protocol, self.output, faults)
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:

@@ -11,7 +11,7 @@ VERSIONS = {
     "downsample": "1",
     "train": "1",
     "calibrate": "3",
-    "evaluate": "1",
+    "evaluate": "2",
     "report": "1",
     "sweep": "2",
 }

@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
+from pydantic import Field
+
 import vehest.sources as package
 from vehest.data.derived import ScaleToWheelbase
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -25,6 +27,7 @@ NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
 SIMULATED = "simulated"  # name of the source whose recordings are never real
+PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
@@ -41,6 +44,44 @@ class Point:
 
 
 @dataclass(frozen=True)
+class CarValues:
+    """Values of the car that a data set was recorded with; None where one is not known.
+
+    Attributes
+    ----------
+    wheelbase : float or None
+        Distance between the axles [m].
+    mass : float or None
+        Mass as it was driven [kg].
+    cg_to_rear_axle : float or None
+        Distance of the centre of gravity from the rear axle [m].
+    steering_ratio : float or None
+        Overall steering ratio: handwheel angle over road-wheel angle.
+    """
+
+    wheelbase: (
+        Annotated[float, Field(ge=0.05, le=20.0), "a number of metres, 0.05 to 20"] | None
+    ) = None
+    mass: PositiveNumber | None = None
+    cg_to_rear_axle: PositiveNumber | None = None
+    steering_ratio: PositiveNumber | None = None
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError`: a centre of gravity outside of the wheelbase."""
+        rear = self.cg_to_rear_axle
+        if rear is not None and self.wheelbase is not None and rear >= self.wheelbase:
+            raise ValueError(
+                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {rear:g}"
+            )
+
+    def scaled(self, factor: float) -> CarValues:
+        """The same car with its lengths multiplied; its mass then is that of no car."""
+        wheelbase = None if self.wheelbase is None else factor * self.wheelbase
+        rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
+        return replace(self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None)
+
+
+@dataclass(frozen=True)
 class CommonOptions:
     """Options of every data set; see docs/data.md."""
 
@@ -49,6 +90,7 @@ class CommonOptions:
     title: str = ""
     kind: Kind = "real"
     vehicle: str | dict[str, Any] | None = None
+    car: Annotated[CarValues, "a mapping of wheelbase, mass and others"] | None = None
     licence: str = ""
     citation: str = ""
     accept: Annotated[tuple[str, ...], "a list of checks"] | None = None
@@ -98,6 +140,34 @@ def _point_in_words(point: Any) -> str:
 Options = TypeVar("Options")
 
 
+def car_of(dataset: Mapping[str, Any]) -> CarValues:
+    """The values of the car that the recordings of a data set show.
+
+    Parameters
+    ----------
+    dataset : mapping
+        Configuration of a data set. Its option ``car`` describes the car as it was recorded; a transform
+        ``scale_to_wheelbase`` scales it. Without ``car`` a simulated data set has the values of its
+        vehicle.
+
+    Returns
+    -------
+    CarValues
+        None for each value that is not known, or not the same in all recordings.
+
+    Raises
+    ------
+    ConfigurationError
+        A value is not positive, or the data set makes no sense.
+    """
+    source = open_source(dataset)
+    car = source.car
+    for transform in source.transforms:
+        if isinstance(transform, ScaleToWheelbase):
+            car = car.scaled(transform.to / transform.wheelbase)
+    return car
+
+
 class Source(ABC):
     """Reads one data set.
 
@@ -127,6 +197,7 @@ class Source(ABC):
             raise ConfigurationError(f"{self.where}: {what}")
         common = self._validated(CommonOptions)
         self.reference_point = common.reference_point
+        self.declared_car = common.car
         try:
             self.transforms = [transform_from_config(entry) for entry in common.transforms or ()]
         except ConfigurationError as error:
@@ -146,6 +217,11 @@ class Source(ABC):
         names = {field.name for field in fields(cast(Any, kind))}
         own = {key: value for key, value in self.dataset.items() if key in names}
         return validated(kind, own, self.where, error=ConfigurationError, group="dataset")
+
+    @property
+    def car(self) -> CarValues:
+        """Values of the car as it was recorded, before any transform."""
+        return self.declared_car or CarValues()
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -19,7 +19,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import check_name
 from vehest.simulation.plant.planar_car import PLANAR, planar_car_from_configuration
 from vehest.simulation.plant.wear import Stint
-from vehest.sources.base import Source
+from vehest.sources.base import CarValues, Source
 
 Whole = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
 SurfaceFile = Annotated[
@@ -99,6 +99,22 @@ class SimulatedSource(Source):
                 check_limit("samples", longest * rate_hz, what, ConfigurationError)
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.where}: {error}") from None
+
+    @property
+    def car(self) -> CarValues:
+        """Declared values, or those of the vehicles; None where drives differ by vehicle, payload or variation."""
+        if self.declared_car is not None:
+            return self.declared_car
+        varied = {name for entry in self.options.vary or () for name in entry["parameters"]}
+        has_payload = any(drive.payload for drive in self.drives.values())
+        cars = [_car_values(vehicle, varied) for vehicle in self.vehicles.values()]
+        common = {
+            name: cars[0][name] if all(car[name] == cars[0][name] for car in cars) else None
+            for name in cars[0]
+        }
+        if has_payload:
+            common |= {"mass": None, "cg_to_rear_axle": None}
+        return CarValues(**common)
 
     def inputs(self) -> dict[str, str | Path]:
         """The multi-body plant's library and its version, where a vehicle is driven by it; there are no files."""
@@ -250,6 +266,24 @@ def _simulator_of(
     if payload:
         own = loaded(own, payload.mass, payload.forward, payload.up)
     return partial(simulate_drive, vehicle=own, stint=tyres, stability_control=stability_control)
+
+
+def _car_values(vehicle: Mapping[str, Any], varied_parameters: Set[str]) -> dict[str, float | None]:
+    """Wheelbase [m], mass [kg] and distance of the centre of gravity from the rear axle [m] of a vehicle; None where varied."""
+    from vehest.simulation.plant.parameters import library_parameters, vehicle_from_configuration
+
+    if vehicle.get("plant") == PLANAR:
+        front, rear, mass = "cg_to_front_axle", "cg_to_rear_axle", "mass"
+        parameters: Any = planar_car_from_configuration(vehicle)
+    else:
+        front, rear, mass = "a", "b", "m"
+        parameters = library_parameters(vehicle_from_configuration(vehicle))
+    lengths = [float(getattr(parameters, name)) for name in (front, rear)]
+    return {
+        "wheelbase": None if {front, rear} & varied_parameters else round(sum(lengths), 9),
+        "mass": None if mass in varied_parameters else float(getattr(parameters, mass)),
+        "cg_to_rear_axle": None if rear in varied_parameters else lengths[1],
+    }
 
 
 SOURCE = SimulatedSource

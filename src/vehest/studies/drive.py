@@ -31,7 +31,7 @@ from vehest.report.document import (
     as_code,
     as_text,
 )
-from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
+from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.explorer import chained, explorer_of
@@ -49,9 +49,17 @@ ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
 EARLIEST_UNIX = 1e8  # s, from which on times count from 1970
 
-VERSION = "3"
-_ACCURACY = ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip")
+VERSION = "4"
+_ACCURACY = (
+    "rmse_sideslip",
+    "rmse_vy",
+    "fvu",
+    "p99_sideslip",
+    "max_error_sideslip",
+    "share_below_min_speed",
+)
 _OF_MODEL = ("n_parameters", "epochs")
+BELOW_MIN_SPEED = "share_below_min_speed"
 _BOUND = "floor_cramer_rao"
 _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rmse_sideslip_std")
 
@@ -115,6 +123,7 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on the validation range (the lower seed of
     two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to the lowest error) are
     corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
+    ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``, at which sideslip is not scored.
     ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
     initial state over, else ``own``.
     Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
@@ -124,6 +133,9 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     rows: list[dict[str, object]] = []
     for test_set in artefacts.split.tests:
         ranking = ranking_of(artefacts, test_set)
+        min_speed = artefacts.protocol.describe_min_sideslip_speed(
+            span.dataset for span in artefacts.split.tests[test_set]
+        )
         placed = list[tuple[float, dict[str, object]]]()
         for name, models in by_name(artefacts.models).items():
             seeds = sorted(model.seed for model in models)
@@ -137,6 +149,7 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
                 "test_set": test_set,
             }
             row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
+            row |= {"min_sideslip_speed": min_speed}
             chosen = shown.pop("rmse_sideslip")
             finite = name in ranking.order and math.isfinite(chosen)
             row |= {
@@ -249,7 +262,8 @@ def how_it_was_made(
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values. Estimators may "
         f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
-        "Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike.",
+        f"Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike."
+        f"{protocol.describe_sideslip(artefacts.split.datasets)}{_describe_excluded(artefacts)}",
         *choice,
         *artefacts.facts,
     ]
@@ -287,6 +301,19 @@ def how_it_was_made(
         },
     )
     return "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges
+
+
+def _describe_excluded(artefacts: PartArtefacts) -> str:
+    """A sentence, after a space, on the share of each test set at which sideslip is not scored."""
+    shares = {
+        test_set: run[BELOW_MIN_SPEED]
+        for (*_, test_set), run in runs_of(artefacts).items()
+        if test_set in artefacts.split.tests and BELOW_MIN_SPEED in run
+    }
+    named = [
+        f"{fixed(100 * share, 1)} % of test set {as_code(name)}" for name, share in shares.items()
+    ]
+    return f" Excluded, since the car is slower: {listed(named)}." if named else ""
 
 
 def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
@@ -478,7 +505,15 @@ def _joined(parts: Sequence[Scored], step: float) -> Scored:
 
     vy = over("vy")
     time: FloatArray = np.arange(len(vy), dtype=np.float64) * step
-    return Scored(time, vy, over("vy_ref"), over("sideslip"), over("sideslip_ref"), over("ay"))
+    is_scored = np.nan_to_num(over("is_sideslip_scored")).astype(np.bool_)
+    return Scored(
+        time, vy, over("vy_ref"), over("sideslip"), over("sideslip_ref"), over("ay"), is_scored
+    )
+
+
+def _drawn(part: Scored, sideslip: FloatArray) -> FloatArray:
+    """Sideslip where it is scored, else NaN, (K,) [deg]."""
+    return np.where(part.is_sideslip_scored, np.degrees(sideslip), np.nan)
 
 
 def _gap_of(parts: Sequence[Scored]) -> int:
@@ -494,7 +529,8 @@ def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[fl
     offset = 0
     for part in parts:
         n = min(round(ZOOM_SECONDS / step), len(part.time))
-        power = np.convolve(np.square(part.sideslip_ref), np.full(n, 1.0 / n), mode="valid")
+        sideslip = np.where(part.is_sideslip_scored, part.sideslip_ref, 0.0)
+        power = np.convolve(np.square(sideslip), np.full(n, 1.0 / n), mode="valid")
         if power.max() > best:
             best = float(power.max())
             first = offset + int(power.argmax())
@@ -513,6 +549,8 @@ def _figures_of(
         name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()
     }
     parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
+    if not any(part.is_sideslip_scored.any() for part in next(iter(parts.values()))):
+        return []
     step = 1.0 / artefacts.protocol.rate_hz
     drives = {name: _joined(own, step) for name, own in parts.items()}
     first = next(iter(parts.values()))
@@ -522,9 +560,11 @@ def _figures_of(
     start = float(drive.time[0])
     begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
     axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
-    reference = figures.Traces("measured", REFERENCE, drive.vy_ref, np.degrees(drive.sideslip_ref))
+    reference = figures.Traces(
+        "measured", REFERENCE, drive.vy_ref, _drawn(drive, drive.sideslip_ref)
+    )
     traces = [
-        figures.Traces(rows[name]["title"], lines[name], own.vy, np.degrees(own.sideslip))
+        figures.Traces(rows[name]["title"], lines[name], own.vy, _drawn(own, own.sideslip))
         for name, own in drives.items()
     ]
     inside = (drive.time >= zoom[0]) & (drive.time <= zoom[1])
@@ -532,12 +572,15 @@ def _figures_of(
         figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside])
         for t in (reference, *traces)
     ]
-    scored = ~np.isnan(drive.vy_ref)  # samples, not gaps
     errors = [
-        (str(rows[name]["title"]), lines[name], np.degrees(own.sideslip - own.sideslip_ref)[scored])
+        (
+            str(rows[name]["title"]),
+            lines[name],
+            np.degrees(own.sideslip - own.sideslip_ref)[own.is_sideslip_scored],
+        )
         for name, own in drives.items()
     ]
-    has_ay = bool(np.isfinite(drive.ay[scored]).all())
+    has_ay = bool(np.isfinite(drive.ay[~np.isnan(drive.vy_ref)]).all())  # at samples, not in gaps
     found: list[Block] = [
         Figure(
             f"traces_{file}",
@@ -571,7 +614,9 @@ def _figures_of(
         )
         found.append(
             Figure(
-                f"errors_over_ay_{file}", caption, figures.error_over_ay(drive.ay[scored], errors)
+                f"errors_over_ay_{file}",
+                caption,
+                figures.error_over_ay(drive.ay[drive.is_sideslip_scored], errors),
             )
         )
     return found

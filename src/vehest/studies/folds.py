@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
@@ -123,10 +122,11 @@ def overview(
         }
         row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
         for fold, part in enumerate(parts):
-            square = np.mean(
-                [own[fold].squared_error_sideslip.sum() / own[fold].samples.sum() for own in seeds]
+            square, samples = (
+                sum(float(getattr(own[fold], name).sum()) for own in seeds)
+                for name in ("squared_error_sideslip", "sideslip_samples")
             )
-            row[part] = float(np.sqrt(square))
+            row[part] = math.sqrt(square / samples) if samples else math.nan
         rows.append(row)
     return pd.DataFrame(rows)
 

@@ -19,7 +19,7 @@ from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
-from vehest.evaluation.metrics import pieces_of, scored_range
+from vehest.evaluation.metrics import is_fast_enough, pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
 from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
@@ -35,7 +35,7 @@ SHOWS_FAILED = True
 HARD = 4.0  # m/s², from which on driving says something of the tyres
 PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
-VERSION = "6"
+VERSION = "7"
 leaderboard = drive.leaderboard
 Verdict = tuple[
     list[str], EvaluatedModel | None
@@ -104,7 +104,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
     silent = cannot_rank(part, test_set)
     if not ranking.order:
-        return [f"No estimator gave a finite error on test set `{test_set}`."], None
+        return [f"No estimator has a finite sideslip error on test set `{test_set}`."], None
     if ranking.n_blocks < LEAST_BLOCKS:
         silent = [
             f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least",
@@ -193,16 +193,19 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     protocol = part.protocol
     scored = list[FloatArray]()
     hidden = list[FloatArray]()
-    standing = 0
+    n_slow = 0
     ranges = pieces_of(part.split.tests[test_set], part.reference, protocol)
     for recording, piece in ranges:
         begin = recording.index_range(piece.start, piece.stop)[0]
         (first, end) = scored_range(recording, piece, protocol)
-        still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed
-        sideslip = np.degrees(
-            np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"])))
+        slow = ~is_fast_enough(
+            recording["vx"],
+            recording["vy_ref"],
+            protocol.min_sideslip_speed_on(piece.dataset),
         )
-        standing += int(still[first:end].sum())
+        sideslip = np.degrees(np.abs(np.arctan2(recording["vy_ref"], recording["vx"])))
+        sideslip[slow] = np.nan
+        n_slow += int(slow[first:end].sum())
         hidden.append(sideslip[begin:first])
         scored.append(sideslip[first:end])
     counted = np.concatenate(scored)
@@ -215,8 +218,11 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
     if most_hidden > most:
         words += f", **which hide the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
-    if standing:
-        words += f"; {fixed(100.0 * standing / len(counted), 1)} % of what is scored is standstill, with a sideslip of 0"
+    if n_slow:
+        speed = protocol.describe_min_sideslip_speed(
+            span.dataset for span in part.split.tests[test_set]
+        )
+        words += f"; in {fixed(100.0 * n_slow / len(counted), 1)} % of that the car is slower than {speed}, and only v is scored"
     return f"{words}."
 
 

@@ -556,7 +556,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     warm_up = f"; estimators may start up to {part.protocol.warm_up_seconds:g} s before a {part.protocol.piece}"
     lines = [
         f"Command: {as_code(artefacts.command)}, with Optuna installed",
-        methods.scoring(part.protocol, warm_up),
+        methods.scoring(part, warm_up),
         f"Preprocessing as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz on measurements and reference; "
         "both look ahead. Indicators are against the low-passed reference.",
         "MSE over all samples; MSE_nl over those with |ay| ≥ 4 m/s²; ME and ME_nl are the largest absolute error of each manoeuvre, "

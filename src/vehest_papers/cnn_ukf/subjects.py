@@ -184,12 +184,7 @@ def until(part: Scored, sideslip: float) -> Scored:
     """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least."""
     beyond = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
     last = max(int(beyond[0]), 1) if len(beyond) else len(part.time)
-    return Scored(
-        *(
-            getattr(part, name)[:last]
-            for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")
-        )
-    )
+    return part.at(slice(last))
 
 
 class Prepared:

@@ -242,15 +242,7 @@ def _network_outputs(
 def _within(part: Scored, window: tuple[float, float] | None) -> Scored:
     if window is None:
         return part
-    kept = (part.time >= window[0]) & (part.time <= window[1])
-    return Scored(
-        part.time[kept],
-        part.vy[kept],
-        part.vy_ref[kept],
-        part.sideslip[kept],
-        part.sideslip_ref[kept],
-        part.ay[kept],
-    )
+    return part.at((part.time >= window[0]) & (part.time <= window[1]))
 
 
 def _from_start(part: Scored) -> FloatArray:

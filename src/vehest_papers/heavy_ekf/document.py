@@ -162,7 +162,7 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        methods.scoring(artefacts.parts[TRUCK].protocol),
+        methods.scoring(artefacts.parts[TRUCK]),
         "RMSE(β) is over β = atan2(v, u) with the measured u, Equation 65; of the truck at 2 m/s and more, since below "
         "β means little and the paper's sensor diverges as well.",
         "Axle curves are fitted by least squares to training drives, the truck's to those on nominal tyres; levels of noise are those with "

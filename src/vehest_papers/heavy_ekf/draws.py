@@ -64,12 +64,12 @@ def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Bloc
 def by_drive(
     part: PartArtefacts, model: EvaluatedModel, test: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums of squared errors of β [deg²] and samples of each drive of a test set, each of shape (drives,)."""
+    """Sums of squared errors of β [deg²] of each drive of a test set, and samples at which it is scored, each of shape (drives,)."""
     own = model.segments(test)
     spans = part.split.tests[test]
     drives = list(dict.fromkeys(span.recording for span in spans))
     at = np.array([drives.index(spans[int(piece)].recording) for piece in own.piece])
-    sums = [own.squared_error_sideslip, own.samples]
+    sums = [own.squared_error_sideslip, own.sideslip_samples]
     squared, samples = (np.bincount(at, values, len(drives)).astype(np.float64) for values in sums)
     return squared, samples
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
-from vehest.evaluation.metrics import Protocol
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.warnings import warnings_of
@@ -27,11 +26,13 @@ def absent_parts(artefacts: StudyArtefacts) -> str:
     return f" Not in this report, since the recordings are missing: {absent}." if absent else ""
 
 
-def scoring(protocol: Protocol, reading: str = "") -> str:
-    """How estimates are scored; ``reading`` follows the rate at which they are read."""
+def scoring(part: PartArtefacts, reading: str = "") -> str:
+    """How estimates of a part are scored; ``reading`` follows the rate at which they are read."""
+    protocol = part.protocol
     return (
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first {protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored.{protocol.start_in_words}"
+        f"{protocol.describe_sideslip(part.split.datasets)}"
     )
 
 

@@ -18,7 +18,7 @@ from vehest.estimators.luenberger import Luenberger
 from vehest.estimators.model_files import load_model
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.evaluation.blocks import Segments, segments_of
-from vehest.evaluation.metrics import Scored, pieces_of, score
+from vehest.evaluation.metrics import Scored, is_fast_enough, pieces_of, score
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.training.members import prepare
 from vehest_papers.kit.reading import recordings_of
@@ -88,7 +88,9 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
     All windows end at the same samples. Candidates are called by the length, in samples.
     """
     segments: dict[str, list[Segments]] = {}
-    recordings = recordings_of(scheme.part, scheme.part.split.tests[test])
+    spans = scheme.part.split.tests[test]
+    recordings = recordings_of(scheme.part, spans)
+    speeds = [scheme.part.protocol.min_sideslip_speed_on(span.dataset) for span in spans]
     for model in scheme.models(category)[:MOST_SEEDS]:
         estimator = load_model(model.model_folder)
         if (
@@ -99,8 +101,8 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
         for length in WINDOWS:
             parts = [
                 own
-                for recording in recordings
-                if (own := _with_window(estimator, recording, length)) is not None
+                for recording, speed in zip(recordings, speeds, strict=True)
+                if (own := _with_window(estimator, recording, length, speed)) is not None
             ]
             if parts:
                 segments.setdefault(str(length), []).append(
@@ -109,7 +111,9 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
     return SegmentErrors(segments, f"{test} after the start", same_models=True)
 
 
-def _with_window(estimator: WindowedEstimator, recording: Recording, length: int) -> Scored | None:
+def _with_window(
+    estimator: WindowedEstimator, recording: Recording, length: int, min_sideslip_speed: float
+) -> Scored | None:
     """Estimates from windows of a length, every `STRIDE` samples from where the longest is full."""
     ends = np.arange(max(WINDOWS), len(recording), STRIDE)
     if not len(ends):
@@ -122,7 +126,13 @@ def _with_window(estimator: WindowedEstimator, recording: Recording, length: int
         vy = network(windows).double().numpy().reshape(-1)
     speed, reference, ay = (recording[name][ends] for name in ("vx", "vy_ref", "ay"))
     return Scored(
-        recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay
+        recording.time[ends],
+        vy,
+        reference,
+        np.arctan2(vy, speed),
+        np.arctan2(reference, speed),
+        ay,
+        is_fast_enough(speed, reference, min_sideslip_speed),
     )
 
 

@@ -66,6 +66,7 @@ class SegmentErrors(SampledErrors):
         of_seeds = int(generator.integers(2**31))
         counts = resampled(self.n_blocks, N_RESAMPLES if self.n_blocks > 1 else 0, generator)
         total = np.maximum(counts @ sizes, 1.0)
+        moving = np.maximum(counts @ block_sums(first.sideslip_samples, labels), 1.0)
         mean, square = (
             counts @ block_sums(getattr(first, own), labels) / total
             for own in ("vy_ref", "squared_vy_ref")
@@ -75,8 +76,12 @@ class SegmentErrors(SampledErrors):
             vy, error, sideslip = (
                 counts
                 @ block_sums(np.stack([getattr(part, own) for part in parts]), labels).T
-                / total[:, None]
-                for own in ("squared_error_vy", "error_vy", "squared_error_sideslip")
+                / number[:, None]
+                for own, number in (
+                    ("squared_error_vy", total),
+                    ("error_vy", total),
+                    ("squared_error_sideslip", moving),
+                )
             )
             fvu = (vy - np.square(error)) / np.maximum(variance, 1e-12)[:, None]
             for metric, values in zip(METRICS, (fvu, vy, sideslip), strict=True):
@@ -117,7 +122,11 @@ def masked_segments(
     fields = ("vy", "vy_ref", "sideslip", "sideslip_ref")
     chosen = segments_of(
         [
-            replace(part, **{name: getattr(part, name) * mask for name in fields})
+            replace(
+                part,
+                **{name: getattr(part, name) * mask for name in fields},
+                is_sideslip_scored=part.is_sideslip_scored & (mask > 0),
+            )
             for part, mask in marked
         ],
         rate_hz,

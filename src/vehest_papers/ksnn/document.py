@@ -240,7 +240,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     lines = [
         f"Command: {as_code(artefacts.command)}; {fits} fits",
         methods.scoring(
-            artefacts.parts["scheme_1"].protocol, ", held and never interpolated from later values"
+            artefacts.parts["scheme_1"], ", held and never interpolated from later values"
         ),
         "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
         "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "

@@ -80,12 +80,12 @@ def how_it_was_made(
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
     """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
-    protocol = next(iter(main.values())).protocol
+    first = next(iter(main.values()))
     trained = {model.estimator for part in artefacts.parts.values() for model in part.models}
     data["training_settings"] = settings_table(main)
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        methods.scoring(protocol),
+        methods.scoring(first),
         "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
         "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",

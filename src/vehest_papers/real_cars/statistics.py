@@ -171,7 +171,12 @@ def _at_rate(recording: Recording) -> Recording:
 
 
 def _drive(piece: Recording) -> Drive:
-    whole = Protocol(rate_hz=piece.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
+    whole = Protocol(
+        rate_hz=piece.rate_hz,
+        warm_up_seconds=0.0,
+        skip_seconds=0.0,
+        min_sideslip_speed=0.0,  # pieces are those in which the car drives (`_driven`)
+    )
     return drive_of(piece, Span("", piece.id), whole)
 
 

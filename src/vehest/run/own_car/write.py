@@ -15,7 +15,6 @@ import yaml
 
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
-from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
@@ -449,10 +448,7 @@ def _pipeline_of(
                     "sweeps": [[*scratch, PRETRAINED]],
                 }
                 parts[f"minutes_{own:g}_tuned"] = part | tuned
-    evaluation = {
-        "rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)]),
-        "least_speed": STANDSTILL_SPEED,
-    }
+    evaluation = {"rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)])}
     study = {
         "study": name,
         "title": f"Which estimator to trust on {name}",

@@ -57,6 +57,8 @@ def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
 
 
 def _against_best(ranking: Ranking, name: Name) -> str:
+    if not ranking.order:
+        return MISSING
     if name == ranking.order[0]:
         return "lowest"
     own = ranking.pairs.get((ranking.order[0], name))
@@ -68,7 +70,7 @@ def _against_best(ranking: Ranking, name: Name) -> str:
 def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) -> str:
     """Who has the lowest error, and whether that is more than chance: a winner only where it may be called one."""
     if not ranking.order:
-        return f"On {where} no estimator gave a finite error."
+        return f"On {where} no estimator has a finite sideslip error."
     best = ranking.order[0]
     figure = f"RMSE(β) over all seeds {fixed(ranking.rmse[best], 3)}°"
     if best in ranking.intervals:

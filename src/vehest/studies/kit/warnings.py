@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.splits import Span
+from vehest.evaluation.metrics import is_fast_enough
 from vehest.report.document import as_code, as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
@@ -35,11 +35,25 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
     ]
     return [
         *left_out,
+        *_standing(artefacts),
         *_excitation(artefacts),
         *_floors(artefacts),
         *_kinds(artefacts),
         *_epoch_limits(artefacts),
     ]
+
+
+def _standing(artefacts: PartArtefacts) -> list[str]:
+    """Tests in which the car is too slow throughout for sideslip to be scored."""
+    runs = runs_of(artefacts)
+    found = []
+    for test_set, spans in artefacts.split.tests.items():
+        if _lowest(runs, test_set, "share_below_min_speed") == 1.0:
+            speed = artefacts.protocol.describe_min_sideslip_speed(span.dataset for span in spans)
+            found.append(
+                f"Test set `{test_set}`: sideslip is not scored, since the car is slower than {speed} throughout; RMSE(v) counts all samples."
+            )
+    return found
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
@@ -168,7 +182,7 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
-    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, without standstill and gaps of the reference."""
+    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where sideslip is scored and measured."""
     parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
@@ -177,7 +191,8 @@ def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, Flo
         own = recording.cut(max(span.start, -math.inf), span.stop)
         if "ay" not in own:
             parts.pop("ay", None)
-        known = np.hypot(own["vx"], own["vy_ref"]) >= STANDSTILL_SPEED
+        min_speed = artefacts.protocol.min_sideslip_speed_on(span.dataset)
+        known = is_fast_enough(own["vx"], own["vy_ref"], min_speed)
         known &= np.isfinite(own["ay"]) if "ay" in parts else True
         if "ay" in parts:
             parts["ay"].append(own["ay"][known])
