@@ -255,7 +255,7 @@ print(peak() - before)
 
 
 def test_packed_tables_that_unpack_to_too_much_are_refused_within_the_limit_on_memory(tmp_path):
-    limit = 60_000_000
+    limit = 30_000_000
     rows_of = (
         b"1,1,1\n",
         b"1,1,1\n" + 9 * b"\n",
