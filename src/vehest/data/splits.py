@@ -30,7 +30,7 @@ def check_name(name: str, what: str) -> None:
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
-            f"{what}: '{printable(name[:60])}' must be made of the letters A to Z, digits, '_', '-' and "
+            f"{what}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
             "'.', begin with none of the last two and not end with '.'; it becomes part of file names"
         )
     if len(name) > LONGEST_NAME:
