@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
 
 import vehest
 from conftest import planar_drive
@@ -263,3 +264,15 @@ def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root, 
     found = compare("pretrained", ferrari(*FERRARI), tmp_path)
     assert found.lost > 200  # of 15,000 samples and two messages, 1 % each
     assert max(found.ratios) < 1.05
+
+
+def test_a_stray_stamp_in_a_log_is_refused_before_a_sample_or_a_file_is_made(tmp_path):
+    written = write_log(drive(), tmp_path, ".log")
+    lines = written.log.read_text().splitlines(keepends=True)
+    at = len(lines) * 3 // 4
+    lines[at] = "(10000000000.000000)" + lines[at].partition(")")[2]
+    written.log.write_text("".join(lines))
+    message = refusal(lambda: replayed(written, out=tmp_path / "out.csv"))
+    assert f"'{written.log}' would give 830000000000 samples" in message
+    assert "limits.samples=NUMBER" in message
+    assert not (tmp_path / "out.csv").exists()

@@ -6,6 +6,7 @@ from refusals import refusal
 
 from vehest.bus.sampling import Sampler, Timing, timing_of
 from vehest.data.errors import ConfigurationError
+from vehest.data.limits import Limits, use_limits
 
 CYCLE = 0.01
 
@@ -99,3 +100,15 @@ def test_slower_messages_hold_for_their_own_period_and_no_longer():
     missing = [time for time, _, gone in run(timing, frames, fast[-1]) if "vx" in gone]
     assert len(missing) == 5
     assert missing[0] == pytest.approx(slow[200] + timing.offset, abs=CYCLE)
+
+
+def test_a_stamp_far_ahead_is_refused_before_any_of_the_samples_in_between_is_formed():
+    sampler = Sampler(timing_of({"ay": arrivals()}))
+    first = sampler.next_time
+    for ahead in (1e10, 1e308, np.inf):
+        assert "remove a frame with a stray stamp" in refusal(
+            lambda ahead=ahead: next(sampler.samples_before(ahead))
+        )
+    assert sampler.next_time == first
+    with use_limits(Limits(samples=100)):
+        assert len(list(sampler.samples_before(first + 99.5 * CYCLE))) == 100

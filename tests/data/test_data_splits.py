@@ -17,7 +17,7 @@ from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.runs import equal_runs, true_runs
 from vehest.data.split_files import dataset_names, limit_minutes, split_from_config
-from vehest.data.splits import Span, Split
+from vehest.data.splits import Span, Split, check_name
 from vehest.data.windows import windows_of
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
@@ -719,3 +719,25 @@ def test_runs_are_those_of_a_count_sample_by_sample(length, seed):
         counted.append((value, [begin, place]))
     assert equal_runs(samples).tolist() == [run for _, run in counted]
     assert true_runs(samples == 1).tolist() == [run for value, run in counted if value == 1]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("1", "1e5", "0x1f", "1.5", "2024-05-03", "null", "True", "no", "off", "nan", "inf"),
+        *("öäü", "-lap", ".lap", "lap.", "a b", "a'b", 'a"b', "a/b", "a\nb", "", "~"),
+        *("con", "NUL.x", "lpt1", "a" * 101),
+    ],
+)
+def test_a_name_that_means_something_else_in_yaml_an_override_or_a_file_is_refused(name):
+    message = one_line(lambda: check_name(name, "data set"), ConfigurationError)
+    assert message.startswith("data set: ")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "name", ["lap", "250lm", "ferrari_250lm", "a.b-c", "_x", "a" * 100, "null1"]
+)
+def test_a_plain_name_is_taken_and_yaml_reads_it_as_text(name):
+    check_name(name, "data set")
+    assert yaml.safe_load(name) == name

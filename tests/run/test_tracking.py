@@ -14,6 +14,7 @@ from dataclasses import replace
 import pytest
 
 from processes import start, wait_for
+from vehest.data.errors import MissingError
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.tracking import Tracker
 
@@ -281,3 +282,14 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     assert {key: int(value) for key, value in run.data.params.items()} == {
         f"group.{key}": v for key, v in config["group"].items()
     }
+
+
+@pytest.mark.parametrize(
+    "address", ["/etc", "file:///etc/x", "{root}/../x", "file:{root}/../x", "dbfs:/x", "c:/x"]
+)
+def test_a_server_may_not_choose_a_local_folder_outside_the_output_root(tmp_path, address):
+    tracker = Tracker({"name": "mlflow", "uri": "http://localhost:1"}, tmp_path, print)
+    with pytest.raises(MissingError, match="no folder of the output root and no server"):
+        tracker._require_place(address.format(root=tmp_path))
+    for allowed in (f"file://{tmp_path}/mlartifacts/0", "mlflow-artifacts:/0", "s3://runs/0"):
+        tracker._require_place(allowed)

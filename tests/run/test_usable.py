@@ -24,6 +24,7 @@ from vehest.data.recording_summary import (
 from vehest.data.schema import settings_from_config
 from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
+from vehest.estimators import registry
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.comparison import lower_rate
@@ -562,3 +563,19 @@ def test_rates_that_recordings_have_are_left_alone_and_what_a_lower_one_means_is
         compose_config("eval", ["estimator=velocity_gru"]), "estimator", at(50.0)
     )
     assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text
+
+
+def test_an_estimator_of_another_package_that_cannot_be_loaded_is_listed_with_the_reason(
+    monkeypatch,
+):
+    class Broken:
+        name = "broken"
+
+        def load(self):
+            raise RuntimeError("no such GPU")
+
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [Broken()])
+    config = {"estimator": {"name": "broken"}, "training": {}}
+    row = usability("broken", config, [])
+    assert row.usable == "no"
+    assert "cannot be loaded (RuntimeError: no such GPU)" in row.to_give

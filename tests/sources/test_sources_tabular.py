@@ -1,6 +1,9 @@
 """Tables of any make: what pandas reads, in SI units and ISO 8855 signs; and one clear line for what cannot be used."""
 
+import bz2
 import gzip
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -159,6 +162,8 @@ def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path):
         ({"gappy": ["ay"], "channels": {"vx": {"column": "a", "unit": "m/s"}}}, "gappy names 'ay'"),
         ({"encoding": "latin-x"}, "dataset.encoding: 'latin-x' is not known"),
         ({"files": "/data/*.csv"}, "files must be a pattern inside path"),
+        ({"files": "a**b"}, "files must be a pattern inside path"),
+        ({"files": "."}, "files must be a pattern inside path"),
         ({"rate_hz": "100"}, "dataset.rate_hz must be a number, not '100'"),
         ({"clock": 3}, "dataset.clock '3' is not one of: strict, interpolate"),
         ({"kind": "dreamt"}, "dataset.kind 'dreamt' is not one of: real, simulated"),
@@ -216,3 +221,65 @@ def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path):
         assert "limits.memory=NUMBER" in refusal(lambda: read(bomb))
     torn = written(tmp_path, bomb.read_bytes()[:-100], "torn.csv.gz")
     assert "cannot be read" in refusal(lambda: read(torn))
+
+
+def packed_rows(folder, name, row, size):
+    """A table of one repeated row, ``size`` bytes of it, packed."""
+    head = b"time,vx,ay\n"
+    content = head + row * (size // len(row))
+    packed = bz2.compress(content) if name.endswith(".bz2") else gzip.compress(content, 6)
+    return written(folder, packed, name)
+
+
+PEAKS = """
+import resource, sys
+from pathlib import Path
+from vehest.data.errors import DataError
+from vehest.data.limits import Limits, use_limits
+from vehest.sources.surveys.tables import survey_table
+from vehest.sources.tables import TextLayout, read_columns
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+before = peak()
+for name in sys.argv[2:]:
+    for read in (survey_table, lambda file: read_columns(file, ["time"], TextLayout())):
+        try:
+            with use_limits(Limits(memory=int(sys.argv[1]))):
+                read(Path(name))
+        except DataError as error:
+            print("limits.memory" in str(error))
+print(peak() - before)
+"""
+
+
+def test_packed_tables_that_unpack_to_too_much_are_refused_within_the_limit_on_memory(tmp_path):
+    limit = 30_000_000
+    rows_of = (
+        b"1,1,1\n",
+        b"1,1,1\n" + 9 * b"\n",
+        b"1,,\n",
+        b"some text,1,1\n",
+        b"1" * 5000 + b",1,1\n",
+    )
+    files = [
+        packed_rows(tmp_path, f"{k}.csv{'.bz2' if k == 1 else '.gz'}", row, 3 * limit // 2)
+        for k, row in enumerate(rows_of)
+    ]
+    order = [sys.executable, "-c", PEAKS, str(limit), *map(str, files)]
+    child = subprocess.run(order, capture_output=True, text=True, check=True)
+    *refused, peak = child.stdout.split()
+    assert refused == ["True"] * 2 * len(files)
+    assert int(peak) < limit
+
+
+def test_an_honest_packed_table_is_read_within_the_limit_and_cells_count_beside_the_text(tmp_path):
+    rows_of = b"".join(b"%.2f,5.25,0.125\n" % (k / 100) for k in range(2000))
+    file = written(tmp_path, gzip.compress(b"time,vx,ay\n" + rows_of), "lap.csv.gz")
+    taken = len(rows_of) + len(b"time,vx,ay\n") + 16 * 3 * 2001
+    beyond = taken - 10 * file.stat().st_size
+    with use_limits(Limits(memory=beyond)):
+        assert len(read(file)) == 2000
+    with use_limits(Limits(memory=beyond - 1)):
+        assert f"unpacks to {taken} bytes" in refusal(lambda: read(file))

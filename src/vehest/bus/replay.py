@@ -23,7 +23,7 @@ import numpy as np
 from vehest.bus.mapping import BusSignals
 from vehest.bus.messages import EstimateFrames
 from vehest.bus.outputs import Output
-from vehest.bus.sampling import Sample, Sampler, Timing, timing_of
+from vehest.bus.sampling import Sample, Sampler, Timing, check_samples, timing_of
 from vehest.bus.view import Figures, View
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.text_files import first_line
@@ -42,7 +42,8 @@ SWITCH_SECONDS = (
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
     """Timing of a bus from the first seconds of a log, and from further on for signals that come later.
 
-    Raises `DataError`: it cannot be used, or a signal never occurs. Raises `ConfigurationError`: the rate is none.
+    Raises `DataError`: it cannot be used, a signal never occurs, or its stamps span more samples than
+    the limits allow. Raises `ConfigurationError`: the rate is none.
     """
     stamps = {name: array("d") for name in signals.wanted}
     first = math.inf
@@ -61,7 +62,9 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Ti
             raise DataError(
                 f"'{log.file}': stamps of message '{wanted.message.name}' repeat or go back; where two buses carry it, name one"
             )
-    return timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz)
+    timing = timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz)
+    check_samples(timing.first, log.last_stamp, timing.rate_hz, f"'{log.file}'")
+    return timing
 
 
 @dataclass(frozen=True)
@@ -264,8 +267,7 @@ class Replay:
 
     def _advance(self, now: float) -> None:
         """Deal with the samples whose instant lies before now [s]."""
-        while self.sampler.next_time < now:
-            sample = self.sampler.sample()
+        for sample in self.sampler.samples_before(now):
             started = time.perf_counter()
             self._estimate(sample)
             took = (

@@ -8,7 +8,7 @@ follow the sender's clock, which is not the receiver's, by a phase-locked loop o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,6 +17,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
+from vehest.data.limits import check_limit
 from vehest.sources.clocks import mean_step, plain_rate
 
 GAIN = 0.02  # share of an arrival's deviation by which the next instant moves: a time constant of 50 samples
@@ -78,6 +79,16 @@ def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
     return float(np.angle(mean) / (2 * np.pi) * cycle % cycle) if abs(mean) > 0.5 else None
 
 
+def check_samples(first: float, last: float, rate_hz: float, where: str) -> None:
+    """Refuse, by a `DataError`, stamps [s] so far apart that too many samples lie between them."""
+    n_samples = (last - first) * rate_hz
+    what = f"from {first:.12g} s to {last:.12g} s at {rate_hz:.6g} Hz"
+    remedy = "remove a frame with a stray stamp"
+    check_limit(
+        "samples", n_samples, f"{where} would give {n_samples:.0f} samples {what} ({remedy})"
+    )
+
+
 class Sample(NamedTuple):
     """What is known of a bus at one instant."""
 
@@ -110,6 +121,15 @@ class Sampler:
                 stamp - self.next_time + self.timing.offset + 0.5 * self.cycle
             ) % self.cycle - 0.5 * self.cycle
             self._deviation = min(max(early, -0.25 * self.cycle), 0.25 * self.cycle)
+
+    def samples_before(self, now: float) -> Iterator[Sample]:
+        """Samples whose instant lies before ``now`` [s].
+
+        Raises `DataError`: a time so far ahead that they would be more than the limits allow.
+        """
+        check_samples(self.next_time, now, self.timing.rate_hz, "the bus")
+        while self.next_time < now:
+            yield self.sample()
 
     def sample(self) -> Sample:
         """The sample at ``next_time``, which moves on by a cycle."""

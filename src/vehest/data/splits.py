@@ -8,17 +8,42 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise, product
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, printable
 
 VALIDATION = "validation"
 TRAINING = "training"
+LONGEST_NAME = 100  # characters, so that file names with a stage and a key stay below 255
+YAML_WORDS = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n", "nan", "inf"])
+YAML_NUMBER = re.compile(
+    r"0[xob][0-9a-f_]+|[0-9][0-9_]*(\.[0-9_]*)?(e-?[0-9]+)?|[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}",
+    re.IGNORECASE,
+)
+WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse, by a `ConfigurationError`, a name that holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot."""
-    if not re.fullmatch(r"[\w-][\w.-]*", name):
+    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or an override.
+
+    It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
+    with none of the last, and has `LONGEST_NAME` characters at most. It is no word or number of
+    YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
-            f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names"
+            f"{what}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
+            "'.', begin with none of the last two and not end with '.'; it becomes part of file names"
+        )
+    if len(name) > LONGEST_NAME:
+        raise ConfigurationError(
+            f"{what}: '{name[:20]}…' has {len(name)} characters; take {LONGEST_NAME} at most"
+        )
+    if name.lower() in YAML_WORDS or YAML_NUMBER.fullmatch(name):
+        raise ConfigurationError(
+            f"{what}: '{name}' is a word or number of YAML; add letters, such as car_{name}"
+        )
+    if WINDOWS_DEVICE.fullmatch(name.partition(".")[0]):
+        raise ConfigurationError(
+            f"{what}: '{name}' is a device of Windows, not a file; add letters, such as car_{name}"
         )
 
 

@@ -12,7 +12,8 @@ from functools import cache
 from importlib.metadata import entry_points
 
 import vehest.estimators as package
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, printable
+from vehest.data.text_files import first_line
 from vehest.estimators.base import Estimator
 
 ENTRY_POINTS = "vehest.estimators"
@@ -40,7 +41,13 @@ def estimator_class(name: str) -> type[Estimator]:
         return own
     points = entry_points(group=ENTRY_POINTS, name=name)
     if points:
-        loaded: type[Estimator] = next(iter(points)).load()
+        try:
+            loaded: type[Estimator] = next(iter(points)).load()
+        except Exception as error:  # a package may raise anything when it is imported
+            what = f"{type(error).__name__}: {printable(first_line(error))}"
+            raise ConfigurationError(
+                f"estimator '{name}' of another package cannot be loaded ({what}); repair or remove it"
+            ) from error
         return loaded
     raise ConfigurationError(f"estimator '{name}' is not one of: {', '.join(estimator_names())}")
 

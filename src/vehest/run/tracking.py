@@ -15,7 +15,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
+from vehest.data.errors import MissingError, printable
 from vehest.data.files import regular_file, remove_leftovers, written_aside
 from vehest.run.artefacts import MANIFEST, Artefact
 from vehest.run.calibrate import calibration_figures
@@ -25,6 +28,9 @@ from vehest.run.train import HISTORY, read_fit_metrics
 from vehest.studies.artefacts import read_frame
 
 STORE = "mlflow.db"
+REMOTE_ARTIFACTS = frozenset(
+    ["mlflow-artifacts", "http", "https", "s3", "gs", "wasbs", "abfss", "ftp", "sftp", "hdfs"]
+)  # schemes of addresses at which MLflow writes to another machine
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
 KEY_TAG = "vehest.key"
@@ -107,10 +113,28 @@ class Tracker:
         for start in range(0, max(len(points), len(parameters)), VALUES_A_REQUEST):
             batch = slice(start, start + VALUES_A_REQUEST)
             client.log_batch(run_id, points[batch], parameters[batch])
+        self._require_place(str(run.info.artifact_uri))
         for file in [*artefact.outputs, MANIFEST]:
             if not file.endswith(".parquet"):
                 client.log_artifact(run_id, str(artefact.folder / file), os.path.dirname(file))
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else "KILLED")
+
+    def _require_place(self, address: str) -> None:
+        """Refuse artefacts at an address that is a folder of this machine outside the output root.
+
+        A server says where the artefacts of a run go. MLflow writes to a ``file:`` address, or to
+        one without a scheme, on this machine; no server may choose what is overwritten here.
+        """
+        parts = urlsplit(address)
+        if parts.scheme in REMOTE_ARTIFACTS:
+            return
+        folder = Path(url2pathname(parts.path) if parts.scheme else address)
+        if parts.scheme in ("", "file") and folder.resolve().is_relative_to(self._root):
+            return
+        raise MissingError(
+            f"it names '{printable(address[:80])}' for artefacts, no folder of the output root and "
+            "no server; start it with --serve-artifacts"
+        )
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
         wanted = " and ".join(

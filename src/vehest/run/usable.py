@@ -115,7 +115,10 @@ def usability(
     try:
         estimator, training = _built(config)
     except ConfigurationError as error:
-        absent = absent_channels(getattr(estimator_class(own), "channels", ()), both)
+        channels: Sequence[str] = ()
+        with suppress(ConfigurationError):  # a class of another package that cannot be loaded
+            channels = getattr(estimator_class(own), "channels", ())
+        absent = absent_channels(channels, both)
         return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
     missing = _missing(estimator, training, recordings, to_estimate)
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
@@ -106,9 +106,10 @@ class FileSource(Source):
     def _require_pattern(self) -> None:
         """See that ``files`` is a pattern inside the folder."""
         pattern = self.options.files
-        if not pattern or Path(pattern).is_absolute():
+        unclear = any("**" in part and part != "**" for part in Path(pattern).parts)
+        if not Path(pattern).parts or Path(pattern).is_absolute() or unclear or "\0" in pattern:
             raise ConfigurationError(
-                f"{self.where}: files must be a pattern inside path, such as '*.csv', not '{pattern}'"
+                f"{self.where}: files must be a pattern inside path, such as '*.csv' or '**/*.csv', not '{printable(pattern)}'"
             )
 
     def _recording(

@@ -22,12 +22,13 @@ import pyarrow.csv as pc
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
-from vehest.data.limits import check_limit, check_unpacked
+from vehest.data.limits import check_limit, check_unpacked, current_limits
 from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
+BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -106,6 +107,8 @@ def read_columns(
             return read_numbers(file, parquet, wanted)
     opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     convert = _conversion(wanted, layout)
+    if text is None:
+        require_memory(file, layout)
     try:
         table = parse_table(opened, layout, convert)
     except DAMAGE:
@@ -137,7 +140,8 @@ def column_parts(
                 batches = number_batches(file, opened.enter_context(parquet_file(file)), wanted)
             else:
                 options = _options(layout, _conversion(wanted, layout))
-                batches = iter(pc.open_csv(opened.enter_context(table_stream(file)), **options))
+                stream = opened.enter_context(table_stream(file))
+                batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
             at = 0
             for length in lengths:
@@ -206,22 +210,37 @@ def _conversion(wanted: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
 
 
 def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits.
+    """Text of a table, unpacked as it is read if it ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4``.
 
-    Raises `MissingError` where there is no such file, `DataError` for a pipe, a folder or too much, `OSError` where it cannot be opened.
+    Raises `MissingError` where there is no such file, `DataError` for a pipe or a folder, `OSError`
+    where it cannot be opened.
     """
     packed = PACKED.get(regular_file(file).suffix.lower())
-    stream = pa.input_stream(open(file, "rb"), compression=packed)  # noqa: SIM115 (pyarrow opens no name that is not UTF-8)
-    if packed is None:
-        return stream
-    blocks = []
-    size = 0
-    with stream:
-        while block := stream.read(BLOCK):
-            blocks.append(block)
-            size += len(block)
-            check_unpacked(file, file.stat().st_size, size)
-    return pa.BufferReader(b"".join(blocks))
+    # pyarrow opens no name that is not UTF-8
+    return pa.input_stream(open(file, "rb"), compression=packed)
+
+
+def require_memory(file: Path, layout: TextLayout) -> None:
+    """Refuse, by a `DataError`, a table that would take more memory as a whole than the limits allow.
+
+    Weighed are its unpacked text and ``BYTES_PER_CELL`` for each delimiter and each end of a line,
+    counted block by block without keeping any. Text that is not packed and too short to exceed the
+    limit with every byte a cell is not looked through.
+    """
+    size = regular_file(file).stat().st_size
+    packed = file.suffix.lower() in PACKED
+    if not packed and (1 + BYTES_PER_CELL) * size <= current_limits().memory:
+        return
+    delimiter = layout.delimiter.encode("utf8")
+    n_bytes = 0
+    try:
+        with table_stream(file) as stream:
+            while block := stream.read(BLOCK):
+                n_cells = block.count(delimiter) + max(block.count(b"\n"), block.count(b"\r"))
+                n_bytes += len(block) + BYTES_PER_CELL * n_cells
+                check_unpacked(file, size, n_bytes)
+    except DAMAGE as error:
+        raise _unreadable(file, error) from None
 
 
 def listed(names: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.limits import check_limit
 from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
@@ -164,6 +165,7 @@ class TabularSource(FileSource):
             if clock is None:
                 yield self.read_file(file)
                 return
+            check_limit("samples", clock.n_samples, f"'{file}' has {clock.n_samples} rows")
             slices = part_slices(clock.n_samples, clock.rate_hz)
             parts = column_parts(
                 file, wanted, self.layout, (rows.stop - rows.start for rows in slices)

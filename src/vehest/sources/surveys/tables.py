@@ -29,7 +29,14 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
-from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, table_stream
+from vehest.sources.tables import (
+    TextLayout,
+    is_parquet,
+    parse_table,
+    read_head,
+    require_memory,
+    table_stream,
+)
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
@@ -342,10 +349,12 @@ def _table(file: Path, shape: Shape) -> pa.Table:
     text = pc.ConvertOptions(
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
     )
+    require_memory(file, shape.layout)
+    opened = partial(table_stream, file)
     problem = None
     for convert in (inferred, text):
         try:
-            return parse_table(partial(table_stream, file), shape.layout, convert)
+            return parse_table(opened, shape.layout, convert)
         except DAMAGE as error:
             problem = printable(first_line(error))
     why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
