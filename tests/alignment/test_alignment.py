@@ -397,7 +397,6 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
             "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
         ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
-        ({"estimate": ("steering_ratio",)}, "needs the wheelbase"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
     ],
 )
@@ -494,6 +493,8 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
+    with pytest.raises(ConfigurationError, match="needs the wheelbase"):
+        align(road, replace(settings, wheelbase=None))
     assert "no channel 'steer'" in refusal(
         lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings)
     )

@@ -43,7 +43,7 @@ from vehest.alignment.imu import (
 from vehest.alignment.motion import rms
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import DataError, listed
+from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.recording import Recording
 from vehest.data.transforms import transform_from_config
 
@@ -284,7 +284,11 @@ def _align_steering(
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
     """
-    assert settings.wheelbase is not None
+    if settings.wheelbase is None:
+        raise ConfigurationError(
+            "the steering ratio needs the wheelbase [m]: --wheelbase 2.7, "
+            "or car: {wheelbase: 2.7} in conf/dataset/NAME.yaml"
+        )
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
     yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
     require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")

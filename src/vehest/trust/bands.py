@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.estimators.kernels.compiling import entry
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)
@@ -109,8 +109,12 @@ class Bands:
         _check_terms("largest", self.largest)
 
     def are_of(self, vehicle: str) -> bool:
-        """Whether they were calibrated on a vehicle."""
-        return not self.vehicles or vehicle in self.vehicles
+        """Whether they hold for a vehicle: one that they were calibrated on, or any where either side has no name."""
+        return (
+            not self.vehicles
+            or not {vehicle, UNNAMED_VEHICLE}.isdisjoint(self.vehicles)
+            or (vehicle == UNNAMED_VEHICLE)
+        )
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""

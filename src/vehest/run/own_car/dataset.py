@@ -21,7 +21,7 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
 from vehest.data.transforms import MOST_BRIDGED
@@ -239,8 +239,10 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         "name": name,
         "title": f"Recordings of {name}",
         "kind": "real",
-        "vehicle": name,
+        "vehicle": UNNAMED_VEHICLE,
     }
+    if car := {key: value for key, value in examined.vehicle.items() if value is not None}:
+        dataset["car"] = car
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = {column.name: column for column in log.columns}
     if log.source == "rosbag":

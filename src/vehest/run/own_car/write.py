@@ -59,6 +59,8 @@ RATE = "estimator.rate_hz="
 GIVEN = Trial(1, "given by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
+    "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
+    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m] and steering_ratio, where they are known; every command uses them",
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
     "bridge": "longest time without a sample that a straight line bridges [s]",
@@ -245,7 +247,9 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
         file,
     )
     run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
-    settings = [f"estimator.wheelbase={made.examined.vehicle['wheelbase'] or ASSUMED_WHEELBASE:g}"]
+    settings = (
+        [] if made.examined.vehicle["wheelbase"] else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
+    )
     words = [
         "vehest",
         "estimate",
