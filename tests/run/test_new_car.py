@@ -76,6 +76,16 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     )
 
 
+def test_values_of_the_car_are_in_the_data_set_and_the_printed_command_needs_none(log):
+    log.write("lap.csv", usual(drive()).drop(columns="Beta"))
+    out, _ = log.new("lap.csv", "--yes", "--wheelbase", "0.33", "--mass", "5.1", "--json")
+    assert held(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
+    assert held(0)["vehicle"] == "unknown"
+    assert not [command for command in json.loads(out)["next"] if "wheelbase" in command]
+    log.new("lap.csv", "--yes", "--force")
+    assert "car" not in held(0)
+
+
 def test_an_answer_that_is_none_is_asked_again(log):
     said = log.typed("lap.csv", answers=["perhaps", "no", "-3", "", "", ""])
     assert all(

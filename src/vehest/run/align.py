@@ -201,4 +201,8 @@ def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
         key: getattr(parameter, key)
         for key in ("name", "value", "uncertainty", "low", "high", "unit")
     }
-    return plain | {"from_scatter": parameter.scatter, "from_tilt": parameter.tilt}
+    return plain | {
+        "from_scatter": parameter.scatter,
+        "from_tilt": parameter.tilt,
+        "from_model": parameter.model,
+    }

@@ -75,6 +75,7 @@ def compare_files(
     settings, overrides = split_settings([word for word in words if not is_file_name(word)])
     config = compose_config("estimate", overrides)
     car = car_of(config["dataset"])
+    notes: list[str] = []
     with use_limits(limits_from_config(config["limits"])):
         drive = read_table(recording, overrides, references=True)
         estimates = {file.stem: read_estimate_table(file, drive) for file in files}
@@ -85,8 +86,7 @@ def compare_files(
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
             model, trust, remarks = adapted(model, trust, car, settings)
-            for remark in remarks:
-                note(f"'{name}': {remark}")
+            notes += [f"'{name}': {remark}" for remark in remarks]
             about = read_description(folder).about
             if any(
                 span.startswith((f"{drive.id} [", f"{drive.id} ("))
@@ -97,6 +97,8 @@ def compare_files(
                 model, drive.without_references(), trust, same_vehicle_from_config(config)
             )
         found = compare_estimates(drive, estimates)
+    for text in notes:
+        note(text)
     cells = [
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
         for row in found["rows"]

@@ -72,8 +72,6 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
     _, shipped, _ = open_model(SELF_CALIBRATING, Path(config["output"]), lambda _: None)
     model, _, remarks = adapted(shipped, None, car_of(config["dataset"]), settings)
     assert isinstance(model, SelfCalibrating)
-    for remark in remarks:
-        note(remark)
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     drives: dict[str, dict[str, Normal]] = {}
@@ -85,6 +83,8 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
             complain(f"warning: {drive.id}: {finding_in_words(finding)}")
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)
+    for remark in remarks:
+        note(remark)
     with written_aside(out) as aside:
         aside.write_text(
             yaml.safe_dump(

@@ -24,7 +24,7 @@ from vehest.estimators.base import Trial
 from vehest.estimators.registry import ENTRY_POINTS, estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
-from vehest.run.own_car.dataset import Draft, draft
+from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
@@ -304,10 +304,10 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines = []
     if made.ratio is not None:
         value, spread = made.ratio
-        doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
-        lines.append(
-            f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}"
-        )
+        if spread <= MAX_RATIO_UNCERTAINTY * abs(value):
+            lines.append(
+                f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase"
+            )
     lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
     lines += [f"note: {note}" for note in made.notes]
     lines += [f"warning: {remark}" for remark in made.remarks]
