@@ -94,9 +94,9 @@ class Usability:
 
 
 def all_usabilities(
-    recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any]
+    recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None = None
 ) -> list[Usability]:
-    """A row for each estimator of conf/estimator, then of other packages that have no file there, with the car of a data set.
+    """A row for each estimator of conf/estimator, then of other packages that have no file there, with the car of a data set, if any.
 
     There is at least one recording.
     """
@@ -106,7 +106,7 @@ def all_usabilities(
     for name in estimator_names():
         configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
     return [
-        usability(name, with_car_values(config, [dataset]), recordings)
+        usability(name, with_car_values(config, [dataset] if dataset else []), recordings)
         for name, config in configs.items()
     ]
 
