@@ -92,7 +92,7 @@ def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, 
     out, _ = log.new(file, "--yes", "--wheelbase", "2.941")
     assert "'steer' is left out: the steering ratio by slow corners is 19.8" in out
     assert "--steering-ratio with your car's adds it" in out
-    assert "steering_ratio" not in str(held(0)["transforms"] if "transforms" in held(0) else "")
+    assert "steering_ratio" not in str(held(0).get("transforms", ""))
     log.new(file, "--yes", "--wheelbase", "2.941", "--steering-ratio", "16.3", "--force")
     assert {"name": "steering_ratio", "ratio": 16.3} in held(0)["transforms"]
     assert held(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
