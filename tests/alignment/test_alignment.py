@@ -397,7 +397,6 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
             "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
         ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
-        ({"estimate": ("steering_ratio",)}, "needs the wheelbase"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
     ],
 )
@@ -489,11 +488,73 @@ def test_steering_intervals_contain_the_truth():
     assert inside >= 16
 
 
+def understeering(seed):
+    """Three minutes of a car whose tyres give way, at a speed, with a ratio and an understeer of its own."""
+    generator = np.random.default_rng(seed)
+    step = 0.01
+    length = 18000
+    speed_mean = (8.0, 14.0, 22.0, 32.0)[seed % 4]
+    wheelbase = generator.uniform(2.3, 3.0)
+    front_stiffness = generator.uniform(7.0, 13.0)  # of an axle over its load [1/rad]
+    rear_stiffness = front_stiffness * generator.uniform(1.0, 1.6)
+    friction = generator.uniform(0.8, 1.2)
+
+    def wander(seconds):
+        samples = generator.standard_normal(length)
+        for _ in range(2):
+            samples = lfilter([step / seconds], [1.0, step / seconds - 1.0], samples)
+        return (samples - samples.mean()) / samples.std()
+
+    speed = np.maximum(speed_mean * (1.0 + 0.2 * wander(6.0)), 3.5)
+    lateral = generator.uniform(0.8, 2.5) * wander(2.0)
+    slip = [
+        friction / stiffness * np.arctanh(np.clip(lateral / 9.81 / friction, -0.9, 0.9))
+        for stiffness in (front_stiffness, rear_stiffness)
+    ]
+    rate = lateral / speed
+    ratio = generator.uniform(12.0, 20.0)
+    steer = wheelbase * rate / speed + slip[0] - slip[1]
+    bank = generator.uniform(0.0, 0.02) * wander(8.0)
+    channels = {
+        "vx": speed + 0.05 * generator.standard_normal(length),
+        "yaw_rate": rate + 0.003 * generator.standard_normal(length),
+        "ay": lateral * 1.04 + 9.81 * bank + 0.1 * generator.standard_normal(length),
+        "handwheel": ratio * steer + 0.02 + 0.003 * generator.standard_normal(length),
+    }
+    return Recording("car", "car", 100.0, 0.0, channels, "simulated"), wheelbase, ratio
+
+
+def test_the_interval_of_a_ratio_covers_it_whatever_the_understeer_and_the_speed():
+    """Twenty-four cars: by a binomial law of 95 % fewer than 20 have a chance of 0.6 %."""
+    inside = certain = 0
+    for seed in range(24):
+        recording, wheelbase, truth = understeering(seed)
+        found = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=wheelbase))
+        ratio = found["steering_ratio"]
+        inside += ratio.low <= truth <= ratio.high
+        if ratio.uncertainty <= 0.1 * ratio.value:
+            certain += 1
+            assert ratio.value == pytest.approx(truth, rel=0.1)
+    assert inside >= 20
+    assert certain >= 6
+
+
+def test_the_ratio_of_a_fast_ferrari_is_uncertain_and_covered(data_root):
+    """Its road-wheel angle has a ratio of 1; by scatter alone the fit gives 1.24 ± 0.11."""
+    drive = real_drive(data_root)
+    ratio = align(drive, AlignmentSettings(("steering_ratio",), wheelbase=2.4))["steering_ratio"]
+    assert ratio.low <= 1.0 <= ratio.high
+    assert abs(ratio.value - 1.0) < ratio.uncertainty
+    assert abs(ratio.value - 1.0) > 2.0 * ratio.scatter
+
+
 def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused():
     road = single_track(15.5, 0.0)
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
+    with pytest.raises(ConfigurationError, match="needs the wheelbase"):
+        align(road, replace(settings, wheelbase=None))
     assert "no channel 'steer'" in refusal(
         lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings)
     )

@@ -76,6 +76,28 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     )
 
 
+def test_values_of_the_car_are_in_the_data_set_and_the_printed_command_needs_none(log):
+    log.write("lap.csv", usual(drive()).drop(columns="Beta"))
+    out, _ = log.new("lap.csv", "--yes", "--wheelbase", "0.33", "--mass", "5.1", "--json")
+    assert held(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
+    assert held(0)["vehicle"] == "unknown"
+    assert not [command for command in json.loads(out)["next"] if "wheelbase" in command]
+    log.new("lap.csv", "--yes", "--force")
+    assert "car" not in held(0)
+
+
+def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, data_root):
+    """A frequency sweep of a Volvo S90, whose ratio is 16.3: the fit gives 19.8 ± 5.1."""
+    file = str(Path(data_root) / "vbox" / "S90__041.VBO")
+    out, _ = log.new(file, "--yes", "--wheelbase", "2.941")
+    assert "'steer' is left out: the steering ratio by slow corners is 19.8" in out
+    assert "--steering-ratio with your car's adds it" in out
+    assert "steering_ratio" not in str(held(0).get("transforms", ""))
+    log.new(file, "--yes", "--wheelbase", "2.941", "--steering-ratio", "16.3", "--force")
+    assert {"name": "steering_ratio", "ratio": 16.3} in held(0)["transforms"]
+    assert held(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
+
+
 def test_an_answer_that_is_none_is_asked_again(log):
     said = log.typed("lap.csv", answers=["perhaps", "no", "-3", "", "", ""])
     assert all(

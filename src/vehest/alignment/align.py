@@ -43,7 +43,7 @@ from vehest.alignment.imu import (
 from vehest.alignment.motion import rms
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import DataError, listed
+from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.recording import Recording
 from vehest.data.transforms import transform_from_config
 
@@ -63,6 +63,10 @@ UNITS: dict[str, str] = {
 READ_AS = {"rad": (180.0 / math.pi, "deg"), "s": (1e3, "ms")}
 """SI unit -> factor and unit in tables for people; files and JSON hold SI units."""
 
+UNDERSTEER_CHANGE = (
+    3e-4  # rad s²/m of the understeer gradient, by which real cars depart from a constant one
+)
+LINKAGE_CHANGE = 0.02  # share of the ratio: linkage, wheelbase and gain of the yaw rate
 STEERING_CUTOFF = 0.25
 """Cut-off of the steering's regression as a part of the other one: only slow steering obeys the steady-state relation."""
 
@@ -78,6 +82,7 @@ class Parameter:
     high: float  # its upper end
     scatter: float  # contribution of the residuals' scatter
     tilt: float  # contribution of roll and pitch of body and road that are not measured
+    model: float = 0.0  # contribution of an understeer gradient that is not constant
 
     @property
     def unit(self) -> str:
@@ -170,14 +175,16 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     )
 
 
-def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
+def _parameter(
+    name: str, value: float, scatter: float, tilt: float, freedom: int, model: float = 0.0
+) -> Parameter:
     """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch and Satterthwaite (GUM, G.4.1)."""
-    uncertainty = math.hypot(scatter, tilt)
+    uncertainty = math.hypot(scatter, tilt, model)
     effective = freedom * (uncertainty / scatter) ** 4 if scatter > 0 else math.inf
     half = uncertainty * float(
         stats.t.ppf(0.975, effective) if effective < 1e6 else stats.norm.ppf(0.975)
     )
-    return Parameter(name, value, uncertainty, value - half, value + half, scatter, tilt)
+    return Parameter(name, value, uncertainty, value - half, value + half, scatter, tilt, model)
 
 
 def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
@@ -284,7 +291,11 @@ def _align_steering(
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
     """
-    assert settings.wheelbase is not None
+    if settings.wheelbase is None:
+        raise ConfigurationError(
+            "the steering ratio needs the wheelbase [m]: --wheelbase 2.7, "
+            "or car: {wheelbase: 2.7} in conf/dataset/NAME.yaml"
+        )
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
     yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
     require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")
@@ -328,9 +339,23 @@ def _align_steering(
     to_gradient = np.diag([1.0, 1.0, 1.0 / ratio, 1.0])  # understeer gradient = slope / ratio
     to_gradient[2, 0] = -slope / ratio**2
     scatter = np.sqrt(np.diag(to_gradient @ scatter_of(fit, blocks) @ to_gradient.T))
-    values = zip(names[:3], (ratio, offset, slope / ratio), scatter[:3].tolist(), strict=True)
-    found = [_parameter(name, value, size, 0.0, blocks - 1) for name, value, size in values]
-    if found[0].low <= 0.0 <= found[0].high:
+    of_model = _error_of_constant_understeer(columns, low(recording["vx"])[calm], ratio)
+    gentle = np.abs(columns[2]) <= 0.5 * settings.max_ay
+    if np.count_nonzero(gentle) * smoothing.step / recording.rate_hz >= least:
+        of_gentle = np.linalg.lstsq(columns[:, gentle].T, measured[gentle], rcond=None)[0][0]
+        of_model = math.hypot(of_model, float(of_gentle) - ratio)
+    values = zip(
+        names[:3],
+        (ratio, offset, slope / ratio),
+        scatter[:3].tolist(),
+        (of_model, 0.0, 0.0),
+        strict=True,
+    )
+    found = [
+        _parameter(name, value, size, 0.0, blocks - 1, model) for name, value, size, model in values
+    ]
+    by_scatter = _parameter(names[0], ratio, float(scatter[0]), 0.0, blocks - 1)
+    if by_scatter.low <= 0.0 <= by_scatter.high:
         what = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
         raise DataError(
             f"recording '{recording.id}': {what}; check its sign, or use a drive with slow turns"
@@ -344,6 +369,33 @@ def _align_steering(
     ratio_of = f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
     note = f"{ratio_of}, from {seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
     return found, transform, note
+
+
+def _error_of_constant_understeer(columns: FloatArray, speed: FloatArray, ratio: float) -> float:
+    """Standard error of a ratio whose fit takes the understeer gradient as constant.
+
+    Curvature and lateral acceleration are nearly proportional at one speed, so that an understeer gradient
+    that changes by `UNDERSTEER_CHANGE` with a standard deviation of the speed, or of |ay|, passes for a ratio.
+
+    Parameters
+    ----------
+    columns : (4, N)
+        Regressors: kinematic angle [rad], 1, ay [m/s²], derivative of the angle.
+    speed : (N,)
+        [m/s].
+    ratio : float
+        Of the fit.
+    """
+    ay = columns[2]
+    weights = np.square(ay) / np.square(ay).sum()
+    changes = []
+    for quantity in (speed, np.abs(ay)):
+        deviation = quantity - weights @ quantity
+        spread = math.sqrt(weights @ np.square(deviation))
+        if spread > 0.0:
+            changes.append(ay * deviation / spread)
+    shares = [np.linalg.lstsq(columns.T, change, rcond=None)[0][0] for change in changes]
+    return abs(ratio) * math.hypot(LINKAGE_CHANGE, UNDERSTEER_CHANGE * math.hypot(*shares))
 
 
 def _percent(share: float) -> str:

@@ -53,8 +53,6 @@ class AlignmentSettings:
             raise ConfigurationError(
                 f"alignment: tilt must be zero or positive [rad], not {self.tilt}"
             )
-        if "steering_ratio" in self.estimate and self.wheelbase is None:
-            raise ConfigurationError("the steering ratio needs the wheelbase [m]")
 
     @property
     def kinematic(self) -> tuple[str, ...]:

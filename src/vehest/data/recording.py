@@ -18,6 +18,7 @@ Kind = Literal["real", "simulated"]
 
 LONGEST_PART = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
+UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6
 HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 

@@ -62,6 +62,7 @@ class EstimateDescription:
     mode: Mode = "causal"
     n_states: int | None = None
     covariance_of: tuple[str, ...] = ("vy", "yaw_rate")  # of files from before rows had names
+    band: str = ""  # what calibrated ``band_vy`` and ``band_sideslip``, and for which car
 
 
 _OF_RECORDING = ("id", "vehicle", "rate_hz", "start_time", "kind")
@@ -110,13 +111,17 @@ def write_estimate(estimate: Estimate, path: Path) -> None:
     write_estimate_parts([estimate], path)
 
 
-def write_estimate_parts(parts: Iterable[Estimate], path: Path) -> None:
-    """`write_estimate` for the parts of an estimate, one after another, with the quantities that the first has."""
+def write_estimate_parts(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
+    """`write_estimate` for the parts of an estimate, one after another, with the quantities that the first has.
+
+    ``band`` says what calibrated the bands, for the description beside the table.
+    """
     rest = iter(parts)
     first = next(rest)
     about = _attributes(first, _OF_ESTIMATE)
     if first.covariance is not None:
         about |= {"n_states": first.covariance.shape[1], "covariance_of": list(first.covariance_of)}
+    about |= {"band": band} if band else {}
     _write(path, estimate_columns(chain([first], rest)), "estimate", about)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from vehest.run.config import Config
 from vehest.run.config_files import choices
 from vehest.run.inspect_data import Lines, reading
 from vehest.run.printing import TerminalTable, counted
-from vehest.sources.base import open_source, read_single
+from vehest.sources.base import car_of, open_source, read_single
 
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml")
 
@@ -33,6 +34,8 @@ def align_recording(
         refuse_errors(
             recording, config["dataset"].get("accept") or (), f"recording '{recording.id}'"
         )
+        if settings.wheelbase is None:
+            settings = replace(settings, wheelbase=car_of(config["dataset"]).wheelbase)
         return align(recording, settings)
 
 
@@ -198,4 +201,8 @@ def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
         key: getattr(parameter, key)
         for key in ("name", "value", "uncertainty", "low", "high", "unit")
     }
-    return plain | {"from_scatter": parameter.scatter, "from_tilt": parameter.tilt}
+    return plain | {
+        "from_scatter": parameter.scatter,
+        "from_tilt": parameter.tilt,
+        "from_model": parameter.model,
+    }

@@ -1,9 +1,9 @@
-"""A car's record: what `vehest identify` finds on its drives, kept in a YAML file that later estimates start from."""
+"""Values of a car that a model's settings take, and a car's record: what `vehest identify` finds on its drives, in YAML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,8 @@ from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
 from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
+from vehest.sources.base import CarValues, car_of
+from vehest.trust.record import Trust
 
 FORMAT = 1
 WIDENING = 1.5
@@ -26,6 +28,8 @@ LIMITS = {
     "grip": (1.0, 60.0),
 }
 """Beyond which a number is not one of a car."""
+CAR_SETTINGS = {"wheelbase": "m", "cg_to_rear_axle": "m"}
+"""Settings of the self-calibrating filter that are values of the car -> unit."""
 Positive = Annotated[float, Field(gt=0.0)]
 
 
@@ -79,19 +83,120 @@ def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     return new
 
 
+def adapted(
+    model: Estimator,
+    trust: Trust | None,
+    car: CarValues,
+    settings: Mapping[str, Any],
+    record: CarRecord | None = None,
+) -> tuple[Estimator, Trust | None, list[str]]:
+    """A model for the car of a recording.
+
+    Settings of the command line come first, then the car's record, then the values of the data set; each
+    applies where those before it do not. A model whose settings were chosen in training keeps them.
+
+    Parameters
+    ----------
+    model : Estimator
+        Only the self-calibrating filter has settings that may be changed; others stay as they are.
+    trust : Trust or None
+        Calibration of the model.
+    car : CarValues
+        Of the recording's data set.
+    settings : mapping
+        Of the command line: name -> value.
+    record : CarRecord, optional
+        By `vehest identify`.
+
+    Returns
+    -------
+    tuple
+        The model, its calibration without health where the channels differ, and remarks for the user.
+
+    Raises
+    ------
+    ConfigurationError
+        Settings or a record are given for another model, or a value is out of bounds.
+    """
+    remarks = []
+    before = model
+    if isinstance(model, SelfCalibrating):
+        taken = _values_of_dataset(model, car, settings, record)
+        if taken:
+            values = [f"{name} {value:g} {CAR_SETTINGS[name]}" for name, value in taken.items()]
+            remarks.append(f"{' and '.join(values)}: of the data set")
+            model = with_settings(model, taken)
+        has_wheelbase = record is not None or "wheelbase" in {*settings, *taken}
+        if not has_wheelbase and not _is_changed(model, "wheelbase"):
+            remarks.append(
+                f"the wheelbase is assumed to be {model.wheelbase:g} m; give your car's, such as "
+                "estimator.wheelbase=2.9, or car: {wheelbase: 2.9} in conf/dataset/NAME.yaml"
+            )
+    if record is not None:
+        model = calibrated(model, record)
+    if settings:
+        model = with_settings(model, dict(settings))
+    if trust is not None and model is not before:
+        trust = trust.for_settings(model)
+    return model, trust, remarks
+
+
+def with_car_values(
+    config: dict[str, Any], datasets: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """The configuration of a training in which a wheelbase of null is that of its data sets' one car, as is the centre of gravity.
+
+    Settings with values stay, and so do all where the data sets have no wheelbase or different ones.
+    """
+    settings = config["estimator"]
+    if settings.get("wheelbase", 0.0) is not None:
+        return config
+    cars = {car_of(dataset) for dataset in datasets}
+    if len({car.wheelbase for car in cars}) != 1:
+        return config
+    car = cars.pop()
+    if cars:  # of one wheelbase, with different centres of gravity
+        car = CarValues(car.wheelbase)
+    values = {name: getattr(car, name) for name in CAR_SETTINGS if settings.get(name, 0.0) is None}
+    return {**config, "estimator": {**settings, **values}}
+
+
+def _values_of_dataset(
+    model: SelfCalibrating,
+    car: CarValues,
+    settings: Mapping[str, Any],
+    record: CarRecord | None,
+) -> dict[str, float]:
+    """Values of a data set's car that neither the command line nor the record nor the training decides."""
+    wheelbase = settings.get("wheelbase", None if record is None else record.wheelbase)
+    if wheelbase not in (None, car.wheelbase):
+        return {}  # another car is meant
+    return {
+        name: value
+        for name in CAR_SETTINGS
+        if (value := getattr(car, name)) is not None
+        and name not in settings
+        and not _is_changed(model, name)
+    }
+
+
+def _is_changed(model: SelfCalibrating, name: str) -> bool:
+    """Whether a setting of a model is another than the default."""
+    return bool(getattr(model.settings, name) != getattr(SelfCalibrating.settings_type(), name))
+
+
 def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) -> SelfCalibrating:
     """The filter with a car's wheelbase and, as priors, its leakage and rear axle, deviations widened; errors of `with_settings`.
 
     Compliance and grip are found anew: tyres and road change them, and estimates that started from them were worse.
     """
-    changed: dict[str, Any] = {
-        "wheelbase": record.wheelbase,
-        "cg_to_rear_axle": record.cg_to_rear_axle,
-    }
+    changed: dict[str, Any] = {"wheelbase": record.wheelbase}
+    if record.cg_to_rear_axle is not None:
+        changed["cg_to_rear_axle"] = record.cg_to_rear_axle
     base = with_settings(model, changed)
     leakage = record.leakage
     rear = record.rear_axle
-    point = record.cg_to_rear_axle
+    point = base.cg_to_rear_axle
     if leakage.identified_on:
         changed |= {
             "leakage": leakage.value,

@@ -27,10 +27,17 @@ from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
+from vehest.run.car_record import adapted
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.estimate import estimate_recording, finding_in_words, open_model
+from vehest.run.estimate import (
+    estimate_recording,
+    finding_in_words,
+    open_model,
+    same_vehicle_from_config,
+    split_settings,
+)
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.sources.base import car_of, read_single
 from vehest.sources.tables import column_names
@@ -69,9 +76,10 @@ def compare_files(
     Raises `VehestError` where a file or model cannot be used.
     """
     files = [Path(word) for word in words if is_file_name(word)]
-    overrides = [word for word in words if not is_file_name(word)]
+    settings, overrides = split_settings([word for word in words if not is_file_name(word)])
     config = compose_config("estimate", overrides)
     car = car_of(config["dataset"])
+    notes: list[str] = []
     with use_limits(limits_from_config(config["limits"])):
         drive = read_single(config["dataset"], recording)
         findings = [
@@ -90,14 +98,20 @@ def compare_files(
             )
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
+            model, trust, remarks = adapted(model, trust, car, settings)
+            notes += [f"'{name}': {remark}" for remark in remarks]
             about = read_description(folder).about
             if any(
                 span.startswith((f"{drive.id} [", f"{drive.id} ("))
                 for span in (*about.trained_on, *about.validated_on)
             ):
                 complain(f"warning: '{name}' learnt on this recording: its row is no test")
-            estimates[name] = estimate_recording(model, drive.without_references(), trust)
+            estimates[name] = estimate_recording(
+                model, drive.without_references(), trust, same_vehicle_from_config(config)
+            )
         found = compare_estimates(drive, estimates, car.wheelbase)
+    for text in notes:
+        note(text)
     cells = [
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
         for row in found["rows"]

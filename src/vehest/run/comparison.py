@@ -14,6 +14,7 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording_summary import RecordingSummary
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact
+from vehest.run.car_record import with_car_values
 from vehest.run.config import GIVEN, Config
 from vehest.run.estimate import find_model, model_artefact
 from vehest.run.evaluate import Evaluation
@@ -89,6 +90,8 @@ class Comparison:
         try:
             split = runner.split(usable[0].config)
             contents = runner.contents(usable[0].config)
+            for job in usable:
+                job.config = with_car_values(job.config, runner.datasets_of(job.config))
             notes = dict.fromkeys(
                 note for job in usable for note in _fit_to_recordings(job, split, contents)
             )

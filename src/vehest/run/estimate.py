@@ -35,17 +35,17 @@ from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
-from vehest.run.car_record import calibrated, read_car, with_settings
+from vehest.run.car_record import adapted, read_car
 from vehest.run.config import compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled, resampled_parts
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
-from vehest.sources.base import read_single, source_of_file
+from vehest.sources.base import car_of, read_single, source_of_file
 from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
-from vehest.trust.record import Trust, is_other_vehicle
+from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
 SHARPEST_TURN = (
@@ -149,25 +149,21 @@ def estimate_file(
         )
         first, known = next(parts)
         remarks: list[str] = []
-        if name == SELF_CALIBRATING:
-            if car is None and "wheelbase" not in settings:
-                remarks.append(
-                    f"the wheelbase is taken for {model.settings.wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9"
-                )
-            if "ax" not in first and "measured_ax" not in settings:
-                settings["measured_ax"] = False
-                remarks.append("there is no channel ax: estimator.measured_ax=false")
-        if settings:
-            model = with_settings(model, settings)
-            if trust is not None:
-                trust = trust.for_settings(model)
-        if car is not None:
-            model = calibrated(model, read_car(car))
+        if name == SELF_CALIBRATING and "ax" not in first and "measured_ax" not in settings:
+            settings["measured_ax"] = False
+            remarks.append("there is no channel ax: estimator.measured_ax=false")
+        record = None if car is None else read_car(car)
+        model, trust, of_car = adapted(model, trust, car_of(dataset), settings, record)
+        remarks += of_car
         if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
-        run = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first))
+        same_vehicle = same_vehicle_from_config(config)
+        band = describe_band(trust, first.vehicle, same_vehicle)
+        run = GuardedRun(
+            model, trust, elsewhere=is_other_vehicle(trust, first.vehicle, same_vehicle)
+        )
         log = out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
@@ -185,7 +181,7 @@ def estimate_file(
             write_log(estimate, first, file, out)
         else:
             del first  # a part that is done needs no memory
-            write_estimate_table(estimates, out)
+            write_estimate_table(estimates, out, band)
     for remark in remarks:
         note(remark)
     findings = [finding_in_words(finding) for finding in merged_findings(report.findings)]
@@ -196,6 +192,7 @@ def estimate_file(
         "model": name if name in WITH_VEHEST else str(folder),
         **({"car": str(car)} if car is not None else {}),
         **report.summary(),
+        **({"band": band} if band else {}),
         "verdict": report.verdict(),
         "findings": findings,
         **(
@@ -346,12 +343,24 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     return []
 
 
+def same_vehicle_from_config(config: Mapping[str, Any]) -> bool | None:
+    """Whether the user says that a recording is of the car of the calibration; raises `ConfigurationError`."""
+    answer = config.get("same_vehicle")
+    if answer is not None and not isinstance(answer, bool):
+        raise ConfigurationError(f"same_vehicle must be true, false or null, not {answer!r}")
+    return answer
+
+
 def estimate_recording(
-    model: Estimator, recording: Recording, trust: Trust | None = None
+    model: Estimator,
+    recording: Recording,
+    trust: Trust | None = None,
+    same_vehicle: bool | None = None,
 ) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
     needed = prepared_recording(model, recording)
-    run = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
+    elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle)
+    run = GuardedRun(model, trust, elsewhere=elsewhere)
     return require_estimate(model, recording, run(needed.channels, needed))
 
 
@@ -377,11 +386,14 @@ def _too_short(model: Estimator, recording_id: str, seconds: float) -> DataError
     )
 
 
-def write_estimate_table(parts: Iterable[Estimate], path: Path) -> None:
-    """Write an estimate, of parts that follow one another, as Parquet or CSV, by the file's ending."""
+def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
+    """Write an estimate, of parts that follow one another, as Parquet or CSV, by the file's ending.
+
+    ``band`` says what calibrated the bands, in the metadata of Parquet.
+    """
     _check_table_name(path)
     if path.suffix.lower() == ".parquet":
-        write_estimate_parts(parts, path)
+        write_estimate_parts(parts, path, band)
         return
     tables = map(_text_columns, estimate_columns(parts))
     first = next(tables)

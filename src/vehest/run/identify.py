@@ -20,7 +20,7 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, read_car, with_settings
+from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.estimate import (
@@ -32,7 +32,8 @@ from vehest.run.estimate import (
     read_table,
     split_settings,
 )
-from vehest.run.printing import TerminalTable, complain
+from vehest.run.printing import TerminalTable, complain, note
+from vehest.sources.base import car_of
 
 IDENTIFIED_SHARE = (
     0.5  # of the prior's variance: a number is identified on a drive that leaves less
@@ -69,7 +70,8 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
     settings, overrides = split_settings(overrides)
     config = compose_config("estimate", overrides)
     _, shipped, _ = open_model(SELF_CALIBRATING, Path(config["output"]), lambda _: None)
-    model = with_settings(shipped, settings)
+    model, _, remarks = adapted(shipped, None, car_of(config["dataset"]), settings)
+    assert isinstance(model, SelfCalibrating)
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     drives: dict[str, dict[str, Normal]] = {}
@@ -81,6 +83,8 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
             complain(f"warning: {drive.id}: {finding_in_words(finding)}")
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)
+    for remark in remarks:
+        note(remark)
     with written_aside(out) as aside:
         aside.write_text(
             yaml.safe_dump(

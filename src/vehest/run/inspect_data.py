@@ -124,7 +124,7 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
         )
     if not recordings:
         raise DataError(f"'{source}' holds no recordings")
-    rows = all_usabilities(recordings)
+    rows = all_usabilities(recordings, config["dataset"])
     missing = absent_channels(SCORED, recordings).to_estimate
     lines = usable_in_words(rows)
     if missing:

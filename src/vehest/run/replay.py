@@ -17,12 +17,22 @@ from vehest.bus.replay import Bus, Replay, survey
 from vehest.bus.view import View
 from vehest.data.errors import ConfigurationError
 from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
+from vehest.run.car_record import adapted
 from vehest.run.config import Config, compose_config
-from vehest.run.estimate import PRETRAINED, WITH_VEHEST, open_model
+from vehest.run.estimate import (
+    PRETRAINED,
+    WITH_VEHEST,
+    open_model,
+    same_vehicle_from_config,
+    split_settings,
+)
+from vehest.sources.base import CarValues, car_of
 from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
+from vehest.trust.record import describe_band, is_other_vehicle
 
 SAME_RATE = 1e-6
 
@@ -57,8 +67,17 @@ def replay_log(
     for path in written:
         if any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
             raise ConfigurationError(f"'{path}' is an input; name another file")
-    config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *overrides])
+    settings, others = split_settings(overrides)
+    config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *others])
     folder, fitted, trust = open_model(model, Path(config["output"]), say)
+    car = car_of(config["dataset"]) if dataset else CarValues()
+    fitted, trust, remarks = adapted(fitted, trust, car, settings)
+    for remark in remarks:
+        say(remark)
+    vehicle = str(config["dataset"].get("vehicle") or UNNAMED_VEHICLE)
+    same_vehicle = same_vehicle_from_config(config)
+    elsewhere = is_other_vehicle(trust, vehicle, same_vehicle)
+    band = describe_band(trust, vehicle, same_vehicle)
     with use_limits(limits_from_config(config["limits"])):
         wanted = _signals(config if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
@@ -72,7 +91,7 @@ def replay_log(
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
         figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
-            lambda: GuardedStepper(fitted, trust, faster), out, view
+            lambda: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere), out, view
         )
     return {
         "log": str(log),
@@ -81,6 +100,7 @@ def replay_log(
         "estimates_hz": fitted.settings.rate_hz,
         "delay_ms": round(1e3 * GuardedStepper(fitted, trust, faster).delay, 3),
         **figures.plain(),
+        **({"band": band} if band else {}),
         "stopped": stopped(),
         "written": [str(file) for file in written],
         **(

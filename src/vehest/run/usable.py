@@ -14,6 +14,7 @@ from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.car_record import with_car_values
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
@@ -92,14 +93,22 @@ class Usability:
         }
 
 
-def all_usabilities(recordings: Sequence[RecordingSummary]) -> list[Usability]:
-    """A row for each estimator of conf/estimator, then of other packages that have no file there; there is at least one recording."""
+def all_usabilities(
+    recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None = None
+) -> list[Usability]:
+    """A row for each estimator of conf/estimator, then of other packages that have no file there, with the car of a data set, if any.
+
+    There is at least one recording.
+    """
     configs: dict[str, Config] = {
         name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")
     }
     for name in estimator_names():
         configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
-    return [usability(name, config, recordings) for name, config in configs.items()]
+    return [
+        usability(name, with_car_values(config, [dataset] if dataset else []), recordings)
+        for name, config in configs.items()
+    ]
 
 
 def usability(

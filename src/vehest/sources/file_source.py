@@ -9,7 +9,7 @@ from typing import Any
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
 from vehest.sources.columns import Column, columns_from_config
@@ -124,7 +124,7 @@ class FileSource(Source):
         try:
             return Recording(
                 id=recording_id,
-                vehicle=str(self.dataset.get("vehicle", "unknown")),
+                vehicle=str(self.dataset.get("vehicle", UNNAMED_VEHICLE)),
                 rate_hz=clock.rate_hz,
                 start_time=clock.start_time,
                 channels=channels,

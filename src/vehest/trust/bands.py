@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number, check_numbers
 
@@ -118,8 +118,14 @@ class Bands:
         check_number("bands.horizon_steps", self.horizon_steps, 0)
 
     def are_of(self, vehicle: str) -> bool:
-        """Whether they were calibrated on a vehicle."""
-        return not self.vehicles or vehicle in self.vehicles
+        """Whether they apply to a vehicle as they are.
+
+        They do if they were calibrated on it, or are for any car. Where a side has no name, they apply
+        to the one car that they were calibrated on, and not to one beside several.
+        """
+        if not self.vehicles or vehicle in self.vehicles:
+            return True
+        return len(self.vehicles) == 1 and UNNAMED_VEHICLE in (vehicle, *self.vehicles)
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
@@ -82,11 +82,47 @@ class Trust:
         return replace(self, bands=bands, health=health)
 
 
-def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
-    """Whether a recording is of another vehicle than those that bands were calibrated on."""
-    return (
-        trust is not None and trust.bands is not None and not trust.bands.are_of(recording.vehicle)
-    )
+def is_other_vehicle(trust: Trust | None, vehicle: str, same_vehicle: bool | None = None) -> bool:
+    """Whether a recording is of another vehicle than those that bands were calibrated on.
+
+    Parameters
+    ----------
+    trust : Trust or None
+        Calibration of the model; without bands the answer is False.
+    vehicle : str
+        Name of the recording's car; the rule is that of `Bands.are_of`.
+    same_vehicle : bool, optional
+        Answer of the user, which comes first.
+    """
+    if trust is None or trust.bands is None:
+        return False
+    if same_vehicle is not None:
+        return not same_vehicle
+    return not trust.bands.are_of(vehicle)
+
+
+def describe_band(trust: Trust | None, vehicle: str, same_vehicle: bool | None = None) -> str:
+    """What calibrated the band of an estimate, and by which rule of `is_other_vehicle` it applies; empty without a band."""
+    if trust is None or trust.bands is None:
+        return ""
+    bands = trust.bands
+    datasets = ", ".join(bands.datasets)
+    if not bands.vehicles and same_vehicle is None:
+        return f"calibrated on drives of many cars ({datasets}): for any car"
+    names = [f"'{name}'" for name in bands.vehicles if name != UNNAMED_VEHICLE]
+    cars = ", ".join(names) or ("a car without a name" if bands.vehicles else "many cars")
+    basis = f"calibrated on recordings of {cars} ({datasets})"
+    if same_vehicle is not None:
+        which = "the same car" if same_vehicle else "another car: band doubled"
+        return f"{basis}; this one is of {which}, as same_vehicle says"
+    if is_other_vehicle(trust, vehicle):
+        remedy = "if it is the same, give same_vehicle=true, or its name as vehicle of the data set"
+        car = "assumed to be of" if vehicle == UNNAMED_VEHICLE else f"of '{vehicle}',"
+        return f"{basis}; this one is {car} another car: band doubled; {remedy}"
+    if names and vehicle in bands.vehicles:
+        return f"{basis}; this one is of the same car, by its name"
+    remedy = "if it is another, give same_vehicle=false, which doubles the band"
+    return f"{basis}; this one is assumed to be of the same car, as no names differ; {remedy}"
 
 
 def write_trust(trust: Trust, folder: Path, model: str = "") -> None:

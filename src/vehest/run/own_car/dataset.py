@@ -21,7 +21,7 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
-from vehest.data.recording import Recording
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
 from vehest.data.transforms import MOST_BRIDGED
@@ -45,6 +45,7 @@ GAPS = "samples are missing; only a table with a column of times may lack some, 
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
+MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 GAIN_APART = (
     1.15  # factor between the gains of two files, of which each half is beyond the other file's
 )
@@ -132,9 +133,15 @@ def draft(examined: Examined) -> Draft:
             for file, n in of_file.items()
             if n > 1
         ]
-    made = _transforms(
-        examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None)
+    used_ratio = vehicle["steering_ratio"] or (
+        ratio[0] if ratio and ratio[1] <= MAX_RATIO_UNCERTAINTY * abs(ratio[0]) else None
     )
+    if ratio and used_ratio is None:
+        notes.append(
+            f"'steer' is left out: the steering ratio by slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
+            f"less certain than {MAX_RATIO_UNCERTAINTY:.0%}; --steering-ratio with your car's adds it"
+        )
+    made = _transforms(examined, longest, late, speed, used_ratio)
     dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -239,8 +246,10 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         "name": name,
         "title": f"Recordings of {name}",
         "kind": "real",
-        "vehicle": name,
+        "vehicle": UNNAMED_VEHICLE,
     }
+    if car := {key: value for key, value in examined.vehicle.items() if value is not None}:
+        dataset["car"] = car
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = {column.name: column for column in log.columns}
     if log.source == "rosbag":

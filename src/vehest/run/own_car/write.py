@@ -23,7 +23,7 @@ from vehest.estimators.base import Trial
 from vehest.estimators.registry import ENTRY_POINTS, estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
-from vehest.run.own_car.dataset import Draft, draft
+from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
@@ -58,6 +58,8 @@ RATE = "estimator.rate_hz="
 GIVEN = Trial(1, "given by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
+    "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
+    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m] and steering_ratio, where they are known; every command uses them",
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
     "bridge": "longest time without a sample that a straight line bridges [s]",
@@ -244,7 +246,9 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
         file,
     )
     run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
-    settings = [f"estimator.wheelbase={made.examined.vehicle['wheelbase'] or ASSUMED_WHEELBASE:g}"]
+    settings = (
+        [] if made.examined.vehicle["wheelbase"] else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
+    )
     words = [
         "vehest",
         "estimate",
@@ -299,10 +303,10 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines = []
     if made.ratio is not None:
         value, spread = made.ratio
-        doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
-        lines.append(
-            f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}"
-        )
+        if spread <= MAX_RATIO_UNCERTAINTY * abs(value):
+            lines.append(
+                f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase"
+            )
     lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
     lines += [f"note: {note}" for note in made.notes]
     lines += [f"warning: {remark}" for remark in made.remarks]

@@ -1,0 +1,217 @@
+"""Values of a car in its data set: every command uses them, and a band does not depend on the data set's name."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+import vehest
+from conftest import planar_drive
+from vehest.data.errors import ConfigurationError
+from vehest.data.store import read_estimate
+from vehest.estimators.model_files import load_model
+from vehest.run.car_record import CarRecord, Number, adapted, with_car_values
+from vehest.run.estimate import pretrained_folder
+from vehest.sources.base import CarValues
+from vehest.trust.record import describe_band, is_other_vehicle, read_trust
+
+TABLE = {
+    "source": "tabular",
+    "licence": "mine",
+    "citation": "none",
+    "files": "*.csv",
+    "time": {"column": "time", "unit": "s"},
+}
+UNKNOWN = Number(5.0, 1.0)
+RECORD = CarRecord(
+    2.2, None, replace(UNKNOWN, value=0.0), UNKNOWN, replace(UNKNOWN, value=0.01), UNKNOWN, {}
+)
+
+
+def write_dataset(name, **options):
+    file = Path("conf/dataset") / f"{name}.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml.safe_dump(TABLE | {"name": name} | options), encoding="utf-8")
+
+
+def write_lap(references=True):
+    drive = planar_drive(30.0, 100.0, seed=4, noise=0.02)
+    channels = drive.channels if references else drive.without_references().channels
+    pd.DataFrame({"time": drive.time, **channels}).to_csv("lap.csv", index=False)
+
+
+@pytest.fixture(scope="module")
+def self_calibrating():
+    return load_model(pretrained_folder("self_calibrating"))
+
+
+def settings_after(model, car=None, settings=None, record=None):
+    found, _, remarks = adapted(model, None, car or CarValues(), settings or {}, record)
+    return found.settings.wheelbase, found.settings.cg_to_rear_axle, " ".join(remarks)
+
+
+def test_the_command_line_comes_before_the_record_before_the_data_set_before_the_default(
+    self_calibrating,
+):
+    car = CarValues(wheelbase=2.4, cg_to_rear_axle=1.07)
+    record = replace(RECORD, wheelbase=2.2)
+    assert settings_after(self_calibrating)[:2] == (2.7, None)
+    assert settings_after(self_calibrating, car)[:2] == (2.4, 1.07)
+    assert settings_after(self_calibrating, car, record=record)[:2] == (2.2, None)
+    assert settings_after(self_calibrating, car, {"wheelbase": 2.9}, record)[:2] == (2.9, None)
+    assert settings_after(self_calibrating, car, {"cg_to_rear_axle": 1.2})[:2] == (2.4, 1.2)
+    of_the_same_car = replace(RECORD, wheelbase=2.4)
+    assert settings_after(self_calibrating, car, record=of_the_same_car)[:2] == (2.4, 1.07)
+
+
+def test_the_default_wheelbase_is_remarked_only_where_none_is_known(self_calibrating):
+    assumed = "the wheelbase is assumed to be 2.7 m"
+    assert assumed in settings_after(self_calibrating)[2]
+    for known in (
+        {"car": CarValues(wheelbase=2.4)},
+        {"settings": {"wheelbase": 2.7}},
+        {"record": RECORD},
+    ):
+        assert assumed not in settings_after(self_calibrating, **known)[2]
+    assert (
+        "wheelbase 2.4 m: of the data set"
+        in settings_after(self_calibrating, CarValues(wheelbase=2.4))[2]
+    )
+
+
+def test_a_model_whose_wheelbase_was_chosen_in_training_keeps_it(self_calibrating):
+    trained, _, _ = adapted(self_calibrating, None, CarValues(), {"wheelbase": 3.1})
+    assert settings_after(trained, CarValues(wheelbase=2.4, cg_to_rear_axle=1.0))[0] == 3.1
+
+
+def test_estimate_compare_and_identify_use_the_wheelbase_of_the_data_set(place):
+    write_lap()
+    write_dataset("small", car={"wheelbase": 0.33})
+    write_dataset("unknown_car")
+    place.done("estimate", "lap.csv", "dataset=small", "-o", "small.parquet")
+    said = place.done("estimate", "lap.csv", "estimator.wheelbase=0.33", "-o", "given.parquet")[1]
+    assert "assumed" not in said
+    place.done("estimate", "lap.csv", "dataset=unknown_car", "-o", "default.parquet")
+    small, given, default = (
+        read_estimate(Path(f"{name}.parquet"))["vy"] for name in ("small", "given", "default")
+    )
+    np.testing.assert_array_equal(small, given)
+    assert np.abs(small - default).max() > 0.05
+
+    def compared(*words):
+        out, _ = place.done("compare", "lap.csv", *words, "-m", "self_calibrating", "--json")
+        rows = {row["estimate"]: row["rmse_sideslip"] for row in json.loads(out)["rows"]}
+        return rows["self_calibrating"]
+
+    assert compared("dataset=small") == compared("estimator.wheelbase=0.33")
+    assert compared("dataset=small") != compared("dataset=unknown_car")
+    place.done("identify", "lap.csv", "dataset=small", "-o", "car.yaml")
+    assert yaml.safe_load(Path("car.yaml").read_text(encoding="utf-8"))["wheelbase"] == 0.33
+
+
+def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
+    config = {"estimator": {"name": "data_sheet", "wheelbase": None, "cg_to_rear_axle": None}}
+    first, second, other = (
+        TABLE | {"name": "one", "car": {"wheelbase": wheelbase, "cg_to_rear_axle": rear}}
+        for wheelbase, rear in ((2.4, 1.1), (2.4, 1.2), (2.6, 1.2))
+    )
+
+    def values(config, *datasets):
+        settings = with_car_values(config, datasets)["estimator"]
+        return settings["wheelbase"], settings["cg_to_rear_axle"]
+
+    assert values(config, first) == (2.4, 1.1)
+    assert values(config, first, second) == (2.4, None)
+    assert values(config, first, other) == (None, None)
+    given = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
+    assert with_car_values(given, [first]) is given
+    without = {"estimator": {"name": "zero"}}
+    assert with_car_values(without, [first]) is without
+
+
+def test_the_steering_ratio_is_aligned_with_the_wheelbase_of_the_data_set(place):
+    write_lap()
+    write_dataset("unknown_car")
+    code, _, err = place("data", "align", "lap.csv", "-e", "steering_ratio", "dataset=unknown_car")
+    assert code != 0
+    assert "needs the wheelbase [m]: --wheelbase 2.7, or car: {wheelbase: 2.7} in conf" in err
+
+
+@pytest.fixture(scope="module")
+def model():
+    """An observer that was calibrated on drives of the vehicle 'planar'."""
+    drives = [
+        replace(planar_drive(30.0, 100.0, seed=seed, noise=0.02), vehicle="planar")
+        for seed in (1, 2)
+    ]
+    return vehest.train(
+        "luenberger", drives[:1], drives[1:], ("training.grid=1", "training.max_evaluations=5")
+    )
+
+
+def test_a_band_is_the_same_under_every_name_of_a_data_set_unless_it_names_another_car(
+    place, model
+):
+    vehest.save_model(model, place.folder / "own")
+    write_lap(references=False)
+    write_dataset("first")
+    write_dataset("second", vehicle="unknown")
+    write_dataset("named", vehicle="planar")
+    write_dataset("other", vehicle="lorry")
+
+    def band(*words):
+        out, _ = place.done("estimate", "own", "lap.csv", *words, "--json")
+        said = json.loads(out)
+        metadata = json.loads(pq.read_schema("estimate.parquet").metadata[b"vehest"])
+        assert metadata["band"] == said["band"]
+        read_estimate(Path("estimate.parquet"))
+        return said["band_sideslip_deg"]["median"], said["band"]
+
+    alone, basis = band()
+    assert basis.startswith("calibrated on recordings of 'planar'")
+    assert "assumed to be of the same car" in basis
+    for dataset in ("first", "second", "named"):
+        assert band(f"dataset={dataset}")[0] == alone
+    assert "the same car, by its name" in band("dataset=named")[1]
+    doubled, basis = band("dataset=other")
+    assert doubled == pytest.approx(2.0 * alone, abs=1e-3)
+    assert "this one is of 'lorry', another car: band doubled" in basis
+    assert "same_vehicle=true" in basis
+    assert band("dataset=other", "same_vehicle=true")[0] == alone
+    assert band("same_vehicle=false")[0] == doubled
+    code, _, err = place("estimate", "own", "lap.csv", "same_vehicle=maybe")
+    assert code != 0
+    assert "same_vehicle must be true, false or null, not 'maybe'" in err
+
+
+def test_the_rules_by_which_a_band_applies(model, tmp_path):
+    vehest.save_model(model, tmp_path / "own")
+    trust = read_trust(tmp_path / "own")
+    unnamed = replace(trust, bands=replace(trust.bands, vehicles=("unknown",)))
+    many_cars = replace(trust, bands=replace(trust.bands, vehicles=()))
+    assert not is_other_vehicle(trust, "planar")
+    assert not is_other_vehicle(trust, "unknown")
+    assert is_other_vehicle(trust, "lorry")
+    assert not is_other_vehicle(trust, "lorry", same_vehicle=True)
+    assert is_other_vehicle(trust, "planar", same_vehicle=False)
+    assert not is_other_vehicle(unnamed, "lorry")
+    assert not is_other_vehicle(many_cars, "lorry")
+    fleet = replace(trust, bands=replace(trust.bands, vehicles=("planar", "van")))
+    assert is_other_vehicle(fleet, "unknown"), "a recording without a name is of none of several"
+    assert not is_other_vehicle(fleet, "van")
+    assert "assumed to be of another car: band doubled" in describe_band(fleet, "unknown")
+    assert not is_other_vehicle(replace(trust, bands=None), "lorry", same_vehicle=False)
+    assert describe_band(None, "lorry") == ""
+    assert describe_band(many_cars, "lorry").endswith("for any car")
+    assert "a car without a name" in describe_band(unnamed, "lorry")
+
+
+def test_settings_are_refused_for_a_model_that_has_none_to_change(model):
+    with pytest.raises(ConfigurationError, match="are for the self-calibrating filter"):
+        adapted(model, None, CarValues(), {"wheelbase": 2.4})
+    assert adapted(model, None, CarValues(wheelbase=2.4), {})[0] is model
