@@ -66,11 +66,10 @@ def test_ranges_without_samples_missing_channels_and_estimates_of_unknown_quanti
         ({"vz": np.zeros(3)}, "unknown quantity 'vz'"),
         ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length"),
     ):
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(ValueError, match=said):
             Estimate("r", "ekf", 20.0, 0.0, channels)
-    assert "not None and (vy)" in refusal(
-        lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
-    )
+    with pytest.raises(ValueError, match=r"not None and \(vy\)"):
+        Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
 
 
 def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_references():
@@ -148,7 +147,7 @@ NAMES = [
 
 @pytest.mark.parametrize(("shape", "names"), [*SHAPES, *NAMES])
 def test_a_covariance_has_a_row_a_name(shape, names):
-    with pytest.raises(DataError, match=r"covariance_of name n quantities, not \([234].* and \("):
+    with pytest.raises(ValueError, match=r"covariance_of name n quantities, not \([234].* and \("):
         Estimate(
             "r",
             "ekf",

@@ -13,6 +13,8 @@ import vehest
 from conftest import planar_drive
 from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
+from vehest.estimators.registry import estimator_names
+from vehest.run.estimate import estimate_file
 from vehest.trust.record import TRUST, read_trust
 
 
@@ -122,6 +124,44 @@ def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_who
             )
             assert pq.ParquetFile("parts.parquet").num_row_groups == 5
         assert {**parts, "out": "", "findings": []} == {**whole, "out": "", "findings": []}
+
+
+YESTERDAY = Path(__file__).resolve().parents[1] / "yesterday"
+
+
+def calibrated_model(name):
+    """Folder of a small model of a family with bands and health, and a drive at its rate."""
+    folder = YESTERDAY / "models" / name
+    estimator = vehest.load_model(folder)
+    kind = next(
+        (
+            kind
+            for kind, channel in (("small_car", "motor_current"), ("steered", "steer"))
+            if channel in estimator.channels
+        ),
+        "planar",
+    )
+    drive = vehest.read_recording(YESTERDAY / "drives" / f"{kind}_{estimator.rate_hz:g}hz.parquet")
+    return folder, drive
+
+
+@pytest.mark.parametrize("end", [".parquet", ".csv"])
+@pytest.mark.parametrize("name", estimator_names())
+def test_every_family_estimates_a_file_in_parts_as_the_whole(place, monkeypatch, name, end):
+    folder, drive = calibrated_model(name)
+    table = pd.DataFrame({"time": drive.time, **drive.channels})
+    if end == ".csv":
+        table.to_csv("drive.csv", index=False)
+    else:
+        table.to_parquet("drive.parquet")
+    command = [str(folder), f"drive{end}", "dataset.accept=[sign,unit,impossible]"]
+    estimate_file(command, Path("whole.parquet"))
+    in_parts(monkeypatch, 1.3)
+    estimate_file(command, Path("parts.parquet"))
+    whole, parts = (pd.read_parquet(file) for file in ("whole.parquet", "parts.parquet"))
+    tolerance = 1e-6 if name == "sideslip_ffnn" else 1e-12
+    pd.testing.assert_frame_equal(parts, whole, check_exact=False, rtol=0.0, atol=tolerance)
+    assert {"vy", "sideslip", "health", "health_reason"} <= set(whole)
 
 
 @pytest.mark.parametrize(

@@ -203,7 +203,7 @@ def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_with
     )
     assert (
         json.loads((first[0] / "manifest.json").read_text())["code"]
-        == f"{manifest['code']} faults=2"
+        == f"{manifest['code']} faults=3"
     )
     assert set(manifest["outputs"]) == {
         "metrics.csv",

@@ -71,7 +71,7 @@ def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_i
         for artefact in (root.model, root.trusted, root.scored)
     }
     root.add("report", "mine", {"module": "drive"}, inputs, code_of("report", "drive"))
-    root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=2")
+    root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=3")
     root.add(
         "train",
         "theirs",

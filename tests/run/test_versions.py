@@ -29,7 +29,7 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
         assert "vehest." not in text
         assert not re.search(r"[0-9a-f]{8}", text), text
     assert code_of("train", "ksnn") == "train=1 ksnn=1 training=1"
-    assert code_of("evaluate", "ksnn", faults=True) == "evaluate=1 ksnn=1 faults=2"
+    assert code_of("evaluate", "ksnn", faults=True) == "evaluate=1 ksnn=1 faults=3"
     assert code_of("ingest", "tabular") == "ingest=1 tabular=1"
 
 

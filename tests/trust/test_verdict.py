@@ -14,6 +14,7 @@ from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 CHANNELS = ("yaw_rate", "vx", "ay")
 SKIPPABLE = np.array([True, False, True])
 STEPS = 60
+PERSISTENT = 10
 NUMBERS_OF = np.array([NUMBERS[name] for name in CHANNELS])
 
 
@@ -21,7 +22,7 @@ def code(kind, channel):
     return 10_000.0 * kind + 100.0 * NUMBERS[channel]
 
 
-def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, last=40):
+def heeded(kind, channel, *, adapts=False, starts_anew=True, status=2, first=10, last=40):
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
     statuses = np.zeros(STEPS)
     reasons = np.zeros(STEPS)
@@ -36,7 +37,8 @@ def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, l
         NUMBERS_OF,
         SKIPPABLE,
         starts_anew,
-        rollback,
+        adapts,
+        PERSISTENT,
         rows,
         measured,
         flow,
@@ -68,9 +70,9 @@ def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
     assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
     assert np.flatnonzero(
-        heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART
-    ).tolist() == [18, 28, 38]
-    assert not (heeded(kernel.OFFSET, "ay", rollback=10, starts_anew=False)[2] == RESTART).any()
+        heeded(kernel.SCALE, "vx", adapts=True, starts_anew=False)[2] == RESTART
+    ).tolist() == [19, 29, 39]
+    assert not (heeded(kernel.OFFSET, "ay", adapts=True, starts_anew=False)[2] == RESTART).any()
     reasons = np.zeros(STEPS)
     statuses = np.zeros(STEPS)
     statuses[10:40] = 2.0
@@ -87,13 +89,37 @@ def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
             NUMBERS_OF,
             SKIPPABLE,
             False,
-            10,
+            True,
+            PERSISTENT,
             rows[part],
             measured[part],
             flow[part],
             state,
         )
-    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2])
+    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", adapts=True, starts_anew=False)[2])
+
+
+def test_a_fault_shorter_than_a_second_starts_nothing_anew_however_long_its_flag_is_degraded():
+    statuses = np.zeros(STEPS)
+    statuses[10:19] = 2.0
+    statuses[19:55] = 1.0
+    reasons = np.where(statuses > 0, code(kernel.SCALE, "vx"), 0.0)
+    for adapts in (False, True):
+        flow = np.full(STEPS, USE, np.int8)
+        isolate_rows(
+            statuses,
+            reasons,
+            NUMBERS_OF,
+            SKIPPABLE,
+            not adapts,
+            adapts,
+            PERSISTENT,
+            np.ones((STEPS, 3)),
+            np.ones((STEPS, 3), np.bool_),
+            flow,
+            np.zeros(2),
+        )
+        assert (flow == USE).all()
 
 
 def test_the_verdict_names_what_guard_and_watch_know():

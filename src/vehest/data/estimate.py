@@ -44,7 +44,7 @@ half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) o
 class Estimate:
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
-    NaN means that the method has no estimate yet (a window that is not full). Raises `DataError`: a quantity is unknown or of another
+    NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`: a quantity is unknown or of another
     length, the covariance is not of shape (T, n, n), or its rows have no n different names.
     """
 
@@ -65,9 +65,9 @@ class Estimate:
         where = f"estimate of '{self.recording_id}'"
         lengths = {len(values) for values in self.channels.values()}
         for name in self.channels.keys() - QUANTITIES.keys():
-            raise DataError(f"{where}: unknown quantity '{name}'")
+            raise ValueError(f"{where}: unknown quantity '{name}'")
         if len(lengths) != 1:
-            raise DataError(
+            raise ValueError(
                 f"{where}: quantities must have one common length, not {sorted(lengths)}"
             )
         n_rows = len(self.covariance_of)
@@ -77,7 +77,7 @@ class Estimate:
             or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows
         ):
             what = f"not {shape} and ({', '.join(self.covariance_of)})"
-            raise DataError(
+            raise ValueError(
                 f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}"
             )
 

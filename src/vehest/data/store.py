@@ -174,7 +174,7 @@ def read_estimate(path: Path) -> Estimate:
         )
     except KeyError as error:
         raise DataError(f"'{path}' has no column {error}; make it again") from None
-    except DataError as error:
+    except (DataError, ValueError) as error:
         raise DataError(f"'{path}': {error}") from None
 
 

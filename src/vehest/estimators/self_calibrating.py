@@ -58,6 +58,7 @@ class SelfCalibrating(Recursive):
     slow_kernel = "vehest.estimators.kernels.self_calibrating:scan"
     offline = "estimator 'self_calibrating' smooths a whole drive and cannot run online; use estimator.smoothed=false"
     template = "self_calibrating"
+    adapts = True  # the axle, the offsets and the weights of filters and candidates
     refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)

@@ -179,7 +179,8 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "truths": truths,
         "brief": brief,
         "starts_anew": monitor._starts_anew,
-        "rollback": monitor._rollback,
+        "adapts": monitor._adapts,
+        "persistent_steps": monitor._persistent_steps,
         "bands": band_table(stepper),
         "pi": math.pi,
     }

@@ -23,6 +23,9 @@ def kalman_scan(
 ) -> Filtered[FloatArray]:
     """Filter one sequence in float64; what is NaN was not measured and is skipped.
 
+    States and innovations are NaN from the sample on at which the filter breaks down: an innovation whose variance is not positive, or a
+    state that is not a number.
+
     Args:
         model: see `LinearModel`.
         measurements: y, (T, m).
@@ -32,7 +35,6 @@ def kalman_scan(
 
     Raises:
         ValueError: shapes do not fit each other.
-        numpy.linalg.LinAlgError: the variance of an innovation is not positive.
 
     Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive, a measurement
     after the other (Bierman 1977).
@@ -64,9 +66,8 @@ def kalman_scan(
         *parts, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gated
     )
     if failed >= 0:
-        raise np.linalg.LinAlgError(
-            f"the variance of an innovation is not positive at sample {failed}"
-        )
+        for part in (*predicted, *filtered, innovation, covariance):
+            part[failed:] = math.nan
     return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y))
 
 

@@ -7,8 +7,10 @@
 3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
 4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
    the fault is over (`vehest.trust.verdict`).
-5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, is not finite or raises starts anew,
-   with adapting states, such as tyres, at their fitted values. Slower than 0.1 m/s, at standstill, the car has no sideslip: 0.
+5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, or is not finite, starts anew, with
+   adapting states, such as tyres, at their fitted values. Slower than 0.1 m/s, at standstill, the car has no sideslip: 0.
+
+An estimator that breaks down numerically returns NaN. An exception that it raises is a defect and is passed on.
 """
 
 from __future__ import annotations
@@ -43,9 +45,6 @@ from vehest.trust.health import INVALID, Health
 from vehest.trust.record import Trust
 from vehest.trust.verdict import Monitor, starts_anew
 from vehest.trust.watch import Watch, Watched
-
-FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
-"""Failures of an estimator on senseless samples; it then starts anew."""
 
 NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
 MOTION = ("vx", "yaw_rate", "ay")
@@ -205,15 +204,9 @@ class GuardedRun:
             r.kind,
             frozenset(self.estimator.skippable),
         )
-        try:
-            estimate = self._going_on(state).estimate(
-                [piece], None if self._begun or start else self.initial_state
-            )[0]
-        except FAILURES:
-            self._state = None
-            return (
-                self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
-            )
+        estimate = self._going_on(state).estimate(
+            [piece], None if self._begun or start else self.initial_state
+        )[0]
         shift = slice(len(window) + extra, len(window) + extra + end - start)
         if "vx" in estimate.channels:
             self.vx[start:end] = estimate["vx"][shift]
@@ -230,23 +223,6 @@ class GuardedRun:
                     shift
                 ]
         return np.asarray(estimate["vy"][shift])
-
-    def _stepped(self, start: int, end: int) -> FloatArray:
-        """The same one sample at a time, for pieces that cannot be estimated in one go."""
-        stepper = self.estimator.online()
-        raw = np.full(end - start, np.nan)
-        for k in range(start, end):
-            try:
-                found = stepper.step(
-                    dict(zip(self.estimator.channels, self.cleaned.rows[k].tolist(), strict=True))
-                )
-            except FAILURES:
-                stepper = self.estimator.online()
-                continue
-            raw[k - start] = found["vy"]
-            self.vx[k] = found.get("vx", math.nan)
-            self.variance[k] = found.get("vy_variance", math.nan)
-        return raw
 
     def _going_on(self, state: Any) -> Estimator:
         """The estimator, which begins with a state unless it is None, and leaves the one after its last row."""
@@ -430,7 +406,7 @@ class GuardedStepper(Stepper):
         if self._clock.fault:
             verdict.status[0] = INVALID
             verdict.reason[0] = self._clock.fault * 10_000
-        self._raw[0], vx, self._variance[0], failed = self._estimated(cleaned)
+        self._raw[0], vx, self._variance[0] = self._estimated(cleaned)
         motion = self._motion
         flow = cleaned.flow[0]
         for column, at in enumerate(self._places):
@@ -439,7 +415,7 @@ class GuardedStepper(Stepper):
         if math.isnan(motion[0, 0]):
             motion[0, 0] = vx
         watched = self._watch(self._raw, motion, cleaned.flow)
-        if watched.lost or failed:
+        if watched.lost:
             self._stepper = self.estimator.online()
             self._fresh = True
         self.marks = int(watched.marks[0])
@@ -460,22 +436,17 @@ class GuardedStepper(Stepper):
         found["health_reason"] = float(verdict.reason[0])
         return found
 
-    def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float, bool]:
-        """The estimator on a row: v, its own vx, the variance of v's error, and whether it failed."""
+    def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float]:
+        """The estimator on a row: v, its own vx and the variance of v's error."""
         flow = cleaned.flow[0]
         self._others = {}
         if flow == WAIT:
-            return math.nan, math.nan, math.nan, False
+            return math.nan, math.nan, math.nan
         if flow == RESTART and not self._fresh:
             self._stepper = self.estimator.online()
         self._fresh = False
-        try:
-            found = self._stepper.step(
-                dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True))
-            )
-        except FAILURES:
-            return math.nan, math.nan, math.nan, True
+        found = self._stepper.step(dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True)))
         self._others = {
             name: value for name, value in found.items() if name not in ("vy", "vy_variance")
         }
-        return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan), False
+        return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan)

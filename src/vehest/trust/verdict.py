@@ -1,9 +1,11 @@
 """Consequences of health: channels that an estimator gets, restarts, status and reason of its estimate, width of its band.
 
 - A channel that health accuses of a fault counts as not measured where the method can do without it, so that nothing adapts to it.
-- An estimator that remembers more than a window starts anew once a fault is over.
+- An estimator that remembers more than a window starts anew once a persistent fault is over.
 - One with states that adapt, such as tyres and friction, does not, since it would forget them. But if the accused channel is one that it
-  needs, these states go back to what they were fitted to, every second until nothing is suspected any more.
+  needs, these states go back to what they were fitted to, after each two seconds in which the channel was accused.
+- A shorter fault, such as a single wrong sample, changes neither: what it leaves in an estimator is smaller than what a new start loses.
+  Only samples at which a channel is accused count, not the time for which a flag is held afterwards.
 - The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
   least as far as sideslip did in training. These factors were set before their effect was looked at.
 """
@@ -39,7 +41,8 @@ BAND_FACTORS = (1.0, 2.0, 4.0)  # factor of the band of a valid, a degraded, an 
 WIDEST = math.radians(6.0)
 """Half width of the band of β beyond which an estimate is invalid: what it says of the car is no more than v = 0 does."""
 
-ROLLED_BACK_SECONDS = 1.0
+PERSISTENT_FAULT_SECONDS = 2.0
+"""Accusation from which on a fault is persistent; a single wrong sample is accused for up to 1.6 s, as sums decay."""
 
 NO_FAULTS = np.array(
     [kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN]
@@ -78,10 +81,9 @@ class Monitor:
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
         self._starts_anew = starts_anew(estimator)
-        self._rollback = (
-            max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1)
-            if getattr(estimator, "adapts", False)
-            else 0
+        self._adapts = bool(getattr(estimator, "adapts", False))
+        self._persistent_steps = max(
+            round(PERSISTENT_FAULT_SECONDS * estimator.settings.rate_hz), 1
         )
         self._fault = np.zeros(2)
 
@@ -96,7 +98,8 @@ class Monitor:
             self._numbers,
             self._skippable,
             self._starts_anew,
-            self._rollback,
+            self._adapts,
+            self._persistent_steps,
             *cleaned,
             self._fault,
         )
@@ -138,16 +141,27 @@ class Monitor:
 
 @entry(nogil=True)
 def isolate_rows(  # type: ignore[no-untyped-def]
-    status, reason, numbers, skippable, starts_anew, rollback, rows, measured, flow, state
+    status,
+    reason,
+    numbers,
+    skippable,
+    starts_anew,
+    adapts,
+    persistent_steps,
+    rows,
+    measured,
+    flow,
+    state,
 ):
-    """Take accused channels out of rows, and have estimators start anew after faults; ``rows, measured, flow`` are changed in place.
+    """Take accused channels out of rows, and have estimators start anew; ``rows, measured, flow`` are changed in place.
 
     Args:
         status, reason: of health, (T,).
         numbers, skippable: of the channels: number in a code, whether the estimator can do without it, (C,).
-        starts_anew: whether the estimator does after a fault.
-        rollback: samples after which adapting states go back to fitted values, while a needed channel is accused; 0 if nothing adapts.
-        state: whether there was a fault since health was last valid, and for how many samples one in a needed channel, (2,).
+        starts_anew: whether the estimator does after a persistent fault.
+        adapts: whether it has adapting states, which go back to fitted values while a needed channel is accused.
+        persistent_steps: samples of accusation after which a fault is persistent.
+        state: samples at which any channel was accused since health was last valid, and at which a needed one was, (2,).
     """
     for k in range(rows.shape[0]):
         kind = int(reason[k]) // 10000
@@ -156,24 +170,22 @@ def isolate_rows(  # type: ignore[no-untyped-def]
         for other in NO_FAULTS:
             at_fault = at_fault and kind != other
         if at_fault:
-            state[0] = 1.0
+            state[0] += 1.0
             needs = True
             for c in range(rows.shape[1]):
                 if skippable[c] and numbers[c] == channel:
                     rows[k, c] = math.nan
                     measured[k, c] = False
                     needs = False
-            if needs and state[1] == 0.0:
-                state[1] = 1.0
+            if needs:
+                state[1] += 1.0
+                if adapts and flow[k] == USE and state[1] % persistent_steps == 0.0:
+                    flow[k] = RESTART
         elif status[k] == VALID and state[0] > 0.0:
+            if starts_anew and flow[k] == USE and state[0] >= persistent_steps:
+                flow[k] = RESTART
             state[0] = 0.0
             state[1] = 0.0
-            if starts_anew and flow[k] == USE:
-                flow[k] = RESTART
-        if state[1] > 0.0:
-            state[1] += 1.0
-            if rollback > 0 and flow[k] == USE and state[1] % rollback == 0.0:
-                flow[k] = RESTART
 
 
 @entry(nogil=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,14 +40,14 @@ class FilteredStates(NamedTuple):
     measured: NDArray[np.bool_]  # (T, 2)
     last: Gaussian[FloatArray]  # state after the last sample
 
-    def nis(self) -> tuple[FloatArray, FloatArray]:
-        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured; (T,) each."""
-        (first, both), (_, second) = np.moveaxis(self.innovation_covariance, 0, 2)
-        one, other = self.innovation.T
+    def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:
+        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured, of some rows; (T,) each."""
+        (first, both), (_, second) = np.moveaxis(self.innovation_covariance[rows], 0, 2)
+        one, other = self.innovation[rows].T
         nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (
             first * second - both**2
         )
-        return nis, np.sum(self.measured, axis=1, dtype=np.float64)
+        return nis, np.sum(self.measured[rows], axis=1, dtype=np.float64)
 
 
 class FilterState(NamedTuple):
@@ -137,7 +138,7 @@ class SideslipFilter(GatedFilter, Recursive):
             "vy": vx * tangent,
             "yaw_rate": mean[:, 1].copy(),
             "covariance": found.covariance[own] * scale[:, :, None] * scale[:, None, :],
-            "innovations": found.nis,
+            "innovations": partial(found.nis, own),
         }
         return values | self.quantities(mean), FilterState(samples[-1], found.last, refused)
 

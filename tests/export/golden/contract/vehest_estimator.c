@@ -443,6 +443,7 @@ static const int32_t NUMBER[C] = { 1, 2, 4 }; /* of the channels in reasons */
 
 #define FREE 0
 #define OUTSIDE 12
+#define PERSISTENT 200U /* samples of accusation after which a fault is persistent */
 
 /* Take accused channels out of the sample, and have the method start anew after faults. */
 static void isolate(vehest_state *state, uint8_t status, int32_t reason, cleaned_sample *cleaned)
@@ -452,7 +453,7 @@ static void isolate(vehest_state *state, uint8_t status, int32_t reason, cleaned
     const bool at_fault = (status == VEHEST_INVALID) && (kind != FREE) && (kind != MISSING) && (kind != OUTSIDE) && (kind != SPIN);
     if (at_fault) {
         bool needed = true;
-        state->had_fault = true;
+        state->at_fault = counted(state->at_fault);
         for (int32_t c = 0; c < C; c++) {
             if (SKIPPABLE[c] && (NUMBER[c] == accused)) {
                 cleaned->row[c] = VEHEST_NAN;
@@ -460,20 +461,17 @@ static void isolate(vehest_state *state, uint8_t status, int32_t reason, cleaned
                 needed = false;
             }
         }
-        if (needed && (state->in_fault == 0U)) {
-            state->in_fault = 1U;
+        if (needed) {
+            state->needed_at_fault = counted(state->needed_at_fault);
         }
-    } else if ((status == VEHEST_VALID) && state->had_fault) {
-        state->had_fault = false;
-        state->in_fault = 0U;
-        if (cleaned->flow == USE) {
+    } else if (status == VEHEST_VALID) {
+        if ((cleaned->flow == USE) && (state->at_fault >= PERSISTENT)) {
             cleaned->flow = RESTART;
         }
+        state->at_fault = 0U;
+        state->needed_at_fault = 0U;
     } else {
         /* nothing changes */
-    }
-    if (state->in_fault > 0U) {
-        state->in_fault = counted(state->in_fault);
     }
 }
 
@@ -655,8 +653,8 @@ void vehest_start(vehest_state *state)
     front_end_start(&state->front_end);
     guard_start(&state->guard);
     vehest_health_start(&state->health);
-    state->in_fault = 0U;
-    state->had_fault = false;
+    state->at_fault = 0U;
+    state->needed_at_fault = 0U;
     vehest_method_start(&state->method);
     state->fresh = true;
     watch_start(&state->watch);

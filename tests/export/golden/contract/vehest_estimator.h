@@ -96,8 +96,8 @@ typedef struct {
     vehest_front_end front_end;
     vehest_guard guard;
     vehest_health health;
-    uint32_t in_fault; /* samples for which a channel that is needed has been accused */
-    bool had_fault; /* since health was last valid */
+    uint32_t at_fault; /* samples at which a channel was accused since health was last valid */
+    uint32_t needed_at_fault; /* of these, those at which a channel was accused that is needed */
     vehest_method method;
     bool fresh; /* whether the method has seen nothing since its start */
     vehest_watch watch;
