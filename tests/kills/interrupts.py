@@ -74,6 +74,9 @@ def main():
     parser.add_argument("--output", type=Path, help="an output root to copy, with its recordings")
     asked = parser.parse_args()
     os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # which a shell's background job ignores
     draw = random.Random(asked.seed)
     codes = Counter()
     faults = []

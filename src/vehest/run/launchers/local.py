@@ -198,10 +198,10 @@ class _Worker:
 def _describe_exit(code: int | None) -> str:
     """Why a worker ended, in one line."""
     if code is None or code >= 0:
-        return f"its worker process ended unexpectedly with exit code {code}"
+        return f"a worker process ended unexpectedly with exit code {code}"
     name = signal.Signals(-code).name
     hint = "; if memory ran out, --jobs 1 needs less" if name == "SIGKILL" else ""
-    return f"its worker process was ended by {name}{hint}; the same command goes on"
+    return f"a worker process was ended by {name}{hint}; the same command goes on"
 
 
 def _serve(connection: Connection, limits: Limits) -> None:
