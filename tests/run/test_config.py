@@ -182,9 +182,9 @@ ALIASES = "title: [&a [x,x,x,x,x,x,x,x,x]" + "".join(
         (yaml.safe_dump(repeated(40, "${{oc.select:dataset.k{}}}")), "more than 20000 values"),
         (
             yaml.safe_dump(
-                {"m0": ["x"] * 10} | {f"m{n + 1}": [f"${{.m{n}}}"] * 10 for n in range(9)}
+                {"m0": ["x"] * 10} | {f"m{n + 1}": [f"${{dataset.m{n}}}"] * 10 for n in range(9)}
             ),
-            "stand for more than 20000 values|Interpolation",
+            "stand for more than 20000 values",
         ),
         (
             yaml.safe_dump(
