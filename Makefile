@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -95,6 +95,9 @@ pilots-compare: $(INSTALLED) ## tables of two such runs, cell by cell (A=FOLDER 
 
 kills: $(INSTALLED) ## kill the quickstart 100 times (KILLS=100, SEED=0), every run after it must end in the same numbers; half an hour
 	PYTHONPATH=tests $(BIN)/python tests/kills/kills.py --kills $(KILLS) --seed $(SEED)
+
+interrupts: $(INSTALLED) ## press Ctrl-C 50 times (SEED=0) in the first 5 s of the quickstart, while workers start; every run must end; ten minutes
+	PYTHONPATH=tests $(BIN)/python tests/kills/interrupts.py --seed $(SEED)
 
 fuzz: $(INSTALLED) ## try 3,000 malformed inputs on the command line, a row each in results/reliability/fuzz.csv (FUZZ=3000, SEED=0; ten minutes)
 	PYTHONPATH=tests:tests/sources $(BIN)/python -m fuzz --inputs $(FUZZ) --seed $(SEED) --jobs $(JOBS) --out results/reliability/fuzz.csv

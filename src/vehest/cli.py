@@ -886,10 +886,16 @@ def doctor(as_json: AsJson = False) -> None:
 
 @data_app.command("list")
 def data_list(as_json: AsJson = False) -> None:
-    """List the data sets that conf/dataset offers, with their licences and what to cite."""
+    """List the data sets that conf/dataset offers, with their licences and what to cite.
+
+    Exit code 2 after the list if some file there cannot be read, which the error names.
+    """
     from vehest.run.inspect_data import list_datasets
 
-    emit(as_json, *list_datasets())
+    rows, lines, errors = list_datasets()
+    emit(as_json, rows, lines)
+    if errors:
+        raise ConfigurationError("; ".join(errors))
 
 
 @data_app.command("channels")

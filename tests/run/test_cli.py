@@ -22,6 +22,7 @@ from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
 from vehest.run import ingest, inspect_data, runner
 from vehest.run.artefacts import read_artefact
+from vehest.run.comparison import NO_TIME
 from vehest.run.signals import TimeLimit
 from vehest.training import supervised
 from vehest.trust.health import reason_in_words
@@ -131,13 +132,13 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     assert not any("seconds" in metric for metric in set(metrics["metric"]))
     shutil.rmtree(next((place.folder / "outputs" / "train").glob("gru-*")))
     code, out, err = place("report", "small", "tracking=none", "--json")
-    assert code == 5
-    assert "run 'vehest run" in err
+    assert code == 0
+    assert "'vehest run pipelines/small.yaml' goes on with them" in err
     drawn = json.loads(out)
     assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger", "ksnn"}
     ((name, reason),) = drawn["failed"].items()
     assert name.startswith("gru-states_2")
-    assert "has not been trained and evaluated" in reason
+    assert reason == NO_TIME
 
 
 def test_train_eval_estimate_report_one_by_one(place):
@@ -437,10 +438,10 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
         code, out, err = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out
-    assert (
-        "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on"
-        in out
-    )
+    assert f"left out: gru-states_2-seed0: {NO_TIME}" in out
+    told, err = place.done("report", "small", "tracking=none")
+    assert told == out, "the same report"
+    assert "gru-states_2-seed0; 'vehest run pipelines/small.yaml' goes on with them" in err
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
     assert "GRU" in out

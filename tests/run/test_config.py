@@ -1,10 +1,12 @@
 """Configuration: overrides, choices, sweeps, local files first, errors of one line, completion."""
 
+import json
 import re
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 import pytest
+import yaml
 from refusals import refusal
 
 from place import run_vehest
@@ -159,3 +161,54 @@ def test_commands_options_choices_and_studies_are_completed(
     ):
         monkeypatch.setenv(name, value)
     assert offered <= set(run_vehest(capsys)[1].split())
+
+
+def repeated(levels, form):
+    """Keys k0 to k``levels``, each of which stands twice for the one before."""
+    return {"k0": "x", **{f"k{n + 1}": form.format(n) * 2 for n in range(levels)}}
+
+
+ALIASES = "title: [&a [x,x,x,x,x,x,x,x,x]" + "".join(
+    f",&{name} [{','.join([f'*{before}'] * 9)}]" for before, name in pairwise("abcdef")
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (ALIASES + "]", r"'conf/dataset/bad.yaml' nests deeper than .* or holds more than 20000"),
+        (yaml.safe_dump(repeated(40, "${{dataset.k{}}}")), "stand for more than 20000 values"),
+        (yaml.safe_dump(repeated(40, "${{.k{}}}")), "stand for more than 20000 values"),
+        (yaml.safe_dump(repeated(40, "${{oc.select:dataset.k{}}}")), "more than 20000 values"),
+        (
+            yaml.safe_dump(
+                {"m0": ["x"] * 10} | {f"m{n + 1}": [f"${{dataset.m{n}}}"] * 10 for n in range(9)}
+            ),
+            "stand for more than 20000 values",
+        ),
+        (
+            yaml.safe_dump(
+                dict(reversed(repeated(40, "${{dataset.k{}}}").items())), sort_keys=False
+            ),
+            "stand for more than 20000 values",
+        ),
+        ("title: [", r"'conf/dataset/bad.yaml' cannot be read as YAML"),
+    ],
+)
+def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, text, says):
+    file = place.folder / "conf" / "dataset" / "bad.yaml"
+    file.write_text(f"name: bad\nsource: tabular\n{text}\n", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=says):
+        compose_config("ingest", ["dataset=bad"])
+    code, out, err = place("data", "list", "--json")
+    assert code == 2
+    assert err.startswith("error: data set 'bad': ")
+    assert err.count("\n") == 1
+    assert "mine" in {row["dataset"] for row in json.loads(out)}
+    assert place("data", "show", "mine")[0] == 0
+
+
+def test_references_of_an_override_are_bounded_too(elsewhere):
+    words = [f"++k{n}={value}" for n, value in enumerate(repeated(40, "${{k{}}}").values())]
+    with pytest.raises(ConfigurationError, match="stand for more than 20000 values"):
+        compose_config("ingest", ["dataset=ferrari_250lm", *words])

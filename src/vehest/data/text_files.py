@@ -41,8 +41,8 @@ def read_yaml(path: Path) -> Any:
 
 def parse_yaml(text: str, where: str) -> Any:
     """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
+    check_yaml_size(text, where)
     try:
-        _check_size(text, where)
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
@@ -55,8 +55,20 @@ def parse_yaml(text: str, where: str) -> Any:
         ) from None
 
 
-def _check_size(text: str, where: str) -> None:
-    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built."""
+def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> None:
+    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built; raises `DataError`."""
+    try:
+        is_larger = _is_larger(text, max_values)
+    except (yaml.YAMLError, ValueError) as error:
+        raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+    if is_larger:
+        raise DataError(
+            f"{where} nests deeper than {DEEPEST} levels or holds more than {max_values} values, repeated ones included"
+        )
+
+
+def _is_larger(text: str, max_values: int) -> bool:
+    """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as aliases repeat it."""
     sizes: dict[str | None, int] = {}  # of anchored collections
     begun: list[tuple[str | None, int]] = []
     count = 0
@@ -68,11 +80,10 @@ def _check_size(text: str, where: str) -> None:
             count += sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
             if isinstance(event, yaml.CollectionStartEvent):
                 begun.append((event.anchor, count))
-                sizes[event.anchor] = MOST_VALUES  # until its end: it cannot hold itself
-        if count > MOST_VALUES or len(begun) > DEEPEST:
-            raise DataError(
-                f"{where} nests deeper than {DEEPEST} levels or holds more than {MOST_VALUES} values, repeated ones included"
-            )
+                sizes[event.anchor] = max_values  # until its end: it cannot hold itself
+        if count > max_values or len(begun) > DEEPEST:
+            return True
+    return False
 
 
 def read_json(path: Path) -> Any:

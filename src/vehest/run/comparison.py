@@ -27,7 +27,7 @@ from vehest.run.study import Job
 from vehest.run.train import TrainJob, new_estimator, plan_train
 from vehest.run.usable import lack
 
-NO_TIME = "not done yet: no time was left, the same command goes on"
+NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
 Note = tuple[

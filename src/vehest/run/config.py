@@ -7,28 +7,34 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, product
+from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import Container, OmegaConf
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from vehest.data.errors import ConfigurationError, printable
+from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
 from vehest.data.schema import FURTHER_KEYS, validated
-from vehest.data.text_files import first_line
+from vehest.data.text_files import check_yaml_size, first_line, read_text
 from vehest.data.transforms import Preparation
 from vehest.run.config_files import GROUPS, choices, conf_folders, packaged
 
@@ -40,6 +46,12 @@ COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "nam
 GIVEN = "given"  # key of a configuration: the rates that overrides set; only a default may be lowered to the rate of the recordings
 
 RATES = ("estimator.rate_hz", "evaluation.rate_hz")
+LOCAL_SCHEME = "vehest"  # of the search path, for ./conf
+MAX_CONFIG_VALUES = (
+    20_000  # of a file of ./conf, and of what references stand for; OmegaConf takes 0.1 ms for each
+)
+VALUES_PER_REFERENCE = 10  # as which the work for a reference counts
+CHARACTERS_PER_VALUE = 100  # as which long text counts
 OWN_SEARCH_PATH = "hydra.searchpath=[]"  # the first one counts; a package named by another, in a file or an override, would be imported
 
 
@@ -88,9 +100,68 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
         *local, _, papers = conf_folders()
         for folder in local:
             search_path.prepend(
-                "local", f"file://{folder.resolve()}"
+                "local", f"{LOCAL_SCHEME}://{folder.resolve()}"
             )  # Hydra takes it literally, spaces too
         search_path.append("papers", f"file://{papers}")
+
+
+class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
+    """The files of ./conf: each is read within the limits on text and values before OmegaConf copies what its aliases repeat."""
+
+    @staticmethod
+    def scheme() -> str:
+        return LOCAL_SCHEME
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        file = Path(os.path.relpath(self.path), self._normalize_file_name(config_path))
+        check_yaml_size(read_text(file), f"'{file}'", MAX_CONFIG_VALUES)
+        return super().load_config(config_path)
+
+
+@contextmanager
+def _limited_references() -> Iterator[None]:
+    """Bound what references (``${…}``) stand for in one configuration, each counted as often as others repeat it.
+
+    OmegaConf resolves a reference anew wherever it is met, so that a chain of n references to two each takes 2ⁿ steps, and has no
+    bound itself; all of its ways to resolve one go through ``Container.resolve_parse_tree``.
+    """
+    resolve = Container.resolve_parse_tree
+    sizes: dict[int, int] = {}  # of collections that references name
+    total = 0
+
+    def check() -> None:
+        if total > MAX_CONFIG_VALUES:
+            raise InterpolationResolutionError(
+                f"the references (${{…}}) of the configuration stand for more than {MAX_CONFIG_VALUES} values, "
+                "repeated ones included; let them repeat each other less"
+            )
+
+    def counted(container: Container, *arguments: Any, **options: Any) -> Any:
+        nonlocal total
+        total += VALUES_PER_REFERENCE
+        check()  # first, since OmegaConf drops some errors and resolves on
+        resolved = resolve(container, *arguments, **options)
+        if isinstance(resolved, str):
+            total += len(resolved) // CHARACTERS_PER_VALUE
+        elif isinstance(resolved, Container):
+            if id(resolved) not in sizes:
+                sizes[id(resolved)] = _count_values(OmegaConf.to_container(resolved))
+            total += sizes[id(resolved)]
+        check()
+        return resolved
+
+    Container.resolve_parse_tree = counted  # type: ignore[method-assign, assignment]
+    try:
+        yield
+    finally:
+        Container.resolve_parse_tree = resolve  # type: ignore[method-assign]
+
+
+def _count_values(content: Any) -> int:
+    """Number of values in plain collections, the collections included."""
+    if isinstance(content, dict):
+        content = list(content.values())
+    return 1 + sum(map(_count_values, content)) if isinstance(content, list) else 1
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
@@ -106,12 +177,18 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         _check(override)
     if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(_LocalFirst)
+    SourcesRegistry.instance().register(_LimitedFiles)
     try:
-        with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
+        with (
+            _limited_references(),
+            initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"),
+        ):
             composed = compose(
                 command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in read)]
             )
-        resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
+            resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
+    except VehestError as error:
+        raise ConfigurationError(str(error)) from None
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing

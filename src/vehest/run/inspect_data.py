@@ -40,11 +40,16 @@ SPREAD = ("min", "mean", "max", "std")
 Lines = list[str | TerminalTable]
 
 
-def list_datasets() -> tuple[list[dict[str, str]], Lines]:
-    """Data sets with their files' presence, licences and citations: for JSON and for a terminal."""
+def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
+    """Data sets with their files' presence, licences and citations: for JSON and for a terminal; why others cannot be listed."""
     rows = []
+    errors = []
     for name in choices("dataset"):
-        dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
+        try:
+            dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
+        except ConfigurationError as error:
+            errors.append(f"data set '{name}': {error}")
+            continue
         row = {
             "dataset": name,
             "kind": kind_of(dataset),
@@ -67,7 +72,7 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines]:
         for row in rows
         for line in (f"{row['dataset']}: {row['licence']}", f"  cite: {row['citation']}")
     ]
-    return rows, [table, "", "licences and citations", *cited]
+    return rows, [table, "", "licences and citations", *cited], errors
 
 
 def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vehest.data.errors import JobsFailedError, VehestError
-from vehest.data.files import file_name, remove_leftovers, written_aside
+from vehest.data.files import file_name, regular_file, remove_leftovers, written_aside
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
@@ -182,7 +182,7 @@ class RunCache:
         texts = list(self._overrides)
         try:
             for file in [*_configuration(self._pipeline), *_code()]:
-                content = file.read_bytes()
+                content = regular_file(file).read_bytes()
                 digest.update(
                     repr((str(file), hashlib.sha256(content).hexdigest())).encode(
                         "utf-8", "surrogateescape"

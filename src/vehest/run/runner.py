@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import DataError
 from vehest.data.recording_summary import RecordingSummary, stored_summary
 from vehest.data.split_files import Reader, dataset_names, split_from_config
 from vehest.data.splits import Split
@@ -219,14 +219,7 @@ class Runner:
             waiting += [replace(group, jobs=missing)] if missing else []
         failures: dict[str, Failure] = {}
         if waiting and self.train_first:
-            plans = [job.plan for group in waiting for job in group.jobs]
-            reason = f"run '{self.train_first}' first"
-            if not members:
-                raise MissingError(f"{plans[0].label} has not been trained and evaluated; {reason}")
-            failure = Failure(
-                f"has not been trained and evaluated; {reason}", exit_code=MissingError.exit_code
-            )
-            return members, {plan.key: failure for plan in plans}
+            return members, {}  # `Comparison.unfinished` has the others
         if waiting:
             self._announce(waiting, len(members))
         while waiting:

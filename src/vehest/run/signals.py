@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType
 
 
@@ -64,6 +65,23 @@ class StopSignals:
         self.number = self.number or number
         if not (self._deferred and first):
             raise Stopped(number)
+
+
+@contextmanager
+def blocked_signals() -> Iterator[None]:
+    """Start processes in here that are to leave SIGINT and SIGTERM to this one: they inherit that this thread blocks both.
+
+    A handler that they install themselves comes too late for a Ctrl-C while they start.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # which unblocks both when it starts
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
 class TimeLimit:

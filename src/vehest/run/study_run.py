@@ -266,12 +266,23 @@ def _error_of(
             f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}"
         )
     nothing = bool(study.parts) and not any(own.members for own in comparisons)
+    unfinished = [name for own in comparisons for name in own.unfinished]
+    if unfinished and runner.train_first and (nothing or not study.shows_failed):
+        raise MissingError(
+            f"{unfinished[0]} has not been trained and evaluated; run '{runner.train_first}' first"
+        )
     if error is not None and (nothing or not study.shows_failed):
         raise error
     if nothing:
-        left = [name for own in comparisons for name in own.unfinished]
         raise DataError(
-            f"no estimator was done in this time; the same command goes on with: {', '.join(left)}"
+            f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}"
+        )
+    if unfinished and not runner.dry_run:
+        runner.messages.line(
+            "note",
+            REPORT,
+            f"{len(unfinished)} of {len(jobs)} not done",
+            f"{', '.join(unfinished)}; '{study.command}' goes on with them",
         )
     return error
 

@@ -7,18 +7,20 @@ import os
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
 from vehest.run.locks import Waiting
-from vehest.run.signals import StopSignals, TimeLimit
+from vehest.run.signals import StopSignals, TimeLimit, blocked_signals
 from vehest.training.context import Progress
 
 if TYPE_CHECKING:
@@ -29,6 +31,9 @@ Task = Callable[
 ]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]
 POLL_SECONDS = 0.2
+READY = "ready"  # kinds of messages of a worker: it waits for its first task,
+PROGRESS = "progress"  # a task goes on,
+ENDED = "ended"  # a task returned or failed
 Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> its files
 
 
@@ -100,43 +105,126 @@ def guarded(
 def _launch_in_processes(
     tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
 ) -> Iterator[Done]:
-    context = get_context("spawn")
-    stopping = context.Event()
-    messages = context.SimpleQueue()
-    pool = ProcessPoolExecutor(jobs, context, _start_worker, (stopping, messages, current_limits()))
-    with stop.deferred(), pool:
-        futures = {
-            pool.submit(_work, position, task): position for position, task in enumerate(tasks)
-        }
-        waiting = set(futures)
-        while waiting:
-            ended, waiting = wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
-            while not messages.empty():
-                report(*messages.get())
-            if stop.requested():
-                stopping.set()
-                for future in waiting:
-                    future.cancel()
-            for future in ended:
-                error = None if future.cancelled() else future.exception()
-                if error is not None:
-                    yield Done(
-                        futures[future], Failure(f"a worker process ended unexpectedly ({error})")
-                    )
-                elif not future.cancelled() and (done := future.result()) is not None:
-                    yield done
+    waiting = deque(enumerate(tasks))
+    workers: dict[Connection, _Worker] = {}
+    with stop.deferred():
+        try:
+            while waiting or workers:
+                if stop.requested():
+                    waiting.clear()
+                    for worker in list(workers.values()):
+                        if not worker.stop():
+                            del workers[worker.connection]
+                while waiting and len(workers) < jobs:
+                    worker = _Worker(*waiting.popleft())
+                    workers[worker.connection] = worker
+                for connection in wait(list(workers), POLL_SECONDS):
+                    worker = workers[cast(Connection, connection)]
+                    message = worker.receive()
+                    if not isinstance(message, Done):
+                        report(worker.position, message)
+                        continue
+                    if waiting and worker.is_alive:
+                        worker.begin(*waiting.popleft())
+                        report(worker.position, None)
+                    else:
+                        worker.end()
+                        del workers[worker.connection]
+                    yield message
+        finally:
+            for worker in workers.values():
+                worker.kill()
 
 
-_worker: dict[str, Any] = {}
+class _Worker:
+    """A process that runs one task at a time; each has a pipe of its own, so that no lock is shared with one that is killed."""
+
+    def __init__(self, position: int, task: Task) -> None:
+        context = get_context("spawn")
+        self.connection, remote_end = context.Pipe()
+        self.position = position
+        self.is_alive = True
+        self._is_stopping = False
+        self._task: Task | None = task  # until it is sent
+        self._process = context.Process(target=_serve, args=(remote_end, current_limits()))
+        with blocked_signals():
+            self._process.start()
+        remote_end.close()
+
+    def begin(self, position: int, task: Task) -> None:
+        """Send a task to a worker that waits for it."""
+        self.position = position
+        self._task = None
+        with suppress(ConnectionError):  # it was killed, which `receive` reports
+            self.connection.send(task)
+
+    def receive(self) -> Done | Progress | Waiting | None:
+        """The next message: None when a task begins, its progress, its end; a dead worker fails the task that it had."""
+        try:
+            kind, value = self.connection.recv()
+        except (EOFError, ConnectionError):
+            self._process.join()
+            self.is_alive = False
+            return Done(self.position, Failure(_describe_exit(self._process.exitcode)))
+        if kind == READY:
+            assert self._task is not None
+            self.begin(self.position, self._task)
+            return None
+        progress: Progress | Waiting = value
+        return progress if kind == PROGRESS else Done(self.position, value)
+
+    def stop(self) -> bool:
+        """Ask the task to end soon; False where it had not begun, and the process was ended instead."""
+        if self._task is not None:
+            self.kill()
+            return False
+        if not self._is_stopping:
+            self._is_stopping = True
+            with suppress(ConnectionError):
+                self.connection.send(None)
+        return True
+
+    def end(self) -> None:
+        """Let a worker without a task go."""
+        self.connection.close()
+        self._process.join()
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self._process.kill()
+        self.end()
 
 
-def _start_worker(stopping: Any, messages: Any, limits: Limits) -> None:
-    """Leave signals to the parent, and end with it."""
+def _describe_exit(code: int | None) -> str:
+    """Why a worker ended, in one line."""
+    if code is None or code >= 0:
+        return f"a worker process ended unexpectedly with exit code {code}"
+    name = signal.Signals(-code).name
+    hint = "; if memory ran out, --jobs 1 needs less" if name == "SIGKILL" else ""
+    return f"a worker process was ended by {name}{hint}; the same command goes on"
+
+
+def _serve(connection: Connection, limits: Limits) -> None:
+    """Run the tasks that come; leave signals to the parent, and end with it.
+
+    What comes while a task runs, be it a message or the end of the pipe, asks it to stop.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.set_threshold(10_000)  # as cli.main does
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _worker.update(stopping=stopping, messages=messages, limits=limits)
+    last = time.monotonic()
+
+    def on_progress(progress: Progress | Waiting) -> None:
+        nonlocal last
+        if isinstance(progress, Waiting) or time.monotonic() - last > POLL_SECONDS:
+            last = time.monotonic()
+            connection.send((PROGRESS, progress))
+
+    with use_limits(limits), suppress(EOFError, ConnectionError):  # the parent has ended
+        connection.send((READY, None))
+        while (task := connection.recv()) is not None:
+            connection.send((ENDED, guarded(task, connection.poll, on_progress)))
 
 
 def _end_with_parent() -> None:
@@ -144,22 +232,3 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _work(position: int, task: Task) -> Done | None:
-    """Run a task in a worker; none if it was stopped before it began."""
-    stopping = _worker["stopping"]
-    messages = _worker["messages"]
-    if stopping.is_set():
-        return None
-    messages.put((position, None))
-    last = time.monotonic()
-
-    def on_progress(progress: Progress | Waiting) -> None:
-        nonlocal last
-        if isinstance(progress, Waiting) or time.monotonic() - last > POLL_SECONDS:
-            last = time.monotonic()
-            messages.put((position, progress))
-
-    with use_limits(_worker["limits"]):
-        return Done(position, guarded(task, stopping.is_set, on_progress))
