@@ -33,8 +33,8 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
+from vehest.run.train import DIVERGED, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress
@@ -317,6 +317,8 @@ class Runner:
                 self.artefacts[made.folder] = made
                 status, detail = _in_words(made)
                 self.messages.line(status, made.stage, made.label, detail)
+                if made.stage == TRAIN and read_fit_metrics(made.folder).get("ended_by_divergence"):
+                    self.messages.warn(f"the training of {made.label} {DIVERGED}")
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
@@ -349,6 +351,8 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         fit = read_fit_metrics(made.folder)
         loss = fit.get("best_validation_loss")
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
+        if halvings := fit.get("step_size_halvings"):
+            epochs += f"step size halved {'once' if halvings == 1 else f'{halvings:g} times'}, "
         return "done", epochs + (
             f"{fit['n_parameters']:.0f} parameters"
             if loss is None
