@@ -179,7 +179,7 @@ class Runner:
         """Make an artefact unless it is there."""
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
-        found = None if plan.stage in self.force else find(plan)
+        found = None if plan.stage in self.force else find(plan, self.messages.warn)
         if found is None and self.dry_run:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
@@ -212,7 +212,7 @@ class Runner:
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
-            found = existing(group)
+            found = existing(group, self.messages.warn)
             members |= self._received([member for member in found if member.finished])
             missing = [member.job for member in found if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
