@@ -51,7 +51,7 @@ class SequenceSettings(Group):
 
     group = "training"
     version: ClassVar[str] = "1"
-    phase: PhaseSettings = setting(PhaseSettings(), "the one phase of the training")
+    phase: PhaseSettings = setting(PhaseSettings(patience=100), "the one phase of the training")
     sequence_steps: int = setting(300, "samples in a training sequence, the dropped ones included")
     validation_steps: int = setting(
         1000, "samples in a validation sequence, the dropped ones included"
