@@ -109,6 +109,7 @@ docs: reference docs-site ## the reference pages that are made from the code and
 
 reference: $(INSTALLED)
 	$(BIN)/python docs/make_reference.py
+	$(BIN)/python docs/make_configuration.py
 
 docs-site: $(INSTALLED) ## a site of all pages in build/site, every warning an error, every local link tried
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/site

@@ -29,7 +29,6 @@ CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurren
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
     "learned_ukf": {"width": 8},
-    "learned_ukf_variant": {"width": 8, "correlated_noise": False},
     "dugoff_ukf": {"inputs": "imu", **DUGOFF},
     "sideslip_ffnn": SMALL,
     "ensemble_ukf": {"members": 2, **SMALL, **DUGOFF},

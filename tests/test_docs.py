@@ -6,6 +6,7 @@ from collections import namedtuple
 from dataclasses import fields
 from pathlib import Path
 
+import make_configuration
 import make_reference
 import numpy as np
 import pytest
@@ -449,3 +450,16 @@ def test_stated_parameter_counts_of_recurrent_networks_and_the_ksnn():
         assert estimator_class("ksnn").from_config(
             compose_config("train", job)["estimator"]
         ).n_parameters == int(count)
+
+
+def test_configuration_files_have_the_settings_that_the_classes_declare():
+    contents = make_configuration.files()
+    no_settings = {"none.yaml"}
+    folders = [ROOT / "conf" / "estimator", ROOT / "conf" / "training"]
+    names = {file for folder in folders for file in folder.glob("*.yaml")}
+    assert {file.name for file in names - set(contents)} <= no_settings
+    for file, text in contents.items():
+        assert file.read_text(encoding="utf-8") == text, f"run 'make reference': {file}"
+    gru = contents[ROOT / "conf" / "estimator" / "gru.yaml"]
+    assert "n_states: 5 " in gru
+    assert "at least 1" in gru

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar, overload
 
 from vehest.data.errors import ConfigurationError
 
 LARGEST = (
     1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
 )
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,52 @@ class Declaration:
         )
 
 
-def setting(default: Any, doc: str, **declared: Any) -> Any:
-    """A setting with its default; ``declared`` as in `Declaration`."""
-    return field(default=default, metadata={"declared": Declaration(doc, **declared)})
+@overload
+def setting(
+    default: None,
+    doc: str,
+    *,
+    unit: str = "",
+    positive: bool = False,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> Any: ...
+
+
+@overload
+def setting(
+    default: T,
+    doc: str,
+    *,
+    unit: str = "",
+    positive: bool = False,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> T: ...
+
+
+def setting(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    positive: bool = False,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> Any:
+    """A dataclass field with its default, text, unit and bounds, as in `Declaration`.
+
+    Type checkers take it for a value of the default's type, as they do `dataclasses.field`: a default of another type than the annotation is
+    an error, and the setting is optional in the constructor.
+    """
+    declared = Declaration(doc, unit, positive, least, most, above, below)
+    return field(default=default, metadata={"declared": declared})
 
 
 def fitted(doc: str, **declared: Any) -> Any:

@@ -36,7 +36,6 @@ CONFIGS = {
     "dugoff_ukf": DUGOFF,
     "cnn_ukf": {**DUGOFF, "hidden": [8, 4]},
     "learned_ukf": {"dynamics": "pacejka", "noise": "constant"},
-    "learned_ukf_variant": {"dynamics": "pacejka", "noise": "constant", "correlated_noise": False},
 }
 DRIVES = {
     "kalman": lambda seed: linear_drive(JUMP, seed=seed)[0],
@@ -45,7 +44,6 @@ DRIVES = {
     "dugoff_ukf": lambda seed: dugoff_drive(JUMP, seed),
     "cnn_ukf": lambda seed: dugoff_drive(JUMP, seed),
     "learned_ukf": lambda seed: small_car_drive(JUMP, seed),
-    "learned_ukf_variant": lambda seed: small_car_drive(JUMP, seed),
 }
 EVERY = pytest.mark.parametrize("name", CONFIGS)
 
@@ -185,7 +183,6 @@ FILTERS = (
     "dugoff_ukf",
     "cnn_ukf",
     "learned_ukf",
-    "learned_ukf_variant",
 )
 OTHERS = [
     name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")

@@ -1,6 +1,6 @@
 """The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
 
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
 from vehest.estimators.learned_ukf import SHORT, LearnedUkf
-from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
 from vehest.training.context import FitContext
@@ -239,28 +238,16 @@ def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
     )
 
 
-variant_of = partial(estimator, LearnedUkfVariant)
-
-
-def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
-    one = estimator()
-    other = variant_of()
-    for made in (one, other):
-        made.fit(data(), quick(one_step=3))
-    assert other.variant == "nntf_uh"
-    assert other.n_parameters == one.n_parameters
-    assert all(
-        np.array_equal(values, other.weights()[name]) for name, values in one.weights().items()
-    )
+def test_curvature_is_of_pacejkas_tyres_alone():
     assert "estimator.curvature is of estimator.dynamics=pacejka" in refusal(
-        lambda: variant_of(curvature=True), ConfigurationError
+        lambda: estimator(curvature=True), ConfigurationError
     )
 
 
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])
 def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
     full = estimator(noise=noise)
-    made = variant_of(noise=noise, correlated_noise=False)
+    made = estimator(noise=noise, correlated_noise=False)
     for own in (full, made):
         own.fit(data(), quick(3, one_step=3))
     assert made.variant == f"{full.variant}_diagonal"
@@ -272,7 +259,7 @@ def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
                 covariance = part(state, inputs)[0]
             assert bool((covariance == covariance.diagonal().diag()).all()) == is_diagonal
             assert (torch.linalg.eigvalsh(covariance) > 0).all()
-    start = variant_of(noise=noise, correlated_noise=False)
+    start = estimator(noise=noise, correlated_noise=False)
     start.filter.to(torch.float64).begin_noise(
         [made.drive(own, torch.float64) for own in data().train], 0.2
     )
@@ -287,7 +274,7 @@ def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
 
 def test_diagonal_noise_in_use_is_that_of_its_training():
     """The compiled noise of filters at work against the module's own."""
-    made = variant_of(correlated_noise=False)
+    made = estimator(correlated_noise=False)
     made.fit(data(), quick(2, one_step=3))
     states = np.random.default_rng(0).normal(size=(4, 5))
     process, observation = made.filter.noise_at()
@@ -308,7 +295,7 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
 def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
     plain = {"dynamics": "pacejka", "noise": "constant", "through_filter": False}
     one = estimator(**plain)
-    other = variant_of(curvature=True, **plain)
+    other = estimator(curvature=True, **plain)
     assert other.n_parameters == one.n_parameters + 3
     state = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]])
     inputs = torch.tensor([[0.1, 8.0]])
@@ -316,6 +303,8 @@ def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
         torch.testing.assert_close(
             other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6
         )
+    with pytest.raises(ConfigurationError, match="cannot be exported to C"):
+        other.c_values()
     other.fit(
         FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)]),
         quick(one_step=5, steps=40, validation_steps=60),

@@ -61,6 +61,7 @@ VARIANTS = [
     ("learned_ukf", {"dynamics": "residual", "start_friction": 0.9}),
     ("learned_ukf", {"dynamics": "neural", "noise": "constant", "repair": False}),
     ("learned_ukf", {"dynamics": "tyre_network", "gate": 2.0, "scaled": False}),
+    ("learned_ukf", {"noise": "state_dependent", "width": 8, "correlated_noise": False}),
 ]
 
 pytestmark = [
@@ -246,7 +247,7 @@ def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(
 
 
 def test_every_family_but_the_factor_graph_can_be_exported():
-    assert set(exportable()) == set(estimator_names()) - {"factor_graph", "learned_ukf_variant"}
+    assert set(exportable()) == set(estimator_names()) - {"factor_graph"}
 
 
 def test_what_cannot_be_exported_is_said_in_one_line():

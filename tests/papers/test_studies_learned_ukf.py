@@ -235,7 +235,7 @@ def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets
     (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
     assert name == "NNTF_UH from scratch"
     assert (
-        candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path()))
+        candidate_of(EvaluatedModel("learned_ukf", "pc_curved", "", 0, Path(), Path()))
         == "PC with E"
     )
     metrics = part.metrics[

@@ -3,15 +3,19 @@
 import json
 import shutil
 import subprocess
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.run import published as study_keys
-from vehest.run.artefacts import TIMINGS
+from vehest.run.artefacts import TIMINGS, read_artefact
 from vehest.run.publishing import PROVENANCE, published_content
 from vehest.run.versions import code_of
 
@@ -313,6 +317,59 @@ def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_a
     code, _, err = checked(*RUN, "output=damaged")
     assert (
         code,
-        "weights.safetensors' is damaged" in " ".join(err.split()),
+        "weights.safetensors' was changed" in " ".join(err.split()),
         "--retrain" in err,
     ) == (3, True, True)
+
+
+def test_weights_that_were_changed_after_they_were_published_are_refused_by_name(checked):
+    file = checked.folder / "results" / "small" / "weights.safetensors"
+    before = contents(checked.folder / "results")
+    with safe_open(file, framework="np") as opened:
+        metadata = opened.metadata()
+    larger = {n: np.asarray(1.2 * v, v.dtype) for n, v in load_file(file).items()}
+    save_file(larger, file, metadata=metadata)
+    code, _, err = checked(*RUN)
+    said = " ".join(err.split())
+    assert code == 3
+    assert "weights.safetensors' was changed after it was published" in said
+    assert "git checkout results/small" in said
+    assert not list((checked.folder / "outputs").glob("train/*"))
+    file.write_bytes(before["small/weights.safetensors"])
+    provenance = file.with_name("provenance.json")
+    about = json.loads(provenance.read_text())
+    provenance.write_text(json.dumps({k: v for k, v in about.items() if k != "weights_sha256"}))
+    code, _, err = checked(*RUN)
+    assert (code, "has no weights_sha256" in " ".join(err.split())) == (3, True)
+
+
+def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
+    checked.done(*RUN)
+    output = checked.folder / "outputs"
+    before = {}
+    for manifest in sorted(output.glob("*/[!.]*/manifest.json")):
+        for name in json.loads(manifest.read_text())["outputs"]:
+            file = manifest.parent / name
+            data = file.read_bytes()
+            spoilt = data[:-2] + bytes([data[-2] ^ 1]) + data[-1:]
+            file.write_bytes(spoilt)
+            said = refusal(lambda manifest=manifest: read_artefact(manifest.parent))
+            assert f"'{file}' was changed after it was made" in said
+            file.write_bytes(data)
+            before[file] = data
+    stages = {file.relative_to(output).parts[0] for file in before}
+    assert {"ingest", "downsample", "train", "evaluate", "report"} <= stages
+    spoilt = {}
+    for file, data in before.items():
+        stage, artefact, *_ = file.relative_to(output).parts
+        if stage != "report" and (stage, artefact) not in spoilt:
+            spoilt[stage, artefact] = file
+            file.write_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
+    pipeline = checked.folder / "pipelines" / "small.yaml"
+    pipeline.write_text(pipeline.read_text() + "# so that the run looks at everything\n")
+    _, said = checked.done(*RUN)
+    assert "damaged, and not used" in " ".join(said.split())
+    for file in spoilt.values():
+        assert read_artefact(output / Path(*file.relative_to(output).parts[:2]))
+        if file.suffix in (".safetensors", ".yaml", ".parquet") or file.name == "metrics.csv":
+            assert file.read_bytes() == before[file], file

@@ -130,7 +130,7 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
     training = settings_from_config(estimator.training_type, config["training"], "training")
     needed = lacking_to_train(estimator, training, ())
     unread = (
-        {"vx"} if name in ("learned_ukf", "learned_ukf_variant", "kalman") else set()
+        {"vx"} if name in ("learned_ukf", "kalman") else set()
     )  # their estimates read it, their fits do not
     assert bool(needed) == estimator.learns
     generator = np.random.default_rng(0)

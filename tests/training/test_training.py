@@ -133,6 +133,70 @@ def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error(
         )
 
 
+def _plant(monkeypatch, member, bad_above, epoch=5):
+    """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger than ``bad_above``."""
+    descend = supervised._Run._descend
+
+    def spoilt(self, batches):
+        losses = descend(self, batches)
+        rows = (self.active == self.planted).nonzero().flatten()
+        if self.epoch + 1 >= epoch and self._step_size() > bad_above:
+            self.flat.data[rows] = np.nan
+        return losses
+
+    monkeypatch.setattr(supervised._Run, "_descend", spoilt)
+    monkeypatch.setattr(supervised._Run, "planted", member, raising=False)
+
+
+@pytest.mark.parametrize(
+    ("bad_above", "halvings", "ended"), [(3e-3, 1, 0.0), (6e-4, 3, 0.0), (0.0, 3, 1.0)]
+)
+@pytest.mark.parametrize("averaging", [0.0, 0.9])
+def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
+    tmp_path, monkeypatch, bad_above, halvings, ended, averaging
+):
+    settings = SupervisedSettings(
+        max_epochs=12, patience=12, learning_rate=4e-3, averaging=averaging
+    )
+    calm, _ = _fit("ksnn", {}, [0, 1, 2], settings)
+    _plant(monkeypatch, 1, bad_above)
+    spoilt, records = _fit("ksnn", {}, [0, 1, 2], settings)
+    for member in (0, 2):
+        assert np.array_equal(flat_weights(calm[member]), flat_weights(spoilt[member]))
+        assert "step_size_halvings" not in records[member].metrics
+    metrics = records[1].metrics
+    assert metrics["step_size_halvings"] == halvings
+    assert metrics["ended_by_divergence"] == ended
+    losses = np.array(records[1].history["validation_loss"])
+    assert np.isnan(losses).sum() == halvings + ended
+    assert metrics["best_epoch"] == np.nanargmin(losses) + 1
+    windows = windows_of(DATA.validation, spoilt[1].channels, "vy_ref", spoilt[1].settings.window)
+    error = spoilt[1]._predict(windows.series, windows.starts) - windows.targets
+    assert np.mean(error**2) == pytest.approx(np.nanmin(losses), rel=1e-5)
+    folders = [tmp_path / str(seed) for seed in range(3)]
+    for _ in range(20):
+        context = FitContext(folders, should_stop=stop_after(23))
+        resumed, resumed_records = _fit("ksnn", {}, [0, 1, 2], settings, context)
+        if not any(record.interrupted for record in resumed_records):
+            break
+    for one, other, record, resumed_record in zip(
+        spoilt, resumed, records, resumed_records, strict=True
+    ):
+        assert np.array_equal(flat_weights(one), flat_weights(other))
+        np.testing.assert_equal(dict(record.history), dict(resumed_record.history))
+    monkeypatch.setattr(supervised._Run, "planted", 0)
+    (alone,), _ = _fit("ksnn", {}, [1], settings)
+    assert np.array_equal(flat_weights(alone), flat_weights(spoilt[1]))
+
+
+def test_member_that_diverges_in_its_first_epoch_has_no_model(monkeypatch):
+    _plant(monkeypatch, 0, 0.0, epoch=1)
+    with pytest.raises(
+        DataError, match=r"member 0 is nan after epoch 4; lower training\.learning_rate"
+    ):
+        _fit("ksnn", {}, [0, 1], SupervisedSettings(max_epochs=6))
+
+
 def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     def cost(p):
         return float((p[0] - 7.0) ** 2 + 30 * abs(p[1] - 0.11) + 5 * np.sin(3 * p[0]) ** 2)

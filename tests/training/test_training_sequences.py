@@ -1,6 +1,7 @@
 """Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is kept, bad steps are skipped."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,10 +11,11 @@ from torch import nn
 from conftest import die_after, stop_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
+from vehest.training import sequences
 from vehest.training.adam import Adam
 from vehest.training.checkpoints import load_checkpoint, resume_epoch
-from vehest.training.context import FitContext
-from vehest.training.sequences import Phase, PhaseSettings, train_phases
+from vehest.training.context import DivergenceError, FitContext
+from vehest.training.sequences import Phase, PhaseSettings, record_of_phases, train_phases
 
 X = torch.linspace(-2, 2, 48).unsqueeze(1)
 Y = torch.sin(2 * X)
@@ -305,6 +307,91 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     assert record.skipped_steps == 24, "two of three in twelve epochs"
     with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
         train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Trainings that have begun, so that a planted loss can ask for the step size and the epoch."""
+    begun = []
+    prepare = sequences._Run.__post_init__
+
+    def watched(self):
+        begun.append(self)
+        prepare(self)
+
+    monkeypatch.setattr(sequences._Run, "__post_init__", watched)
+    return begun
+
+
+def _planted(network, runs, bad_above, **settings):
+    """A phase whose loss is NaN from its fifth epoch on while the step size is larger than ``bad_above``."""
+    phase = _phase(network, "all", max_epochs=40, learning_rate=4e-2, **settings)
+
+    def loss(batch):
+        is_bad = runs[-1].now.epochs >= 4 and runs[-1].adam.learning_rate > bad_above
+        return (network(batch[0]) - batch[1]).square().mean() * (math.nan if is_bad else 1.0)
+
+    return replace(phase, loss=loss)
+
+
+@pytest.mark.parametrize(
+    ("bad_above", "halvings", "has_diverged"), [(0.03, 1, False), (0.007, 3, False), (0.0, 3, True)]
+)
+def test_diverged_phase_goes_on_from_its_best_with_half_the_step_size_three_times(
+    runs, bad_above, halvings, has_diverged
+):
+    network = _network()
+    (record,) = train_phases([_planted(network, runs, bad_above)], 0, FitContext())
+    assert (record.halvings, record.has_diverged) == (halvings, has_diverged)
+    assert record.epochs == 40 if not has_diverged else 4 < record.epochs < 40
+    assert record.best_epoch > (4 if not has_diverged else 0)
+    loss = float((network(X) - Y).square().mean().detach())
+    assert loss == pytest.approx(record.best_loss, rel=1e-6)
+    assert math.isfinite(loss)
+    metrics = record_of_phases([record]).metrics
+    assert metrics["step_size_halvings"] == halvings
+    assert metrics["ended_by_divergence"] == float(has_diverged)
+    calm = record_of_phases(train_phases([_phase(_network())], 0, FitContext())).metrics
+    assert "step_size_halvings" not in calm
+
+
+@pytest.mark.parametrize("stop", [stop_after, die_after], ids=["stopped", "killed"])
+@pytest.mark.parametrize("bad_above", [0.007, 0.0])
+def test_diverged_phase_is_resumed_to_the_same_bits(tmp_path, runs, bad_above, stop):
+    reference = _network()
+    (record,) = train_phases([_planted(reference, runs, bad_above)], 0, FitContext())
+    for _ in range(40):
+        resumed = _network()
+        context = (
+            FitContext([tmp_path], should_stop=stop_after(7))
+            if stop is stop_after
+            else FitContext([tmp_path], on_progress=die_after(3))
+        )
+        try:
+            (again,) = train_phases(
+                [_planted(resumed, runs, bad_above)], 0, context, checkpoint_seconds=0.0
+            )
+        except KeyboardInterrupt:
+            continue
+        if not again.interrupted:
+            break
+    assert torch.equal(_flat(reference), _flat(resumed))
+    assert _without_times([again]) == _without_times([record])
+
+
+def test_loss_that_finds_divergence_and_a_later_phase_keep_the_model(runs):
+    network = _network()
+    first = _phase(network, "first", max_epochs=3)
+
+    def lost(batch):
+        raise DivergenceError("more than half of the sequences are lost")
+
+    records = train_phases([first, replace(_phase(network, "second"), loss=lost)], 0, FitContext())
+    assert [record.has_diverged for record in records] == [False, True]
+    loss = float((network(X) - Y).square().mean().detach())
+    assert loss == pytest.approx(records[0].best_loss, rel=1e-6)
+    with pytest.raises(DataError, match="more than half of the sequences are lost"):
+        train_phases([replace(_phase(_network()), loss=lost)], 0, FitContext())
 
 
 def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):

@@ -10,7 +10,7 @@ from make_models import drive_name
 
 from place import run_vehest
 from vehest.data.store import read_estimate, read_recording
-from vehest.estimators.model_files import load_model
+from vehest.estimators.model_files import RENAMED, load_model
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.estimate import estimate_recording, open_model
 from vehest.trust.health import INVALID, TOO_WIDE
@@ -74,11 +74,6 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
 
 
 def test_every_family_has_a_model_of_yesterday():
-    assert (
-        sorted(
-            name
-            for name in estimator_names()
-            if estimator_class(name).__module__.startswith("vehest.")
-        )
-        == MODELS
-    )
+    assert sorted(
+        name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")
+    ) == [name for name in MODELS if name not in RENAMED]

@@ -27,7 +27,7 @@ from vehest.estimators.networks.sample_network import (
     reference_sideslip,
 )
 from vehest.filters.gaussian import Gaussian
-from vehest.training.context import FitContext
+from vehest.training.context import DivergenceError, FitContext
 from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
 from vehest.training.sequences import (
@@ -348,7 +348,7 @@ class EndToEnd:
 
         Cuts whose covariance or gradient is not finite are left out and counted.
 
-        Raises `DataError`: that is more than half of the batch.
+        Raises `DivergenceError`: that is more than half of the batch.
         """
         estimator = self.estimator
         count, steps = batch.sideslip.shape
@@ -394,7 +394,7 @@ class EndToEnd:
         if number > MOST_LOST * len(lost):
             row = int(lost.int().argmax())
             step = int(bad[row].int().argmax())
-            raise DataError(
+            raise DivergenceError(
                 f"training: phase 'end_to_end': the filter's {what} is not finite at {self.place(int(batch.firsts[row]) + step)} "
                 f"(step {step + 1} of a sequence), nor in {number} of the batch's {len(lost)} sequences; "
                 f"lower training.end_to_end.learning_rate or check the data with 'vehest data check'"

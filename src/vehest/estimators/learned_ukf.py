@@ -153,7 +153,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
     states = STATES
     training_type = ThroughFilterSettings
     network: CarFilter
-    correlated_noise = True
     dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = (
         setting(
             "friction_tyre_network",
@@ -187,13 +186,25 @@ class LearnedUkf(Network, SigmaPointEstimator):
     least_friction: float = setting(
         0.05, "smallest friction that the state may have", positive=True
     )
+    correlated_noise: bool = setting(
+        True,
+        "whether covariances of process and measurements have entries off their diagonals, as in the paper",
+    )
+    curvature: bool = setting(
+        False,
+        "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone",
+    )
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
     def check(self) -> None:
-        """Raises `ConfigurationError`: friction that starts below its smallest value."""
+        """Raises `ConfigurationError`: friction that starts below its smallest value, or a curvature of other dynamics."""
         if self.start_friction is not None and not self.start_friction > self.least_friction:
             raise ConfigurationError(
                 f"estimator.start_friction must lie above least_friction, not at {self.start_friction}"
+            )
+        if self.curvature and self.dynamics != "pacejka":
+            raise ConfigurationError(
+                f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}"
             )
 
     @property
@@ -217,6 +228,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
             + ("" if s.repair else "_unrepaired")
             + ("" if s.scaled else "_si")
             + self.gate_suffix
+            + ("" if s.correlated_noise else "_diagonal")
+            + ("_curved" if s.curvature else "")
         )
 
     @property
@@ -231,7 +244,16 @@ class LearnedUkf(Network, SigmaPointEstimator):
         if s.start_friction not in (None, s.friction):
             how.append(f"friction from {s.start_friction:g}")
         how += ["no repair"] * (not s.repair)
-        return f"{self.title}, {', '.join(how)}{self.gate_title}"
+        options = ["diagonal noise"] * (not s.correlated_noise) + ["curvature"] * s.curvature
+        return ", ".join([f"{self.title}, {', '.join(how)}{self.gate_title}", *options])
+
+    @property
+    def n_parameters(self) -> int:
+        """Those that can change: without entries off the diagonals of diagonal noise."""
+        fixed = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (
+            1 if self.noise == "constant" else 2 + len(STATES)
+        )
+        return super().n_parameters - fixed * (not self.correlated_noise)
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
@@ -335,7 +357,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         car = vars(s.car)
         width = s.width or (64 if "tyre" in s.dynamics else 256)
         if s.dynamics == "pacejka":
-            return PacejkaCar(car)
+            return PacejkaCar(car, with_curvature=s.curvature)
         if s.dynamics == "residual":
             return ResidualCar(car, hidden=(width, width))
         if s.dynamics == "neural":
@@ -491,8 +513,13 @@ class LearnedUkf(Network, SigmaPointEstimator):
         return FilterStep(measurement, memory["inputs"], *memory["noises"])
 
     def c_values(self) -> dict[str, Any]:
-        """Its dynamics, noise, car and gate."""
+        """Its dynamics, noise, car and gate; raises `ConfigurationError`: curves have E terms."""
         s = self.settings
+        if s.curvature:
+            raise ConfigurationError(
+                "estimator 'learned_ukf' with estimator.curvature=true cannot be exported to C; "
+                "train it with curvature=false"
+            )
         own = deepcopy(self.filter).double()
         with torch.no_grad():
             process, observation = own.noise_at()

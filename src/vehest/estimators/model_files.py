@@ -26,6 +26,7 @@ WEIGHTS = "model.safetensors"
 DESCRIPTION = "model.yaml"
 FORMAT = 1
 DTYPES = ("F32", "F64")
+RENAMED = {"learned_ukf_variant": "learned_ukf"}  # former name of a family in a model.yaml -> name
 USUAL_SIZE = 4096
 """A whole number among the settings that is larger than this and than the number of weights is no layer's width."""
 
@@ -129,7 +130,8 @@ def read_description(folder: Path) -> Description:
         raise DataError(f"'{path}' is not the description of a model; train it again")
     check_format(content["format"], FORMAT, f"'{path}'")
     described = validated(Description, content, f"'{path}'")
-    return replace(described, settings=content["settings"])
+    name = RENAMED.get(described.estimator, described.estimator)
+    return replace(described, estimator=name, settings=content["settings"])
 
 
 def model_digest(folder: Path) -> str:

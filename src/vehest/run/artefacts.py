@@ -138,17 +138,33 @@ class Manifest:
     code: str = ""
 
 
-def find(plan: StagePlan) -> Artefact | None:
-    """The complete artefact of a plan; none where it is missing, damaged, interrupted or another's."""
+def find(plan: StagePlan, warn: Callable[[str], None] = lambda text: None) -> Artefact | None:
+    """The complete artefact of a plan; none where it is missing, damaged (which ``warn`` is told), interrupted or another's."""
     try:
         artefact = read_artefact(plan.folder)
-    except (DataError, MissingError):
+    except MissingError:
+        return None
+    except DataError as error:
+        warn(f"damaged, and not used: {error}")
         return None
     return artefact if artefact.key == plan.key and artefact.status == "complete" else None
 
 
-def read_artefact(folder: Path) -> Artefact:
-    """Read a stage's folder; raises `MissingError` without a manifest, `DataError` where it is damaged or the files differ from it."""
+def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
+    """Read a stage's folder and compare its files with the manifest.
+
+    Parameters
+    ----------
+    hash_files : bool
+        Whether digests are compared too, and not lengths alone: for every use of what a file holds.
+
+    Raises
+    ------
+    MissingError
+        There is no manifest.
+    DataError
+        The manifest is damaged, or a file differs from it.
+    """
     path = folder / MANIFEST
     try:
         content = read_json(path)
@@ -168,8 +184,25 @@ def read_artefact(folder: Path) -> Artefact:
             raise DataError(
                 f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again"
             )
+        if hash_files and _digest_of(folder / name, (folder / name).stat()) != output.sha256:
+            raise DataError(
+                f"'{folder / name}' was changed after it was made (its digest is not that in {MANIFEST}); "
+                f"remove '{folder}', and the stage '{manifest.stage}' makes it again"
+            )
     outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
     return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
+
+
+def _digest_of(path: Path, stat: os.stat_result) -> str:
+    """SHA-256 of a file, computed once in a process as long as its length and time stamp stay."""
+    state = (stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+    if _DIGESTS.get(path, (None, ""))[0] != state:
+        _DIGESTS[path] = (state, sha256_of(path))
+    return _DIGESTS[path][1]
+
+
+_DIGESTS: dict[Path, tuple[tuple[int, ...], str]] = {}
+"""File -> its state when it was hashed, and its digest."""
 
 
 def _files(folder: Path) -> list[Path]:
@@ -205,7 +238,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
             "provenance": provenance() | {"seconds": round(time.monotonic() - started, 3)},
         }
         (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
-    return replace(read_artefact(plan.folder), skipped=False)
+    return replace(read_artefact(plan.folder, hash_files=False), skipped=False)
 
 
 def ensured(

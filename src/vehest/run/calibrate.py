@@ -207,16 +207,20 @@ def trust_of(
 
 
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
-    """The calibration of a model in its own output root or in another; the newest of several."""
+    """The calibration of a model in its own output root or in another; the newest of several.
+
+    Raises `DataError`: it was changed after it was made.
+    """
     found = []
     with suppress(VehestError):
-        digest = read_artefact(model_folder).digest
+        digest = read_artefact(model_folder, hash_files=False).digest
         roots = {model_folder.resolve().parent.parent, output.resolve()}
         for folder in sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")}):
             with suppress(VehestError):
-                artefact = read_artefact(folder)
+                artefact = read_artefact(folder, hash_files=False)
                 if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
                     found.append(artefact)
-    return max(
+    newest = max(
         found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None
     )
+    return None if newest is None else read_artefact(newest.folder)

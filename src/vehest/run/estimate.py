@@ -98,6 +98,8 @@ def open_model(
 ) -> tuple[Path, Estimator, Trust | None]:
     """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration."""
     folder = find_model(name, output, say)
+    if (folder / MANIFEST).is_file():
+        read_artefact(folder)  # raises `DataError` where a file was changed after it was made
     model = load_model(folder)
     model.preparation = preparation_of(folder)
     trust = trust_of(folder, output, say)

@@ -105,15 +105,19 @@ class Group:
                     members.append(_member(self, job, models[job.plan.key], made))
             return members
 
-    def existing(self, plan: StagePlan) -> Artefact | None:
-        """The artefact of a plan, if it is there and not to be made anew."""
-        return None if plan.stage in self.force else find(plan)
+    def existing(
+        self, plan: StagePlan, warn: Callable[[str], None] = lambda text: None
+    ) -> Artefact | None:
+        """The artefact of a plan, if it is there and not to be made anew; ``warn`` is told of a damaged one."""
+        return None if plan.stage in self.force else find(plan, warn)
 
 
-def existing(group: Group) -> list[Member]:
+def existing(group: Group, warn: Callable[[str], None] = lambda text: None) -> list[Member]:
     """The members of a group with the artefacts that are there already."""
     return [
-        _member(group, job, group.existing(job.plan), lambda plan, _: group.existing(plan))
+        _member(
+            group, job, group.existing(job.plan, warn), lambda plan, _: group.existing(plan, warn)
+        )
         for job in group.jobs
     ]
 

@@ -92,7 +92,7 @@ def _artefacts(output: Path) -> dict[Path, Artefact | None]:
             named = (manifest["stage"], f"{manifest['label']}-{manifest['key'][:12]}")
             if named == (folder.parent.name, folder.name) and not (folder / MANIFEST).is_symlink():
                 found[folder] = None
-                found[folder] = read_artefact(folder)
+                found[folder] = read_artefact(folder, hash_files=False)
     return found
 
 

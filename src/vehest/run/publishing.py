@@ -21,6 +21,7 @@ from vehest.data.text_files import read_json
 from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
 from vehest.run.locks import Lock, held
+from vehest.run.weights import DIGEST, PUBLISHED_WEIGHTS
 
 RESULTS = Path("results")
 PAGE_ENDING = ".html"
@@ -119,6 +120,8 @@ def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
             (aside / name).write_bytes(content)
         about = {**read_json(report.folder / PROVENANCE), "keys": keys}
+        if PUBLISHED_WEIGHTS in contents:
+            about[DIGEST] = hashlib.sha256(contents[PUBLISHED_WEIGHTS]).hexdigest()
         (aside / PROVENANCE).write_text(
             json.dumps(about, indent=1, ensure_ascii=False) + "\n",
             encoding="utf-8",

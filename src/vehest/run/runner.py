@@ -33,8 +33,8 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
+from vehest.run.train import DIVERGED, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
 from vehest.sources.base import car_of, kind_of, open_source
 from vehest.training.context import Progress
@@ -180,7 +180,7 @@ class Runner:
         """Make an artefact unless it is there."""
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
-        found = None if plan.stage in self.force else find(plan)
+        found = None if plan.stage in self.force else find(plan, self.messages.warn)
         if found is None and self.dry_run:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
@@ -213,7 +213,7 @@ class Runner:
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
-            found = existing(group)
+            found = existing(group, self.messages.warn)
             members |= self._received([member for member in found if member.finished])
             missing = [member.job for member in found if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
@@ -311,6 +311,8 @@ class Runner:
                 self.artefacts[made.folder] = made
                 status, detail = _in_words(made)
                 self.messages.line(status, made.stage, made.label, detail)
+                if made.stage == TRAIN and read_fit_metrics(made.folder).get("ended_by_divergence"):
+                    self.messages.warn(f"the training of {made.label} {DIVERGED}")
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
@@ -343,6 +345,8 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         fit = read_fit_metrics(made.folder)
         loss = fit.get("best_validation_loss")
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
+        if halvings := fit.get("step_size_halvings"):
+            epochs += f"step size halved {'once' if halvings == 1 else f'{halvings:g} times'}, "
         return "done", epochs + (
             f"{fit['n_parameters']:.0f} parameters"
             if loss is None

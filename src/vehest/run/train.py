@@ -27,6 +27,7 @@ from vehest.training.context import FitContext
 STAGE = "train"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
+DIVERGED = "diverged and ended with its best weights until then; lower its learning_rate"
 
 T = TypeVar("T")
 
@@ -139,6 +140,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         "n_parameters": estimator.n_parameters,
         "downsample": _preparation(job.data),
         "interrupted": record.interrupted,
+        **_divergence(record),
     }
     save_model(estimator, folder, about)
     if record.history:
@@ -152,6 +154,19 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
             ["metric", "value"],
             [item for item in metrics.items() if item[0].endswith("_seconds") is timed],
         )
+
+
+def _divergence(record: FitRecord) -> dict[str, Any]:
+    """What model.yaml says of a training that diverged; empty for one that never did."""
+    if "step_size_halvings" not in record.metrics:
+        return {}
+    halvings = int(record.metrics["step_size_halvings"])
+    has_ended = bool(record.metrics["ended_by_divergence"])
+    return {
+        "step_size_halvings": halvings,
+        "ended_by_divergence": has_ended,
+        **({"note": f"The training {DIVERGED}."} if has_ended else {}),
+    }
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:

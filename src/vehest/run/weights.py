@@ -16,12 +16,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from vehest.data.errors import DataError
-from vehest.data.text_files import first_line
+from vehest.data.files import sha256_of
+from vehest.data.text_files import first_line, read_json
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
 from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.train import FIT_METRICS, HISTORY
 
 PUBLISHED_WEIGHTS = "weights.safetensors"
+PROVENANCE = "provenance.json"  # beside it; names the file's digest
+DIGEST = "weights_sha256"
 MODELS = "models"  # the only entry of the file's metadata
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
 
@@ -52,6 +55,20 @@ def write_weights(models: Iterable[Artefact], path: Path) -> None:
     save_file(tensors, path, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
 
 
+def _check_digest(path: Path) -> None:
+    """Raise `DataError` where published weights are not those whose digest their provenance names."""
+    provenance = path.with_name(PROVENANCE)
+    about = read_json(provenance) if provenance.is_file() else {}
+    stated = about.get(DIGEST) if isinstance(about, dict) else None
+    remedy = f"restore both by 'git checkout {path.parent}', or add --retrain"
+    if stated is None:
+        raise DataError(f"'{path}': '{provenance}' has no {DIGEST} to verify it by; {remedy}")
+    if sha256_of(path) != stated:
+        raise DataError(
+            f"'{path}' was changed after it was published: its SHA-256 is not {DIGEST} in '{provenance}'; {remedy}"
+        )
+
+
 class PublishedWeights:
     """Models of a published study by the keys of their trainings; none where there is no such file; raises `DataError` where damaged."""
 
@@ -59,6 +76,7 @@ class PublishedWeights:
         self.path = path
         self._models: dict[str, PublishedModel] = {}
         if path.is_file():
+            _check_digest(path)
             try:
                 with safe_open(path, framework="np") as file:
                     self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(

@@ -6,6 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from vehest.data.errors import DataError
+
+MAX_HALVINGS = 3  # of the step size, each after a divergence; then the training ends with its best
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -63,6 +67,20 @@ def record_of_epochs(
         {"epochs": epochs, **metrics},
         interrupted,
     )
+
+
+class DivergenceError(DataError):
+    """A loss finds that its training has diverged, so that the trainer returns to the best parameters so far."""
+
+
+def divergence_metrics(halvings: int, has_diverged: bool) -> dict[str, float]:
+    """Figures of a fit that diverged; empty for one that never did.
+
+    ``step_size_halvings``: how often its step size was halved; ``ended_by_divergence``: 1 if it diverged again at the end.
+    """
+    if not halvings and not has_diverged:
+        return {}
+    return {"step_size_halvings": halvings, "ended_by_divergence": float(has_diverged)}
 
 
 @dataclass(frozen=True)

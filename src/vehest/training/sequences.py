@@ -17,11 +17,17 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import Group, setting
 from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
-
-SKIPS_ALLOWED = (
-    20  # steps in a row without a finite loss and gradient after which training gives up
+from vehest.training.context import (
+    MAX_HALVINGS,
+    DivergenceError,
+    FitContext,
+    FitRecord,
+    Progress,
+    divergence_metrics,
+    record_of_epochs,
 )
+
+SKIPS_ALLOWED = 20  # steps in a row without a finite loss and gradient that count as divergence
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,10 @@ class PhaseRecord:
     skipped_in_a_row: int = 0  # the last of them
     validated: bool = False  # whether it was, before the first epoch
     interrupted: bool = False  # whether it was stopped before it was over
+    halvings: int = 0  # how often it diverged and went on from its best with half the step size
+    returned_at: int = 0  # epochs finished when it last did, from which its patience counts
+    has_diverged: bool = False  # whether it ended because the smallest step size diverged too
+    problem: str = ""  # error message of the last divergence; empty: it never diverged
 
     @property
     def epochs(self) -> int:
@@ -116,11 +126,19 @@ def record_of_phases(phases: Sequence[PhaseRecord]) -> FitRecord:
         "skipped_steps": sum(phase.skipped_steps for phase in phases),
         "train_seconds": sum(phase.seconds for phase in phases),
         **{f"{phase.name}_seconds": phase.seconds for phase in phases},
+        **divergence_of_phases(phases),
     }
     train_loss = [loss for phase in phases for loss in phase.train_loss]
     validation_loss = [loss for phase in phases for loss in phase.validation_loss]
     numbers = [number for number, phase in enumerate(phases) for _ in phase.train_loss]
     return record_of_epochs(train_loss, validation_loss, metrics, last.interrupted, phase=numbers)
+
+
+def divergence_of_phases(phases: Sequence[PhaseRecord]) -> dict[str, float]:
+    """Figures of a training that diverged; empty for one that never did."""
+    return divergence_metrics(
+        sum(phase.halvings for phase in phases), any(phase.has_diverged for phase in phases)
+    )
 
 
 def train_phases(
@@ -137,6 +155,10 @@ def train_phases(
     element by element. Each phase draws from a stream of its own of ``seed``, so that its batches do not hang on how long the phases before
     it took.
 
+    Where `SKIPS_ALLOWED` steps in a row are not finite, or a loss raises `DivergenceError`, the phase returns to its best parameters and goes on
+    with half the step size and new moments, at most `MAX_HALVINGS` times. After that it ends with its best parameters, and later phases go on
+    from them.
+
     A stop ends within the current epoch, which the next run does again; the phase's best parameters so far are in its module then.
 
     Args:
@@ -151,7 +173,7 @@ def train_phases(
         One record for every phase that was begun.
 
     Raises:
-        DataError: 20 steps in a row, or all validations of a phase, were not finite.
+        DataError: a phase diverged before anything was learnt, or all of its validations were not finite.
         ConfigurationError: phases of equal names, or nothing to learn in one.
 
     Source:
@@ -211,8 +233,19 @@ class _Run:
             raise ConfigurationError(
                 f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable"
             )
-        settings = phase.settings
-        self.adam = Adam(self.learning.values(), settings.learning_rate, settings.weight_decay)
+        self.adam = self._new_adam()
+
+    def _new_adam(self) -> Adam:
+        return Adam(self.learning.values(), self._step_size(), self.phase.settings.weight_decay)
+
+    def _step_size(self) -> float:
+        """That of the epoch under way, halved as often as the phase has diverged."""
+        settings = self.phase.settings
+        size = settings.learning_rate
+        if settings.schedule == "cosine":
+            progress = self.now.epochs / settings.max_epochs
+            size = size * 0.5 * (1.0 + math.cos(math.pi * progress))
+        return size * 0.5**self.now.halvings
 
     def train_phase(self) -> None:
         """Train the phase under way from where it stands to its end, or until a stop."""
@@ -231,9 +264,13 @@ class _Run:
         now = self.now
         if now.epochs and not math.isfinite(now.best_loss) and not now.interrupted:
             raise DataError(
-                f"training: phase '{phase.name}' had no finite validation loss in {now.epochs} epochs; "
+                now.problem
+                or f"training: phase '{phase.name}' had no finite validation loss in {now.epochs} epochs; "
                 f"lower its learning_rate or check the data with 'vehest data check'"
             )
+        is_trained = any(record.best_epoch for record in self.records)
+        if now.problem and not is_trained and not now.interrupted:
+            raise DataError(now.problem)
         _put_back(self.state, self.best)
         if not now.interrupted:
             self._begin(self.position + 1)
@@ -242,8 +279,13 @@ class _Run:
     def _is_over(self) -> bool:
         epochs = self.now.epochs
         settings = self.phase.settings
-        waited = epochs - self.now.best_epoch if epochs % settings.validate_every == 0 else 0
-        return epochs >= settings.max_epochs or 0 < settings.patience <= waited
+        best = max(self.now.best_epoch, self.now.returned_at)
+        waited = epochs - best if epochs % settings.validate_every == 0 else 0
+        return (
+            self.now.has_diverged
+            or epochs >= settings.max_epochs
+            or 0 < settings.patience <= waited
+        )
 
     def _train_epoch(self, started: float) -> None:
         """One pass over the batches, then the validation; an epoch that is stopped leaves no trace but the checkpoint before it."""
@@ -260,12 +302,7 @@ class _Run:
             now.start_loss = self._validate()
             now.validated = True
         before = self._checkpoint()
-        if settings.schedule == "cosine":
-            self.adam.learning_rate = (
-                settings.learning_rate
-                * 0.5
-                * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
-            )
+        self.adam.learning_rate = self._step_size()
         total = 0.0
         taken = 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
@@ -273,6 +310,8 @@ class _Run:
                 self._stop(before)
                 return
             loss = self._step(batch, f"epoch {now.epochs + 1}, step {number}")
+            if now.has_diverged:
+                return
             if loss is not None:
                 total = total + loss
                 taken = taken + 1
@@ -301,28 +340,47 @@ class _Run:
     def _step(self, batch: Any, where: str) -> float | None:
         """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
         self.adam.zero_grad()
-        loss = self.phase.loss(batch)
         now = self.now
-        value = float(loss.detach())
-        if math.isfinite(value):
-            loss.backward()
-            gradients = [
-                parameter.grad for parameter in self.learning.values() if parameter.grad is not None
-            ]
-            if all(np.isfinite(gradient.numpy()).all() for gradient in gradients):
-                if self.phase.settings.clip:
-                    nn.utils.clip_grad_value_(self.learning.values(), self.phase.settings.clip)
-                self.adam.step()
-                now.skipped_in_a_row = 0
-                return value
+        try:
+            loss = self.phase.loss(batch)
+            value = float(loss.detach())
+            if math.isfinite(value):
+                loss.backward()
+        except DivergenceError as error:
+            self._return_to_best(str(error))
+            return None
+        gradients = [
+            parameter.grad for parameter in self.learning.values() if parameter.grad is not None
+        ]
+        if math.isfinite(value) and all(
+            np.isfinite(gradient.numpy()).all() for gradient in gradients
+        ):
+            if self.phase.settings.clip:
+                nn.utils.clip_grad_value_(self.learning.values(), self.phase.settings.clip)
+            self.adam.step()
+            now.skipped_in_a_row = 0
+            return value
         now.skipped_steps += 1
         now.skipped_in_a_row += 1
         if now.skipped_in_a_row >= SKIPS_ALLOWED:
-            raise DataError(
+            self._return_to_best(
                 f"training: phase '{now.name}', {where}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
                 f"lower its learning_rate or check the data with 'vehest data check'"
             )
         return None
+
+    def _return_to_best(self, problem: str) -> None:
+        """Go on from the phase's best parameters with half the step size, or end the phase after `MAX_HALVINGS` of them."""
+        now = self.now
+        now.problem = problem
+        if now.halvings == MAX_HALVINGS:
+            now.has_diverged = True
+            return
+        _put_back(self.state, self.best)
+        now.halvings += 1
+        now.skipped_in_a_row = 0
+        now.returned_at = now.epochs
+        self.adam = self._new_adam()
 
     def _validate(self) -> float:
         """The validation loss; the parameters are kept if it is the lowest so far."""
@@ -375,6 +433,7 @@ class _Run:
         self._begin(len(records) if finished else len(records) - 1)
         self.records = records
         if not finished:
+            self.adam = self._new_adam()
             self.best = best
             self.generator.set_state(checkpoint.tensors["generator"])
             for number, parameter in enumerate(self.learning.values()):

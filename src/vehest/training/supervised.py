@@ -15,7 +15,14 @@ from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
 from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
+from vehest.training.context import (
+    MAX_HALVINGS,
+    FitContext,
+    FitRecord,
+    Progress,
+    divergence_metrics,
+    record_of_epochs,
+)
 from vehest.training.members import (
     FlatParameters,
     constrain,
@@ -41,6 +48,10 @@ def train_members(
 
     Every member draws its own order of the windows from its own seed, stops on its own, and leaves the batch then.
 
+    A member whose validation loss is not finite has diverged: it leaves the batch, and goes on alone afterwards from its best weights (those it
+    began with, where no epoch was better) with half the step size and new moments, at most `MAX_HALVINGS` times. After that it ends with its
+    best weights.
+
     Args:
         networks: M networks of one shape and preparation; changed in place, and in evaluation mode afterwards.
         seeds: their seeds.
@@ -54,7 +65,7 @@ def train_members(
         0: none was finished. Seconds are wall time by member, not counting earlier runs that a checkpoint continues.
 
     Raises:
-        DataError: the loss is no longer finite.
+        DataError: a member diverged in its first epoch and with every smaller step size.
         ConfigurationError: a network does not return one number a window.
 
     Source:
@@ -62,8 +73,10 @@ def train_members(
     """
     run = _Run(networks, seeds, train, validation, settings, context)
     run.resume()
-    while run.active.numel() and run.epoch < settings.max_epochs and not run.interrupted:
-        run.train_epoch()
+    run.train_batch()
+    while run.diverged and not run.interrupted:
+        run.go_on_alone(next(iter(run.diverged)))
+        run.train_batch()
     return run.finish()
 
 
@@ -91,6 +104,12 @@ class _Run:
         self.best = flat.clone()
         self.best_loss = torch.full((members,), math.inf, dtype=torch.float64)
         self.best_epoch = torch.zeros(members, dtype=torch.int64)
+        self.halvings = [0] * members  # of the step size, one at each divergence
+        self.returned_at = torch.zeros(members, dtype=torch.int64)  # epoch of the last of them
+        self.has_diverged = [False] * members  # whether the smallest step size diverged too
+        # members that go on alone later, in their order, with the state of `_rows` that they go on
+        # from; an empty state is their best weights
+        self.diverged: dict[int, dict[str, Tensor]] = {}
         self.active = torch.arange(members)
         self.generators = [
             torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds
@@ -115,9 +134,28 @@ class _Run:
         """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
         self.average = rows.pop("average", None)
         self.flat = nn.Parameter(rows.pop("parameters").clone())
-        self.adam = Adam([self.flat], self.settings.learning_rate)
+        self.adam = Adam([self.flat], self._step_size())
         if rows:
             self.adam.state[self.flat] = rows
+
+    def _step_size(self) -> float:
+        """That of the active members, which are those that never diverged, or a single one."""
+        halvings = self.halvings[int(self.active[0])] if len(self.active) else 0
+        return self.settings.learning_rate * 0.5**halvings
+
+    def train_batch(self) -> None:
+        """Train the active members until each is over, or until a stop."""
+        while self.active.numel() and self.epoch < self.settings.max_epochs:
+            self.train_epoch()
+            if self.interrupted:
+                return
+
+    def go_on_alone(self, member: int) -> None:
+        """Let a member that has diverged be the only active one."""
+        rows = self.diverged.pop(member)
+        self.active = torch.tensor([member])
+        self.epoch = len(self.history[member][1])
+        self._go_on_with(rows or {"parameters": self.best[[member]]})
 
     def train_epoch(self) -> None:
         """One pass over the training windows, then the validation loss and the decisions that hang on it."""
@@ -175,7 +213,7 @@ class _Run:
         constrain(self.network, self.layout.views(bounds))
         starts = self.train.starts[batches]
         targets = self.train.targets[batches]
-        numbers = own.batch_size, own.learning_rate, bounds, own.averaging
+        numbers = own.batch_size, self._step_size(), bounds, own.averaging
         losses: Tensor = self.network.compiled_descent(
             flat, moments, self.train.series, starts, targets, *numbers
         )  # type: ignore[operator]
@@ -229,16 +267,15 @@ class _Run:
             for values, value in zip(self.history[member], losses, strict=True):
                 values.append(value)
             if not math.isfinite(losses[1]):
-                raise DataError(
-                    f"training: the validation loss of member {member} is {losses[1]} after epoch {self.epoch}; "
-                    f"lower training.learning_rate or check the data with 'vehest data check'"
-                )
+                self._return_to_best(member, losses[1])
         better = loss < self.best_loss[self.active]
         improved = self.active[better]
         self.best[improved] = judged[better]
         self.best_loss[improved] = loss[better]
         self.best_epoch[improved] = self.epoch
-        going_on = self.epoch - self.best_epoch[self.active] < self.settings.patience
+        waited_from = torch.maximum(self.best_epoch, self.returned_at)[self.active]
+        going_on = self.epoch - waited_from < self.settings.patience
+        going_on &= torch.isfinite(loss)
         if not bool(going_on.all()):
             self.active = self.active[going_on]
             self._go_on_with(self._rows(going_on))
@@ -254,6 +291,24 @@ class _Run:
         if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
             self._save(self._checkpoints())
 
+    def _return_to_best(self, member: int, loss: float) -> None:
+        """Note that a member goes on alone from its best weights, or that it is over: in its last epoch, or
+        after `MAX_HALVINGS` halvings.
+
+        Raises `DataError`: it is over and no epoch of it was finite.
+        """
+        if self.halvings[member] < MAX_HALVINGS and self.epoch < self.settings.max_epochs:
+            self.halvings[member] += 1
+            self.returned_at[member] = self.epoch
+            self.diverged[member] = {}
+            return
+        if not self.best_epoch[member]:
+            raise DataError(
+                f"training: the validation loss of member {member} is {loss} after epoch {self.epoch}; "
+                f"lower training.learning_rate or check the data with 'vehest data check'"
+            )
+        self.has_diverged[member] = True
+
     def _checkpoints(self) -> list[Checkpoint]:
         """The state of every member, each by itself, so that any of them can go on without the others."""
         row_of = {member: row for row, member in enumerate(self.active.tolist())}
@@ -265,8 +320,17 @@ class _Run:
                     "generator": self.generators[member].get_state(),
                     **self._rows(row_of[member]),
                 }
+            if member in self.diverged:
+                rows = {
+                    name: row if row.dim() == 0 else row[0]
+                    for name, row in self.diverged[member].items()
+                }
+                tensors |= {"generator": self.generators[member].get_state(), **rows}
             values = {
-                "finished": member not in row_of,
+                "finished": member not in row_of and member not in self.diverged,
+                "halvings": self.halvings[member],
+                "returned_at": int(self.returned_at[member]),
+                "has_diverged": self.has_diverged[member],
                 "epoch": len(validation_loss),
                 "best_epoch": int(self.best_epoch[member]),
                 "best_loss": float(self.best_loss[member]),
@@ -294,27 +358,33 @@ class _Run:
             for member, checkpoint in enumerate(checkpoints)
             if not checkpoint.values["finished"]
         ]
-        epochs = {checkpoints[member].values["epoch"] for member in unfinished}
+        together = [m for m in unfinished if not checkpoints[m].values.get("halvings", 0)]
+        epochs = {checkpoints[member].values["epoch"] for member in together}
         if len(epochs) > 1:
             return
         for member, (tensors, values) in enumerate(checkpoints):
             self.best[member] = tensors["best"]
             self.best_loss[member] = values["best_loss"]
             self.best_epoch[member] = values["best_epoch"]
+            self.halvings[member] = values.get("halvings", 0)
+            self.returned_at[member] = values.get("returned_at", 0)
+            self.has_diverged[member] = values.get("has_diverged", False)
             self.history[member] = (values["train_loss"], values["validation_loss"])
-        self.active = torch.tensor(unfinished, dtype=torch.int64)
+        self.active = torch.tensor(together, dtype=torch.int64)
         self.epoch = (
             epochs.pop()
             if epochs
             else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
         )
-        states = [dict(checkpoints[member].tensors) for member in unfinished]
-        for member, state in zip(unfinished, states, strict=True):
+        states = {member: dict(checkpoints[member].tensors) for member in unfinished}
+        for member, state in states.items():
             self.generators[member].set_state(state.pop("generator"))
             del state["best"]
-        if states:
-            together = {name: torch.stack([state[name] for state in states]) for name in states[0]}
-            self._go_on_with(together | ({"step": states[0]["step"]} if "step" in together else {}))
+        if together:
+            self._go_on_with(_stacked([states[member] for member in together]))
+        for member in unfinished:
+            if member not in together:
+                self.diverged[member] = _stacked([states[member]])
 
     def finish(self) -> list[FitRecord]:
         """Put the best weights into the networks."""
@@ -324,13 +394,21 @@ class _Run:
             self.layout.unpack(self.best[member], network.eval())
             figures = {
                 "best_epoch": int(self.best_epoch[member]),
-                "best_validation_loss": min(losses[1], default=math.nan),
+                "best_validation_loss": min(filter(math.isfinite, losses[1]), default=math.nan),
+                **divergence_metrics(self.halvings[member], self.has_diverged[member]),
             }
-            unfinished = self.interrupted and member in self.active.tolist()
+            is_unfinished = member in self.active.tolist() or member in self.diverged
+            unfinished = self.interrupted and is_unfinished
             records.append(
                 record_of_epochs(*losses, {**figures, "train_seconds": seconds}, unfinished)
             )
         return records
+
+
+def _stacked(states: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Rows of members that go on together; Adam's step is that of all."""
+    rows = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+    return rows | ({"step": states[0]["step"]} if "step" in rows else {})
 
 
 class _Prepared:

@@ -53,7 +53,7 @@ _BASELINES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP, "data_sheet": 
 
 def candidate_of(model: EvaluatedModel) -> str:
     """What the paper calls a model; its own title if the paper has none like it."""
-    if model.estimator in ("learned_ukf", "learned_ukf_variant"):
+    if model.estimator == "learned_ukf":
         name = (_FILTERS | _VARIANTS).get(model.variant, model.title)
         pre_training = model.training.get("one_step", {})
         return f"{name}{paper.FROM_SCRATCH}" if pre_training.get("max_epochs") == 0 else name

@@ -22,7 +22,13 @@ from vehest.estimators.base import FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.networks.recurrent import HiddenStateEstimator
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
-from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, train_phases
+from vehest.training.sequences import (
+    Phase,
+    PhaseSettings,
+    divergence_of_phases,
+    drawn_starts,
+    train_phases,
+)
 
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
@@ -45,7 +51,7 @@ class SequenceSettings(Group):
 
     group = "training"
     version: ClassVar[str] = "1"
-    phase: PhaseSettings = setting(PhaseSettings(), "the one phase of the training")
+    phase: PhaseSettings = setting(PhaseSettings(patience=100), "the one phase of the training")
     sequence_steps: int = setting(300, "samples in a training sequence, the dropped ones included")
     validation_steps: int = setting(
         1000, "samples in a validation sequence, the dropped ones included"
@@ -219,6 +225,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             "best_validation_loss": record.best_loss,
             "skipped_steps": record.skipped_steps,
             "train_seconds": record.seconds,
+            **divergence_of_phases([record]),
         }
         return record_of_epochs(
             record.train_loss, record.validation_loss, metrics, record.interrupted

@@ -373,9 +373,7 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
         if tried:
             plan.sweeps.append(([f"estimator={','.join(tried)}", *words], about))
             plan.estimators.extend(tried)
-    known = {name for names in sweeps.values() for name in names} | {
-        "learned_ukf_variant"
-    }  # which only a paper's study compares
+    known = {name for names in sweeps.values() for name in names}
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
     plan.lacking.update(
         dict.fromkeys(others, "none of the families tried by default; --with adds it")

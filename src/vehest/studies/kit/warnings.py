@@ -40,6 +40,7 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
         *_floors(artefacts),
         *_kinds(artefacts),
         *_epoch_limits(artefacts),
+        *_divergence(artefacts),
     ]
 
 
@@ -177,6 +178,20 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
     return (
         [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."]
         if found
+        else []
+    )
+
+
+def _divergence(artefacts: PartArtefacts) -> list[str]:
+    """Estimators some of whose trainings diverged with their smallest step size too."""
+    diverged = []
+    for models in by_name(artefacts.models).values():
+        ended = sum(bool(model.fit_metrics().get("ended_by_divergence")) for model in models)
+        if ended:
+            diverged.append(f"{as_text(models[0].title)} ({ended} of {len(models)} seeds)")
+    return (
+        [f"Training diverged and ended with its best weights until then: {listed(diverged)}."]
+        if diverged
         else []
     )
 

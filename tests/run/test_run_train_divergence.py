@@ -1,0 +1,13 @@
+"""What a training that diverged leaves in its artefact and in the report's warnings."""
+
+from vehest.run.train import _divergence
+from vehest.training.context import FitRecord, divergence_metrics
+
+
+def test_model_says_how_often_its_step_size_was_halved_and_what_its_user_should_know():
+    assert _divergence(FitRecord(metrics=divergence_metrics(0, False))) == {}
+    halved = _divergence(FitRecord(metrics=divergence_metrics(2, False)))
+    assert halved == {"step_size_halvings": 2, "ended_by_divergence": False}
+    ended = _divergence(FitRecord(metrics=divergence_metrics(3, True)))
+    assert ended["ended_by_divergence"] is True
+    assert "diverged and ended with its best weights" in ended["note"]
