@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -102,13 +101,6 @@ class Protocol:
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
     least_speed: float = 0.0  # of the car by its reference [m/s]; slower samples have no direction, and count as β = 0 without error
-
-    @property
-    def plain(self) -> dict[str, Any]:
-        """For a key; without a least speed it is that of a protocol that knows none."""
-        return {
-            name: value for name, value in asdict(self).items() if name != "least_speed" or value
-        }
 
     @property
     def sets_elsewhere(self) -> frozenset[str]:
