@@ -84,6 +84,7 @@ test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for t
 	$(BIN)/python -m pytest -m slow
 
 golden: $(INSTALLED) ## record the numbers that the golden tests compare, after a version was raised
+	PYTHONPATH=tests $(BIN)/python tests/golden/golden_defaults.py
 	PYTHONPATH=tests:tests/sources $(BIN)/python tests/golden/golden_numbers.py
 	PYTHONPATH=tests:tests/sources $(BIN)/python tests/golden/golden_readings.py
 

@@ -2,13 +2,12 @@
 
 StagePlan -> `find`, or `make` under its lock -> Artefact
 
-The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration, the digests
-of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
+The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration (`keys`), the
+digests of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -29,6 +28,7 @@ from vehest.data.errors import DataError, MissingError
 from vehest.data.files import file_name, remove, remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_json
+from vehest.run.keys import hash_of
 from vehest.run.locks import Lock, Waiting, held
 from vehest.version import __version__
 
@@ -51,10 +51,13 @@ class StagePlan:
     inputs: Mapping[str, str]  # name -> digest
     code: str  # version of the stage's code
     output: Path  # the output root
+    key_config: Mapping[str, Any] | None = (
+        None  # the part of ``config`` in the key; none: all of it
+    )
 
     @property
     def content(self) -> dict[str, Any]:
-        """Everything that determines the content."""
+        """Everything that determines the content, defaults included, as the manifest records it."""
         return {
             "stage": self.stage,
             "config": self.config,
@@ -64,10 +67,9 @@ class StagePlan:
 
     @property
     def key(self) -> str:
-        """Hash of everything that determines the content."""
-        return hashlib.sha256(
-            json.dumps(self.content, sort_keys=True, default=str).encode()
-        ).hexdigest()
+        """Hash of what determines the content, without options that have their defaults."""
+        config = self.config if self.key_config is None else self.key_config
+        return hash_of({**self.content, "config": config})
 
     @property
     def folder(self) -> Path:
@@ -112,7 +114,7 @@ class Artefact:
     def digest(self) -> str:
         """Hash of the content without times, an input of later stages."""
         content = {name: digest for name, digest in self.outputs.items() if name != TIMINGS}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return hash_of(content)
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.run.evaluate_faults import FaultSettings, errors_under
+from vehest.run.keys import changed_options
 from vehest.run.train import (
     FIT_METRICS,
     file_digest,
@@ -105,6 +106,12 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     return protocol
 
 
+def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> dict[str, Any]:
+    """Options of an evaluation that enter its key: those that differ from their defaults; without faults none of theirs."""
+    options: dict[str, Any] = {"protocol": changed_options(protocol)}
+    return options | ({"faults": [changed_options(fault) for fault in faults]} if faults else {})
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """How models are evaluated: on which validation range and tests, and under which faults too."""
@@ -158,7 +165,13 @@ class Evaluation:
             config["faults"] = [asdict(fault) for fault in self.faults]
         code = code_of(STAGE, read_description(model.folder).estimator, faults=bool(self.faults))
         plan = StagePlan(
-            STAGE, f"{model.label}-on-{self.split.name}", config, inputs, code, self.output
+            STAGE,
+            f"{model.label}-on-{self.split.name}",
+            config,
+            inputs,
+            code,
+            self.output,
+            config | evaluation_options(self.protocol, self.faults),
         )
         return plan, partial(_write, self, model, calibration)
 

@@ -3,33 +3,34 @@
 study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date, stale with its causes, or not known
 
 A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and raw files, which the keys of a study
-therefore hold instead.
+therefore hold instead. What of the configuration matters, each stage says for both (`training_options`, `evaluation_options`); titles and
+descriptions are in no key of a study.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
+from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
-from vehest.run.comparison import resampling_fact, training_facts
+from vehest.data.transforms import Preparation
 from vehest.run.config import Config
 from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
+from vehest.run.evaluate import evaluation_options, protocol_from_config
 from vehest.run.evaluate_faults import all_of, faults_of
 from vehest.run.ingest import PROSE, plan_ingest
+from vehest.run.keys import changed_options, hash_of
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.train import training_options
 from vehest.run.versions import code_of
-from vehest.sources.base import kind_of
 
 Keys = dict[str, dict[str, str]]
 """What is made, for example ``scheme_1: train ksnn`` -> ``code``, ``configuration`` and, of an ingest, ``data`` -> version or hash."""
@@ -59,22 +60,10 @@ def keys_of_study(
         }
         if name in inputs:
             keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
-    about: dict[str, Any] = {
-        name: getattr(study, name) for name in ("study", "title", "about", "report")
-    } | {"file": study.file.name}
-    if study.datasets:
-        about["datasets"] = [_titled(job.config) for job in jobs[""]]
     for part in (name for name in study.parts if name not in absent):
         configs = [job.config for job in jobs[part]]
         keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
-        titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
-        about[f"part {part}"] = [
-            study.parts[part].title,
-            *training_facts(configs),
-            resampling_fact(configs),
-            *titles,
-        ]
-    return keys | {"report": {CODE: code_of("report", study.report), CONFIGURATION: _hash(about)}}
+    return keys | {"report": {CODE: code_of("report", study.report)}}
 
 
 def _ingests(
@@ -101,48 +90,42 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
     faults = all_of(map(faults_of, configs))
+    protocol = protocol_from_config(first["evaluation"])
     rates = sorted(
         {float(config["estimator"]["rate_hz"]) for config in configs}
         | {float(first["evaluation"]["rate_hz"])}
     )
+    preparation = changed_options(
+        validated(Preparation, first["downsample"], "", error=ConfigurationError)
+    )
     yield "split", {CONFIGURATION: _hash(first["split"])}
     yield (
         "downsample",
-        {CODE: code_of("downsample"), CONFIGURATION: _hash([first["downsample"], rates])},
+        {CODE: code_of("downsample"), CONFIGURATION: _hash([preparation, rates])},
     )
     for name in dict.fromkeys(str(config["estimator"]["name"]) for config in configs):
-        jobs = [config for config in configs if config["estimator"]["name"] == name]
-        trained = [
-            [job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]]
-            for job in jobs
-        ]
+        trained = sorted(
+            hash_of(training_options(config))
+            for config in configs
+            if config["estimator"]["name"] == name
+        )
         yield f"train {name}", {CODE: code_of("train", name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
             yield (
                 f"calibrate {name}",
                 {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)},
             )
-        conditions: Any = first["evaluation"]
-        if faults:
-            conditions = [conditions, *map(asdict, faults)]
         yield (
             f"evaluate {name}",
             {
                 CODE: code_of("evaluate", name, faults=bool(faults)),
-                CONFIGURATION: _hash(conditions),
+                CONFIGURATION: _hash(evaluation_options(protocol, faults)),
             },
         )
 
 
-def _titled(config: Config) -> list[str]:
-    dataset = config["dataset"]
-    return [str(dataset["name"]), str(dataset.get("title", "")), kind_of(dataset)]
-
-
 def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[
-        :16
-    ]
+    return hash_of(content)[:16]
 
 
 def in_words(verdict: Mapping[str, Any]) -> str:

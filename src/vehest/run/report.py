@@ -25,6 +25,7 @@ from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
+from vehest.run.keys import changed_options
 from vehest.run.printing import (
     TerminalSummary,
     summary_of_leaderboard,
@@ -92,7 +93,7 @@ def draw_report(
                 "training": list(part.facts),
                 "failed": part.failed,
                 "data_titles": part.data_titles,
-                "protocol": asdict(part.protocol),
+                "protocol": changed_options(part.protocol),
             }
             for name, part in artefacts.parts.items()
         },
@@ -302,7 +303,7 @@ def draw_sweep(
             .astype(object)
             .to_dict("records"),
             "failures": part.failed,
-            "protocol": asdict(part.protocol),
+            "protocol": changed_options(part.protocol),
             "kinds": part.kinds,
             "data_titles": part.data_titles,
             "facts": part.facts,

@@ -21,6 +21,7 @@ from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
+from vehest.run.keys import changed_options
 from vehest.run.versions import code_of
 from vehest.training.context import FitContext
 
@@ -28,6 +29,7 @@ STAGE = "train"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
 DIVERGED = "diverged and ended with its best weights until then; lower its learning_rate"
+UNKEYED = frozenset({"checkpoint_seconds"})  # options of a training that move no number
 
 T = TypeVar("T")
 
@@ -68,7 +70,7 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
     """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
     estimator = new_estimator(config["estimator"])
     seed = config["seed"]
-    settings_from_config(estimator.training_type, config["training"], "training")
+    options = training_options(config)
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {seed!r}")
     if not estimator.learns:
@@ -77,27 +79,42 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         raise ConfigurationError(
             f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' learns; take another split"
         )
-    content = {
-        "estimator": dict(config["estimator"]),
-        "training": {
-            key: value for key, value in config["training"].items() if key != "checkpoint_seconds"
-        },
+    ranges = {
         "train": [_plain(span) for span in split.train],
         "validation": [_plain(span) for span in split.validation],
-        "seed": seed,
         **(
             {} if estimator.learns else {"downsample": _preparation(data)}
         ),  # otherwise part of the inputs
     }
+    stated = {key: value for key, value in config["training"].items() if key not in UNKEYED}
+    content = {"estimator": dict(config["estimator"]), "training": stated, "seed": seed, **ranges}
     inputs = {
         f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
         for span in (*split.train, *split.validation)
     }
     label = f"{estimator.name}-{estimator.variant}-seed{seed}"
     plan = StagePlan(
-        STAGE, label, content, inputs, code_of(STAGE, estimator.name), Path(config["output"])
+        STAGE,
+        label,
+        content,
+        inputs,
+        code_of(STAGE, estimator.name),
+        Path(config["output"]),
+        options | ranges,
     )
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
+
+
+def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a training that enter its key: those that differ from their defaults, and the seed; raises `ConfigurationError`."""
+    estimator = new_estimator(config["estimator"])
+    training: Any = settings_from_config(estimator.training_type, config["training"], "training")
+    changed = changed_options(training)
+    return {
+        "estimator": {"name": estimator.name, **changed_options(estimator.settings)},
+        "training": {key: value for key, value in changed.items() if key not in UNKEYED},
+        "seed": config["seed"],
+    }
 
 
 def _plain(span: Span) -> dict[str, str]:

@@ -1,0 +1,95 @@
+"""Keys hold what determines numbers: neither defaults nor texts."""
+
+import shutil
+from dataclasses import dataclass
+
+import pytest
+
+from place import PIPELINE, Place, undrawn
+from vehest.estimators.gru import Gru
+from vehest.run.config import compose_config
+from vehest.run.train import training_options
+
+STUDY = PIPELINE | {
+    "publish": True,
+    "sweeps": [
+        ["estimator=zero"],
+        ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"],
+    ],
+}
+GRU = {"name": "gru", "rate_hz": 20, "window": 30, "n_states": 5}
+
+
+@dataclass(frozen=True)
+class Extended(Gru.settings_type):
+    """Settings of a GRU with one more option."""
+
+    extra: float = 0.5
+
+
+@pytest.fixture
+def published(tmp_path, monkeypatch, capsys):
+    """A small study that was trained and published, with a configuration of its estimator and no output root."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+    undrawn(monkeypatch)
+    place = Place(tmp_path, capsys)
+    place.change("conf/estimator/gru.yaml", **GRU)
+    place.change("pipelines/small.yaml", **STUDY)
+    place.done("run", "small", "tracking=none")
+    shutil.rmtree(tmp_path / "outputs")
+    return place
+
+
+def lines_of(text, *starts):
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    return [line for line in lines if line.startswith(starts)]
+
+
+def test_new_option_removed_default_and_edited_title_retrain_nothing(published, monkeypatch):
+    monkeypatch.setattr(Gru, "settings_type", Extended)
+    published.change("conf/dataset/mine.yaml", title="Another title of the car")
+    published.change("pipelines/small.yaml", title="Another title", about="Other words")
+    file = published.folder / "conf" / "estimator" / "gru.yaml"
+    file.write_text("# a comment\nname: gru\nrate_hz: 20\nn_states: 5\n", encoding="utf-8")
+    weights = published.folder / "results" / "small" / "weights.safetensors"
+    before = weights.read_bytes()
+    assert published("report", "--check") == (0, "small: up to date\n", "")
+    _, said = published.done("run", "small", "tracking=none")
+    assert lines_of(said, "note train") == [
+        "note train 3 of 3 taken from results/small/weights.safetensors; --retrain trains them"
+    ]
+    assert not lines_of(said, "done train")
+    assert weights.read_bytes() == before
+    report = (published.folder / "results" / "small" / "report.md").read_text(encoding="utf-8")
+    assert report.startswith("# Another title"), "the report itself has the new text"
+    assert published("report", "--check") == (0, "small: up to date\n", "")
+
+
+def test_option_that_differs_from_its_default_is_in_the_key():
+    def options(*overrides):
+        return training_options(
+            compose_config("train", ["estimator=ksnn", "split=sim_bmw", *overrides])
+        )
+
+    assert options() == {"estimator": {"name": "ksnn"}, "training": {}, "seed": 0}
+    assert options("estimator.rate_hz=20.0", "training.checkpoint_seconds=1") == options()
+    assert options("estimator.bias=true", "training.patience=3") == {
+        "estimator": {"name": "ksnn", "bias": True},
+        "training": {"patience": 3},
+        "seed": 0,
+    }
+    nested = training_options(
+        compose_config(
+            "train",
+            [
+                "estimator=learned_ukf",
+                "split=sim_bmw",
+                "estimator.car.mass=6",
+                "training.through.max_epochs=50",
+            ],
+        )
+    )
+    assert nested["estimator"] == {"name": "learned_ukf", "car": {"mass": 6.0}}
+    assert nested["training"] == {"through": {"max_epochs": 50}}
