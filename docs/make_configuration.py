@@ -6,8 +6,12 @@ The head of a file, up to and including the line of its name, is written by hand
 
 from __future__ import annotations
 
+import ast
 import inspect
+import io
 import re
+import textwrap
+import tokenize
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -84,12 +88,33 @@ def _line(key: str, comment: str) -> str:
     return f"{key:<{COMMENT_COLUMN - 1}} # {comment}\n" if comment else f"{key}\n"
 
 
+def field_comments(described: type) -> dict[str, str]:
+    """Comments of the fields of a dataclass, within the statement of each or behind it: name -> text."""
+    source = textwrap.dedent(inspect.getsource(described))
+    comments = {
+        token.start[0]: token.string.lstrip("# ")
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    lines = source.splitlines()
+    (kind,) = ast.parse(source).body
+    assert isinstance(kind, ast.ClassDef)
+    of_fields = {}
+    for node in kind.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            end = node.end_lineno or node.lineno
+            is_closed = not lines[end : end + 1] or not lines[end].startswith("    )")
+            for line in range(node.lineno, end + (1 if is_closed else 2)):
+                if line in comments:
+                    of_fields[node.target.id] = comments[line]
+    return of_fields
+
+
 def _comment_of(described: type, name: str) -> str:
     """The comment behind a field of a dataclass that declares no settings, such as the parameters of a car."""
     for kind in described.__mro__[:-1]:
-        found = re.search(rf"^    {name}: .*?#(.*)$", inspect.getsource(kind), re.MULTILINE)
-        if found:
-            return found[1].strip()
+        if comment := field_comments(kind).get(name):
+            return comment
     return ""
 
 

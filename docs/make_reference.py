@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from make_configuration import field_comments
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
@@ -260,9 +261,7 @@ def _sections(described: type) -> dict[str, str]:
             names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
             if names:
                 sections |= dict.fromkeys(names.split(", "), meaning)
-    for name, meaning in re.findall(
-        r"^    (\w+): .*?  # (.+)$", inspect.getsource(described), re.MULTILINE
-    ):
+    for name, meaning in field_comments(described).items():
         sections.setdefault(name, f"{meaning.removesuffix('.')}.".replace("``", "`"))
     return sections
 
