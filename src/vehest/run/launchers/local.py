@@ -185,7 +185,9 @@ class _Worker:
         return True
 
     def end(self) -> None:
-        """Let a worker without a task go."""
+        """Let a worker without a task go; told so, as one that was forked has the other end of the pipe as well."""
+        with suppress(OSError):  # it was killed
+            self.connection.send(None)
         self.connection.close()
         self._process.join()
 
