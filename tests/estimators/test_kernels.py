@@ -213,7 +213,7 @@ def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch, tmp_pa
         return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
     job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train", output=tmp_path))
-    monkeypatch.setattr(group, "find", lambda _: seen.extend(threads()) or job)
+    monkeypatch.setattr(group, "find", lambda *_: seen.extend(threads()) or job)
     monkeypatch.setattr(group, "_member", lambda *_: None)
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with
         group.Group([job], SimpleNamespace()).run(lambda: False, lambda progress: None)

@@ -29,7 +29,7 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
         assert "vehest." not in text
         assert not re.search(r"[0-9a-f]{8}", text), text
     assert code_of("train", "ksnn") == "train=1 ksnn=1 training=1"
-    assert code_of("evaluate", "ksnn", faults=True) == "evaluate=1 ksnn=1 faults=3"
+    assert code_of("evaluate", "ksnn", faults=True) == "evaluate=2 ksnn=1 faults=3"
     assert code_of("ingest", "tabular") == "ingest=1 tabular=1"
 
 
@@ -42,7 +42,7 @@ def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_
     assert trainings() == before
     monkeypatch.setattr(Ksnn, "version", "2")
     assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn"}
-    assert code_of("evaluate", "ksnn") == "evaluate=1 ksnn=2"
+    assert code_of("evaluate", "ksnn") == "evaluate=2 ksnn=2"
     monkeypatch.setattr(SupervisedSettings, "version", "2")
     assert {name for name, text in trainings().items() if text != before[name]} == {
         "ksnn",

@@ -58,7 +58,12 @@ def parse_yaml(text: str, where: str) -> Any:
 def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> None:
     """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built; raises `DataError`."""
     try:
-        is_larger = _is_larger(text, max_values)
+        try:
+            is_larger = _is_larger(text, max_values, _Loader)
+        except (
+            yaml.YAMLError
+        ):  # libyaml refuses names that are not UTF-8, which are written as surrogates
+            is_larger = _is_larger(text, max_values, yaml.SafeLoader)
     except (yaml.YAMLError, ValueError) as error:
         raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
     if is_larger:
@@ -67,12 +72,12 @@ def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> Non
         )
 
 
-def _is_larger(text: str, max_values: int) -> bool:
+def _is_larger(text: str, max_values: int, loader: Any) -> bool:
     """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as aliases repeat it."""
     sizes: dict[str | None, int] = {}  # of anchored collections
     begun: list[tuple[str | None, int]] = []
     count = 0
-    for event in yaml.parse(text, Loader=_Loader):
+    for event in yaml.parse(text, Loader=loader):
         if isinstance(event, yaml.CollectionEndEvent):
             anchor, before = begun.pop()
             sizes[anchor] = count - before

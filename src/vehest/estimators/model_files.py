@@ -26,9 +26,16 @@ WEIGHTS = "model.safetensors"
 DESCRIPTION = "model.yaml"
 FORMAT = 1
 DTYPES = ("F32", "F64")
-RENAMED = {"learned_ukf_variant": "learned_ukf"}  # former name of a family in a model.yaml -> name
+RENAMED = {
+    "learned_ukf_variant": "learned_ukf"
+}  # former name of a family in files of a model -> name
 USUAL_SIZE = 4096
 """A whole number among the settings that is larger than this and than the number of weights is no layer's width."""
+
+
+def current_name(estimator: str) -> str:
+    """The name of a family today, by the name in a file of a model."""
+    return RENAMED.get(estimator, estimator)
 
 
 @dataclass(frozen=True)
@@ -130,7 +137,7 @@ def read_description(folder: Path) -> Description:
         raise DataError(f"'{path}' is not the description of a model; train it again")
     check_format(content["format"], FORMAT, f"'{path}'")
     described = validated(Description, content, f"'{path}'")
-    name = RENAMED.get(described.estimator, described.estimator)
+    name = current_name(described.estimator)
     return replace(described, estimator=name, settings=content["settings"])
 
 

@@ -305,10 +305,14 @@ def how_it_was_made(
 
 def _describe_excluded(artefacts: PartArtefacts) -> str:
     """A sentence, after a space, on the share of each test set at which sideslip is not scored."""
+    metrics = artefacts.metrics
+    if metrics.empty:
+        return ""
+    rows = metrics[(metrics["metric"] == BELOW_MIN_SPEED) & (metrics["subset"] == "all")]
     shares = {
-        test_set: run[BELOW_MIN_SPEED]
-        for (*_, test_set), run in runs_of(artefacts).items()
-        if test_set in artefacts.split.tests and BELOW_MIN_SPEED in run
+        name: float(value)
+        for name, value in zip(rows["test_set"], rows["value"], strict=True)
+        if name in artefacts.split.tests
     }
     named = [
         f"{fixed(100 * share, 1)} % of test set {as_code(name)}" for name, share in shares.items()

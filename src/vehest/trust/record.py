@@ -13,6 +13,7 @@ from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
+from vehest.estimators.model_files import current_name
 from vehest.trust.bands import Bands
 from vehest.trust.guard import GuardLimits
 from vehest.trust.health import HealthModel
@@ -44,7 +45,7 @@ class Trust:
         """Raise `DataError` unless this was learnt with an estimator of this family, channels, rate and horizon."""
         expected = (estimator.name, tuple(estimator.channels), estimator.settings.rate_hz)
         differences: list[tuple[str, object, object]] = [
-            ("about.estimator", self.about.estimator, expected[0])
+            ("about.estimator", current_name(self.about.estimator), expected[0])
         ]
         if self.bands is not None:
             differences += [
