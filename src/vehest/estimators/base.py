@@ -66,6 +66,18 @@ def require_learnable(
                 raise DataError(f"recording '{recording.id}': {what}")
 
 
+def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: str) -> float:
+    """Largest absolute value of a channel in recordings; raises `DataError`: it is 0 throughout."""
+    largest = max(float(np.abs(recording[channel]).max()) for recording in recordings)
+    if not largest > 0.0:
+        names = ", ".join(f"'{recording.id}'" for recording in recordings)
+        raise DataError(
+            f"recordings {names}: channel '{channel}' is 0 throughout, which estimator '{estimator}' "
+            "cannot be trained on; train it on drives with bends"
+        )
+    return largest
+
+
 class Trial(NamedTuple):
     """A family in the first comparison on a car without a trained model (`vehest new`)."""
 

@@ -18,7 +18,7 @@ from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import IdentificationSettings, finite
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import SampleSettings
 from vehest.training.search import SearchRecord
 from vehest.training.sequences import PhaseSettings
@@ -139,8 +139,8 @@ class EnsembleUkf(NetworkUkf):
                 PseudoMeasurement(sideslip, scaled_variance(variance, scaling))
                 for sideslip, variance in found
             ]
-            return finite(
-                self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo)
+            return self.mean_squared_error(
+                recordings, how.skip_seconds, over=how.error, pseudo=pseudo
             )
 
         return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.declared import setting
-from vehest.estimators.base import Trial
+from vehest.estimators.base import Trial, largest_absolute
 from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator
 
@@ -76,7 +76,7 @@ class Ksnn(WindowedEstimator):
 
     def network_for(self, train: list[Recording]) -> Any:
         """A network whose local models span the yaw rates of the training recordings."""
-        return self.new_network(max(float(np.abs(r["yaw_rate"]).max()) for r in train))
+        return self.new_network(largest_absolute(train, "yaw_rate", self.name))
 
     def new_network(self, yaw_rate_max: float = 1.0) -> Any:
         """A `KinematicsStructuredNetwork`."""
