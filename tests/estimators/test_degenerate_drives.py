@@ -87,8 +87,8 @@ def test_a_drive_that_shows_little_is_refused_or_gives_a_finite_model(tmp_path, 
             estimator.fit(FitData(*([changed(r) for r in part] for part in _parts(data))), training)
             save_model(estimator, folder, {})
         except VehestError as error:
-            assert "\n" not in str(error)
-            assert not list(folder.iterdir())
+            if "\n" in str(error) or list(folder.iterdir()):
+                pytest.fail(f"{drive}: {error}")
         else:
             load_model(folder)  # refuses what is not finite
 

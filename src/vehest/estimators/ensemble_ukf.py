@@ -11,7 +11,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
@@ -77,7 +77,9 @@ class EnsembleUkf(NetworkUkf):
         ),
     )
     training_type = EnsembleSettings
-    members: int = setting(20, "networks M of the ensemble; one alone has no spread", least=2)
+    members: int = setting(
+        20, "networks M of the ensemble; one alone has no spread", least=2, most=MAX_WIDTH
+    )
     variance: Literal["models", "mixture"] = setting(
         "models",
         "that of the networks' angles, as in the paper, or with the mean of their own variances on top",

@@ -41,7 +41,7 @@ class SensorNoise(Group):
     cutoff: float = setting(
         0.2,
         "fraction of the Nyquist frequency above which signals count as noise",
-        above=0.0,
+        least=0.001,  # the filter's length grows with its inverse
         below=0.8,
     )
     steer_factor: float = setting(

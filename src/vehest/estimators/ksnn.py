@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import Trial, largest_absolute
 from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator
@@ -44,8 +44,10 @@ class Ksnn(WindowedEstimator):
         "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence;",
         "the licence of this software grants none.",
     )
-    n_local: int = setting(2, "local models P along |yaw rate|", least=1)
-    n_hidden: int = setting(2, "neurons Q of each feedback function; 0: linear", least=0)
+    n_local: int = setting(2, "local models P along |yaw rate|", least=1, most=MAX_WIDTH)
+    n_hidden: int = setting(
+        2, "neurons Q of each feedback function; 0: linear", least=0, most=MAX_WIDTH
+    )
     bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
 
     @classmethod

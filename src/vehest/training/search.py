@@ -133,7 +133,7 @@ def optuna_search(
     stages: int = 1,
     shrink: float = 0.3,
 ) -> SearchRecord:
-    """Minimise a cost that need not be finite by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
+    """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
 
     Args:
         cost: function of the parameters, shape (K,).

@@ -21,8 +21,7 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
-from vehest.training.search import finite_cost
-from vehest.training.search import optuna_search
+from vehest.training.search import finite_cost, optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
