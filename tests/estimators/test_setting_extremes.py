@@ -25,7 +25,11 @@ def _numeric_settings(group, above=()):
         path = (*above, field.name)
         if is_dataclass(value):
             yield from _numeric_settings(value, path)
-        elif value is None or _is_number(value) or (isinstance(value, tuple) and value and _is_number(value[0])):
+        elif (
+            value is None
+            or _is_number(value)
+            or (isinstance(value, tuple) and value and _is_number(value[0]))
+        ):
             yield path, value
 
 

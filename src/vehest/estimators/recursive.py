@@ -16,6 +16,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
+from vehest.declared import Declaration
 from vehest.estimators.base import (
     Estimator,
     FitData,
@@ -23,6 +24,7 @@ from vehest.estimators.base import (
     largest_absolute,
     require_learnable,
     require_shapes,
+    require_within_bounds,
 )
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
@@ -188,11 +190,18 @@ class Recursive(Estimator):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the numbers back; raises `DataError`: one is missing or unknown."""
+        """Take the numbers back; raises `DataError`: one is missing, unknown or out of bounds."""
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
-        self.values = {name: float(weights[name][0]) for name in self.values}
+        values = {name: float(weights[name][0]) for name in self.values}
+        require_within_bounds(values, self.declarations_of_values())
+        self.values = values
+
+    def declarations_of_values(self) -> Mapping[str, Declaration]:
+        """Bounds of `values` by name."""
+        declarations: Mapping[str, Declaration] = self.settings.declarations()
+        return declarations
 
 
 def _fitted_number(name: str) -> property:
