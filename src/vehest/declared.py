@@ -11,7 +11,7 @@ from vehest.data.errors import ConfigurationError
 LARGEST = (
     1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
 )
-
+MAX_WIDTH = 4096  # of a layer, a window or an ensemble: more would take all memory
 
 T = TypeVar("T")
 

@@ -192,7 +192,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
 @pytest.mark.parametrize(
     ("name", "config", "message"),
     [
-        ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
+        ("ksnn", {"n_local": 0}, "n_local must lie between 1 and 4096"),
         ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
         ("luenberger", {"gains": 3}, "gains is not an option"),
         ("kalman", {"noise": {"ay": -1}}, r"estimator\.noise\.ay must be positive"),
@@ -242,7 +242,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         ("learned_ukf", {"start_friction": 0.01}, "start_friction must lie above least_friction"),
         ("learned_ukf", {"car": {"cg_to_rear_axle": 0.4}}, "less than the wheelbase"),
         ("data_sheet", {}, "needs your car's wheelbase"),
-        ("data_sheet", {"wheelbase": -1}, "wheelbase must be positive"),
+        ("data_sheet", {"wheelbase": -1}, "wheelbase must lie between 0.05 and 20 m"),
         ("data_sheet", {"wheelbase": 2.4, "cg_to_rear_axle": 3.0}, "between 0 and the wheelbase"),
         ("dugoff_ukf", {"linear_below": 5.0}, "linear_below must lie between"),
         ("dugoff_ukf", {"tyres": {"friction_front": 1.0}}, r"estimator\.tyres: give all"),

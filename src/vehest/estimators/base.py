@@ -16,7 +16,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.data.schema import settings_from_config
-from vehest.declared import Group, setting
+from vehest.declared import Declaration, Group, setting
 from vehest.training.context import FitContext
 from vehest.training.context import FitRecord as FitRecord
 
@@ -64,6 +64,18 @@ def require_learnable(
             if name not in skippable and np.isnan(recording[name]).any():
                 what = f"channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; cut them out in conf/split"
                 raise DataError(f"recording '{recording.id}': {what}")
+
+
+def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: str) -> float:
+    """Largest absolute value of a channel in recordings; raises `DataError`: it is 0 throughout."""
+    largest = max(float(np.abs(recording[channel]).max()) for recording in recordings)
+    if not largest > 0.0:
+        names = ", ".join(f"'{recording.id}'" for recording in recordings)
+        raise DataError(
+            f"recordings {names}: channel '{channel}' is 0 throughout, which estimator '{estimator}' "
+            "cannot be trained on; train it on drives with bends"
+        )
+    return largest
 
 
 class Trial(NamedTuple):
@@ -431,6 +443,26 @@ def require_shapes(
         raise DataError(
             f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape"
         )
+
+
+def require_within_bounds(
+    values: Mapping[str, float], declarations: Mapping[str, Declaration]
+) -> None:
+    """Raise `DataError` for a loaded number that its setting could not have; NaN is not checked."""
+    for name, value in values.items():
+        problem = (
+            declarations[name].problem(value)
+            if name in declarations and not math.isnan(value)
+            else ""
+        )
+        if problem:
+            raise DataError(f"'{name}' {problem}")
+
+
+def require_positive(name: str, value: float) -> None:
+    """Raise `DataError` for a loaded number that is not positive."""
+    if not value > 0.0:
+        raise DataError(f"'{name}' must be positive, not {value:g}")
 
 
 class RunStepper(Stepper):

@@ -34,7 +34,7 @@ class DataSheet(Recursive):
     ignores_initial_state = True
     template = "static"
     rate_hz: float = rate(20.0)
-    wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", positive=True)
+    wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(
         None,
         "distance of the centre of gravity from the rear axle; null: half the wheelbase",

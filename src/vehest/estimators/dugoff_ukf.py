@@ -40,7 +40,7 @@ from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings, finite
+from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
@@ -298,8 +298,8 @@ class DugoffUkf(SigmaPointEstimator):
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
         if data.validation and all("vy_ref" in recording for recording in data.validation):
-            metrics["best_validation_loss"] = finite(
-                self.mean_squared_error(data.validation, training.skip_seconds, over=training.error)
+            metrics["best_validation_loss"] = self.mean_squared_error(
+                data.validation, training.skip_seconds, over=training.error
             )
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
@@ -380,8 +380,8 @@ class DugoffUkf(SigmaPointEstimator):
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
-            return finite(
-                self.mean_squared_error(recordings, training.skip_seconds, levels, training.error)
+            return self.mean_squared_error(
+                recordings, training.skip_seconds, levels, training.error
             )
 
         limits = BOXES | {

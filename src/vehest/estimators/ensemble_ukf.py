@@ -11,14 +11,14 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import IdentificationSettings, finite
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import SampleSettings
 from vehest.training.search import SearchRecord
 from vehest.training.sequences import PhaseSettings
@@ -77,7 +77,9 @@ class EnsembleUkf(NetworkUkf):
         ),
     )
     training_type = EnsembleSettings
-    members: int = setting(20, "networks M of the ensemble; one alone has no spread", least=2)
+    members: int = setting(
+        20, "networks M of the ensemble; one alone has no spread", least=2, most=MAX_WIDTH
+    )
     variance: Literal["models", "mixture"] = setting(
         "models",
         "that of the networks' angles, as in the paper, or with the mean of their own variances on top",
@@ -139,8 +141,8 @@ class EnsembleUkf(NetworkUkf):
                 PseudoMeasurement(sideslip, scaled_variance(variance, scaling))
                 for sideslip, variance in found
             ]
-            return finite(
-                self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo)
+            return self.mean_squared_error(
+                recordings, how.skip_seconds, over=how.error, pseudo=pseudo
             )
 
         return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.declared import Group, setting
+from vehest.declared import Declaration, Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.filters.gating import Gate
@@ -41,7 +41,7 @@ class SensorNoise(Group):
     cutoff: float = setting(
         0.2,
         "fraction of the Nyquist frequency above which signals count as noise",
-        above=0.0,
+        least=0.001,  # the filter's length grows with its inverse
         below=0.8,
     )
     steer_factor: float = setting(
@@ -144,6 +144,10 @@ class KalmanFilter(SideslipFilter):
         names = {"ay": "ay", "steer": "the steering angle"}
         offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
         return self.title + noise + offsets + self.gate_title
+
+    def declarations_of_values(self) -> Mapping[str, Declaration]:
+        """Those of the sensors' noise."""
+        return self.noise.declarations()
 
     def find_numbers(
         self, data: FitData, training: Any, context: FitContext

@@ -6,6 +6,7 @@ The method is patented by its authors (PCT/IT2023/050058).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.declared import setting
-from vehest.estimators.base import Trial
+from vehest.declared import MAX_WIDTH, setting
+from vehest.estimators.base import Trial, largest_absolute, require_positive
 from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator
 
@@ -44,8 +45,10 @@ class Ksnn(WindowedEstimator):
         "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence;",
         "the licence of this software grants none.",
     )
-    n_local: int = setting(2, "local models P along |yaw rate|", least=1)
-    n_hidden: int = setting(2, "neurons Q of each feedback function; 0: linear", least=0)
+    n_local: int = setting(2, "local models P along |yaw rate|", least=1, most=MAX_WIDTH)
+    n_hidden: int = setting(
+        2, "neurons Q of each feedback function; 0: linear", least=0, most=MAX_WIDTH
+    )
     bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
 
     @classmethod
@@ -76,7 +79,7 @@ class Ksnn(WindowedEstimator):
 
     def network_for(self, train: list[Recording]) -> Any:
         """A network whose local models span the yaw rates of the training recordings."""
-        return self.new_network(max(float(np.abs(r["yaw_rate"]).max()) for r in train))
+        return self.new_network(largest_absolute(train, "yaw_rate", self.name))
 
     def new_network(self, yaw_rate_max: float = 1.0) -> Any:
         """A `KinematicsStructuredNetwork`."""
@@ -87,6 +90,11 @@ class Ksnn(WindowedEstimator):
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of parameters, and of the buffer ``yaw_rate_max``."""
         return kernel.shapes_of(self.n_local, self.n_hidden, bias=self.bias) | {"yaw_rate_max": ()}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take the network back; raises `DataError`: it does not fit, or spans no yaw rate."""
+        super().load_weights(weights)
+        require_positive("yaw_rate_max", float(weights["yaw_rate_max"]))
 
     def fewest_weights(self) -> int:
         """All of `weight_shapes`."""

@@ -16,7 +16,7 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.declared import Group, setting
+from vehest.declared import MAX_WIDTH, Group, setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.filtering.car_filter import CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
@@ -45,6 +45,7 @@ from vehest.vehicle.dynamics import (
     TyreNetworkCar,
     physical_of,
 )
+from vehest.vehicle.parameters import LENGTH, MASS, YAW_INERTIA
 from vehest.vehicle.planar import F1TENTH, LEARNT
 from vehest.vehicle.tyres import STILL
 
@@ -85,14 +86,22 @@ class CarSettings(Group):
     """A small car with one electric motor: what is known, and where learning starts."""
 
     group = "estimator.car"
-    mass: float = setting(5.1, "known", unit="kg", positive=True)
-    wheelbase: float = setting(0.33, "known", unit="m", positive=True)
-    wheel_radius: float = setting(0.05, "known", unit="m", positive=True)
+    mass: float = setting(5.1, "known", unit="kg", least=MASS.least, most=MASS.most)
+    wheelbase: float = setting(0.33, "known", unit="m", least=LENGTH.least, most=LENGTH.most)
+    wheel_radius: float = setting(0.05, "known", unit="m", least=LENGTH.least, most=LENGTH.most)
     yaw_inertia: float = setting(
-        F1TENTH["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True
+        F1TENTH["yaw_inertia"],
+        "learnt from here on",
+        unit="kg m²",
+        least=YAW_INERTIA.least,
+        most=YAW_INERTIA.most,
     )
     cg_to_rear_axle: float = setting(
-        F1TENTH["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True
+        F1TENTH["cg_to_rear_axle"],
+        "learnt from here on",
+        unit="m",
+        least=LENGTH.least,
+        most=LENGTH.most,
     )
     drag_constant: float = setting(
         F1TENTH["drag_constant"], "learnt from here on", unit="N", positive=True
@@ -170,7 +179,10 @@ class LearnedUkf(Network, SigmaPointEstimator):
     )
     start_friction: float | None = setting(None, "that estimates start from; null: the same")
     width: int = setting(
-        0, "of hidden layers; 0: the paper's, 64 for tyres and 256 for rates", least=0
+        0,
+        "of hidden layers; 0: the paper's, 64 for tyres and 256 for rates",
+        least=0,
+        most=MAX_WIDTH,
     )
     scaled: bool = setting(
         True,

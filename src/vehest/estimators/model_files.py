@@ -71,8 +71,17 @@ class Description:
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
     """Write a fitted estimator into an existing folder; ``about`` are plain values of `About`, and others for people.
 
-    Raises `OSError`: it cannot be written.
+    Raises `DataError`: a weight is not finite, before anything is written. Raises `OSError`: it cannot be written.
     """
+    weights = estimator.weights()
+    trained_on = ", ".join((about or {}).get("trained_on", ())) or "its recordings"
+    for name, values in weights.items():
+        n_bad = _count_not_finite(estimator, name, values)
+        if n_bad:
+            raise DataError(
+                f"estimator '{estimator.name}': {n_bad} of the {values.size} numbers of '{name}' are not finite "
+                f"after the training on {trained_on}, which does not determine them; train it on other drives"
+            )
     description = {
         "format": FORMAT,
         "estimator": estimator.name,
@@ -86,7 +95,7 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
         yaml.safe_dump(description, sort_keys=False, allow_unicode=True), encoding="utf-8"
     )
     try:
-        save_file(estimator.weights(), folder / WEIGHTS)
+        save_file(weights, folder / WEIGHTS)
     except SafetensorError as error:
         raise as_os_error(error) from error
 
@@ -108,7 +117,7 @@ def load_model(folder: Path) -> Estimator:
             f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates differ from those of version {kind.version} "
             f"here; train it again, or use the vehest that trained it"
         )
-    weights = _read_weights(folder, kind.may_be_nan)
+    weights = _read_weights(folder, kind)
     estimator = _built(
         kind, description.settings, sum(values.size for values in weights.values()), path
     )
@@ -194,7 +203,14 @@ def _whole_numbers(content: Any, name: str) -> Iterator[tuple[str, int]]:
             yield from _whole_numbers(inner, f"{name}.{key}")
 
 
-def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any]]:
+def _count_not_finite(
+    kind: Estimator | type[Estimator], name: str, values: np.ndarray[Any, Any]
+) -> int:
+    """How many numbers of a tensor are not finite, though they must be."""
+    return int((np.isinf(values) if name in kind.may_be_nan else ~np.isfinite(values)).sum())
+
+
+def _read_weights(folder: Path, kind: type[Estimator]) -> dict[str, np.ndarray[Any, Any]]:
     """Weights by name; what a tensor takes in memory is in the file.
 
     Raises `MissingError`: there are none. Raises `DataError`: the file is damaged, or holds other numbers than finite float32 and float64.
@@ -208,10 +224,10 @@ def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.nda
     try:
         with safe_open(path, framework="np") as file:
             for name in file.keys():  # noqa: SIM118
-                kind = file.get_slice(name).get_dtype()
-                if kind not in DTYPES:
+                dtype = file.get_slice(name).get_dtype()
+                if dtype not in DTYPES:
                     raise DataError(
-                        f"'{path}': tensor '{name}' is of type {kind}, not one of: {', '.join(DTYPES)}"
+                        f"'{path}': tensor '{name}' is of type {dtype}, not one of: {', '.join(DTYPES)}"
                     )
                 weights[name] = file.get_tensor(name)
     except (SafetensorError, OSError, ValueError) as error:
@@ -219,9 +235,9 @@ def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.nda
             f"'{path}' is truncated or damaged ({first_line(error)}); train the model again"
         ) from error
     for name, values in weights.items():
-        bad = np.isinf(values) if name in may_be_nan else ~np.isfinite(values)
-        if bad.any():
+        n_bad = _count_not_finite(kind, name, values)
+        if n_bad:
             raise DataError(
-                f"'{path}': {int(bad.sum())} of the {bad.size} numbers of tensor '{name}' are not finite; train the model again"
+                f"'{path}': {n_bad} of the {values.size} numbers of tensor '{name}' are not finite; train the model again"
             )
     return weights

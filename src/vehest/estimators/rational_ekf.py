@@ -33,7 +33,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import NoiseTuningSettings, finite
+from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.training.search import SearchRecord
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
@@ -402,7 +402,7 @@ class RationalFilter(SideslipFilter):
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total = total + float(np.square(error[counted]).sum())
             count = count + int(counted.sum())
-        return finite(total / max(count, 1))
+        return total / max(count, 1)
 
     def first_gaussian(
         self, sample: FloatArray, given: Mapping[str, float]

@@ -16,7 +16,16 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable, require_shapes
+from vehest.declared import Declaration
+from vehest.estimators.base import (
+    Estimator,
+    FitData,
+    FitRecord,
+    largest_absolute,
+    require_learnable,
+    require_shapes,
+    require_within_bounds,
+)
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
@@ -91,6 +100,8 @@ class Recursive(Estimator):
         """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
+
+        Raises `DataError`: the recordings do not determine the values.
         """
         values = self.closed_form(data.train)
         if values is not None:
@@ -103,9 +114,7 @@ class Recursive(Estimator):
             )
         declared = [self.settings.declarations()[name] for name in self.unknown]
         scales = [
-            max(float(np.abs(r[own.of_largest]).max()) for r in data.train)
-            if own.of_largest
-            else 1.0
+            largest_absolute(data.train, own.of_largest, self.name) if own.of_largest else 1.0
             for own in declared
         ]
         boxes, starts = (
@@ -181,11 +190,18 @@ class Recursive(Estimator):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the numbers back; raises `DataError`: one is missing or unknown."""
+        """Take the numbers back; raises `DataError`: one is missing, unknown or out of bounds."""
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
-        self.values = {name: float(weights[name][0]) for name in self.values}
+        values = {name: float(weights[name][0]) for name in self.values}
+        require_within_bounds(values, self.declarations_of_values())
+        self.values = values
+
+    def declarations_of_values(self) -> Mapping[str, Declaration]:
+        """Bounds of `values` by name."""
+        declarations: Mapping[str, Declaration] = self.settings.declarations()
+        return declarations
 
 
 def _fitted_number(name: str) -> property:

@@ -15,7 +15,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
-from vehest.estimators.base import rate, require_shapes
+from vehest.estimators.base import rate, require_positive, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import c_tables, packed
 from vehest.estimators.ksnn import Ksnn
@@ -376,10 +376,14 @@ class SelfCalibrating(Recursive):
         return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the network back; raises `DataError`: a part is missing, or has another shape."""
+        """Take the network back.
+
+        Raises `DataError`: a part is missing, has another shape, or spans no yaw rate.
+        """
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
+        require_positive("yaw_rate_max", float(weights["yaw_rate_max"][0]))
         self.network = np.ascontiguousarray(weights["network"])
         self._width = float(weights["yaw_rate_max"][0])
         self.__dict__.pop("_constants", None)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.networks.velocity_recurrent import (
     TRIAL,
     RecurrentVelocityEstimator,
@@ -73,7 +73,9 @@ class VelocityLstm(RecurrentVelocityEstimator):
         least=0.0,
         below=1.0,
     )
-    n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
+    n_dense: int = setting(
+        64, "neurons of the hidden dense layer; assumed", least=1, most=MAX_WIDTH
+    )
 
 
 ESTIMATOR = VelocityLstm

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -10,6 +9,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext
 from vehest.training.search import (
+    MAX_GRID,
     Box,
     Cost,
     DirectSearchSettings,
@@ -18,7 +18,6 @@ from vehest.training.search import (
     optuna_search,
 )
 
-BAD = 1e6  # rad², instead of a cost that is not finite
 LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
 
 
@@ -36,7 +35,7 @@ class NoiseTuningSettings(Group):
     curves_from: str = setting(
         "*", "pattern of the ids of those training recordings that axle curves are fitted to"
     )
-    grid: int = setting(2, "starts of Nelder-Mead along each level", least=1)
+    grid: int = setting(2, "starts of Nelder-Mead along each level", least=1, most=MAX_GRID)
     max_evaluations: int = setting(80, "evaluations allowed from each start", least=1)
     tolerance: float = setting(
         1e-3, "relative change of the levels at which a search ends", positive=True
@@ -108,8 +107,3 @@ class IdentificationSettings(NoiseTuningSettings):
             raise ConfigurationError(
                 f"identification.stages must be at most its trials ({self.trials}), not {self.stages}"
             )
-
-
-def finite(error: float) -> float:
-    """An error, or a large one instead of one that is not finite."""
-    return error if math.isfinite(error) else BAD

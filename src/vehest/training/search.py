@@ -12,11 +12,13 @@ import numpy as np
 import scipy
 
 from vehest.constants import FloatArray
-from vehest.data.errors import MissingError
+from vehest.data.errors import DataError, MissingError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
 FIRST_STEP = 0.05
+UNUSABLE_COST = 1e6  # instead of a cost that is not finite: a search goes on elsewhere
+MAX_GRID = 1000  # starts along a parameter
 Cost = Callable[[FloatArray], float]
 Box = Sequence[tuple[float, float]]
 
@@ -27,7 +29,7 @@ class DirectSearchSettings(Group):
 
     group = "training"
     version: ClassVar[str] = "1"
-    grid: int = setting(4, "starts along each parameter", least=1)
+    grid: int = setting(4, "starts along each parameter", least=1, most=MAX_GRID)
     max_evaluations: int = setting(400, "evaluations allowed from each start", least=1)
     tolerance: float = setting(
         1e-4, "relative change of the parameters at which a search ends", positive=True
@@ -52,7 +54,7 @@ class SearchRecord(NamedTuple):
 def nelder_mead_over_grid(
     cost: Cost, box: Box, start_range: Box, settings: DirectSearchSettings, context: FitContext
 ) -> SearchRecord:
-    """Minimise a cost that need not be smooth, keeping the best of several local searches.
+    """Minimise a cost that need not be smooth nor finite, keeping the best of several local searches.
 
     Args:
         cost: function of the parameters, shape (K,).
@@ -60,6 +62,9 @@ def nelder_mead_over_grid(
         start_range: range of each parameter over which ``settings.grid`` starts are spread evenly, ends included.
         settings: grid and limits.
         context: progress and the wish to stop.
+
+    Raises:
+        DataError: the cost is finite nowhere.
 
     Source:
         Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
@@ -78,7 +83,7 @@ def nelder_mead_over_grid(
         first = np.array(start) / scale
         options = {**limits, "initial_simplex": _simplex(first, bounds)}
         result = scipy.optimize.minimize(
-            lambda unit: cost(unit * scale),
+            lambda unit: finite_cost(cost(unit * scale)),
             first,
             method="Nelder-Mead",
             bounds=bounds,
@@ -92,9 +97,19 @@ def nelder_mead_over_grid(
     return _record(rows, evaluations, len(rows) < len(starts))
 
 
+def finite_cost(cost: float) -> float:
+    """A cost, or `UNUSABLE_COST` instead of one that is not finite."""
+    return cost if math.isfinite(cost) else UNUSABLE_COST
+
+
 def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> SearchRecord:
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
+    if best[-1] >= UNUSABLE_COST:
+        raise DataError(
+            f"none of the {evaluations} sets of values that were tried gives a finite estimate of the "
+            "training recordings; check the estimator's settings and the recordings' units"
+        )
     n = len(best) // 2
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
 
@@ -131,6 +146,7 @@ def optuna_search(
 
     Raises:
         MissingError: Optuna is not installed.
+        DataError: the cost is finite nowhere.
 
     Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019; stages as in Bertipaglia
     et al., IEEE Intelligent Vehicles Symposium 2022.
@@ -169,7 +185,7 @@ def optuna_search(
                 return _record(rows, len(rows), True)
             trial = study.ask(distributions)
             values = np.array([trial.params[name] for name in distributions])
-            rows.append(np.concatenate([values, values, [cost(values)]]))
+            rows.append(np.concatenate([values, values, [finite_cost(cost(values))]]))
             lowest = min(lowest, float(rows[-1][-1]))
             study.tell(trial, float(rows[-1][-1]))
             context.on_progress(Progress(number + 1, share, 1, 1, lowest))

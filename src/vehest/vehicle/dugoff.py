@@ -16,14 +16,14 @@ Source: Bertipaglia, Alirezaei, Happee & Shyrokau, IEEE Transactions on Vehicula
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from vehest.constants import GRAVITY
+from vehest.vehicle.parameters import check_parameters
 
 TRACK_STATES = ("vy", "yaw_rate")
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
@@ -39,7 +39,7 @@ Tyres = Literal["plain", "smooth"]
 class LoadedCar:
     """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
 
-    Raises `ValueError`: a number that is not positive.
+    Raises `ValueError`: a number outside of `vehest.vehicle.parameters.RANGES`.
 
     Source: Bertipaglia et al. 2024, Eq. 2.
     """
@@ -53,10 +53,7 @@ class LoadedCar:
     )
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{entry.name} must be positive, not {value}")
+        check_parameters(self)
 
     def loads(self, ax: Tensor) -> tuple[Tensor, Tensor]:
         """Vertical force on the front and on the rear axle under longitudinal accelerations (...) [m/s²], (...) [N] each."""

@@ -2,12 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+
+class Range(NamedTuple):
+    """Least and greatest value that makes sense."""
+
+    least: float
+    most: float
+
+
+# from a car of 40 g on a table to the heaviest road vehicle
+MASS = Range(1e-3, 1e6)  # [kg]
+YAW_INERTIA = Range(1e-7, 1e8)  # [kg m²]
+LENGTH = Range(1e-3, 30.0)  # [m]
+CORNERING_STIFFNESS = Range(1e-3, 1e9)  # [N/rad]
+RANGES: Mapping[str, Range] = {
+    "mass": MASS,
+    "yaw_inertia": YAW_INERTIA,
+    "cg_to_front_axle": LENGTH,
+    "cg_to_rear_axle": LENGTH,
+    "cg_height": LENGTH,
+    "cornering_stiffness_front": CORNERING_STIFFNESS,
+    "cornering_stiffness_rear": CORNERING_STIFFNESS,
+}
+
+
+def check_parameters(parameters: Any) -> None:
+    """Raise `ValueError` for a field of a car's parameters that is outside of `RANGES`."""
+    for entry in fields(parameters):
+        value = getattr(parameters, entry.name)
+        if not value > 0:
+            raise ValueError(f"{entry.name} must be positive, not {value}")
+        low, high = RANGES[entry.name]
+        if not low <= value <= high:
+            raise ValueError(f"{entry.name} must lie between {low:g} and {high:g}, not at {value}")
 
 
 @dataclass(frozen=True)
 class SingleTrackParameters:
-    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number that is not positive."""
+    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number outside of `RANGES`."""
 
     mass: float  # [kg]
     yaw_inertia: float  # about the vertical axis through the centre of gravity [kg m²]
@@ -17,10 +53,7 @@ class SingleTrackParameters:
     cornering_stiffness_rear: float  # the same of the rear axle [N/rad]
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not value > 0:
-                raise ValueError(f"{entry.name} must be positive, not {value}")
+        check_parameters(self)
 
 
 FERRARI_250LM = SingleTrackParameters(

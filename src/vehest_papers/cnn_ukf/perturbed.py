@@ -21,8 +21,7 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import finite
-from vehest.training.search import optuna_search
+from vehest.training.search import finite_cost, optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
@@ -95,7 +94,7 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
             own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers))
             for own in pseudo
         ]
-        return finite(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
+        return finite_cost(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
 
     changed.scaling = optuna_search(
         cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from vehest.data.errors import DataError
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gating import Gate
@@ -175,6 +176,8 @@ class CarFilter(nn.Module):
 
         The friction, which the true states hold as a constant, and the initial state keep the variances that they have, but for a friction
         that may start anywhere within a spread: it has the variance of that.
+
+        Raises `DataError`: the residuals have no positive definite covariance.
         """
         with torch.no_grad():
             steps = torch.cat(
@@ -195,6 +198,11 @@ class CarFilter(nn.Module):
             (self.process_noise, process),
             (self.observation_noise, observation),
         ):
+            if torch.linalg.cholesky_ex(covariance).info:
+                raise DataError(
+                    "training.start_noise=residuals: the training recordings do not move each of the car's states, "
+                    "so that no covariance follows from them; train on other drives, or set training.start_noise=given"
+                )
             noise.begin(covariance, PACE, size)
         initial = self.initial_covariance().detach().clone()
         initial[friction, friction] = torch.clamp(

@@ -229,7 +229,12 @@ def _fitted(
     """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted, so that all stay positive."""
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
-    stiffness = float(slip @ force) / float(slip @ slip)
+    squares = float(slip @ slip)
+    if not squares > 0.0:
+        raise DataError(
+            "tyre curves: the axles never slip, since the car goes straight on; fit them to drives with bends"
+        )
+    stiffness = float(slip @ force) / squares
     scale = math.sqrt(float(np.mean(force**2)))
     if not stiffness > 0.0:
         raise DataError(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import Trial
 from vehest.estimators.kernels.recurrent import loop
 from vehest.estimators.kernels.recursion import Recursion
@@ -100,7 +100,7 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
 class RecurrentEstimator(HiddenStateEstimator, WindowedEstimator):
     """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
 
-    n_states: int = setting(5, "size of the hidden state", least=1)
+    n_states: int = setting(5, "size of the hidden state", least=1, most=MAX_WIDTH)
     template = "window_recurrent"
 
     def c_values(self) -> dict[str, Any]:

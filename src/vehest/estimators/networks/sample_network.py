@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, require_learnable
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of, squared_error
 from vehest.estimators.network import Network
@@ -52,11 +52,11 @@ class SampleNetworkEstimator(Network):
     )
 
     def check(self) -> None:
-        """Layers have neurons."""
+        """Layers have neurons, and not too many."""
         super().check()
-        if min(self.hidden) < 1:
+        if min(self.hidden) < 1 or max(self.hidden) > MAX_WIDTH:
             raise ConfigurationError(
-                f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}"
+                f"estimator.hidden must be the widths of two layers, at most {MAX_WIDTH}, such as [250, 125], not {list(self.hidden)}"
             )
 
     def prepare_network(

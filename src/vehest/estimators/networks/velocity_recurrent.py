@@ -17,7 +17,7 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.declared import Group, setting
+from vehest.declared import MAX_WIDTH, Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.networks.recurrent import HiddenStateEstimator
 from vehest.estimators.networks.standardised import StandardisedNetwork
@@ -172,7 +172,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     outputs: tuple[str, ...] = setting(
         ("vx", "vy", "yaw_rate"), "what it estimates, each learnt from its _ref channel"
     )
-    n_states: int = setting(64, "size of the hidden state", least=1)
+    n_states: int = setting(64, "size of the hidden state", least=1, most=MAX_WIDTH)
     dropout: float = setting(
         0.0,
         "share of the hidden state that is hidden from later layers in training",

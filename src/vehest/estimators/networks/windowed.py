@@ -17,7 +17,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
-from vehest.declared import setting
+from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, rate
 from vehest.estimators.kernels.threads import threads_for_members
 from vehest.estimators.model_files import load_model
@@ -43,7 +43,7 @@ class WindowedEstimator(Network):
     training_type = SupervisedSettings
     horizon_steps = 1  # a window predicts the velocity one sample after it
     rate_hz: float = rate(20.0)
-    window: int = setting(30, "samples that it sees", least=1)
+    window: int = setting(30, "samples that it sees", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
         """A network that knows the ranges of the training recordings: means and deviations if it is a `StandardisedNetwork`."""
