@@ -37,7 +37,12 @@ from vehest.run.runner import Runner
 from vehest.run.study import Study
 from vehest.run.train import new_estimator, read_fit_metrics, recording_file
 from vehest.run.versions import code_of
-from vehest.run.weights import PUBLISHED_WEIGHTS, write_weights
+from vehest.run.weights import (
+    FORMAT,
+    PUBLISHED_WEIGHTS,
+    PublishedWeights,
+    WeightsTooLargeError,
+)
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
     AbsentDataset,
@@ -99,7 +104,7 @@ def draw_report(
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},
         "absent_datasets": [asdict(dataset) for dataset in artefacts.absent_datasets],
-        **({"weights": True} if study.publish else {}),
+        **({"weights": FORMAT} if study.publish else {}),
     }
     ingested = [
         artefact
@@ -123,7 +128,10 @@ def draw_report(
     def write(folder: Path) -> None:
         _write(artefacts, study.report, _recordings(shown, ingested), folder)
         if study.publish and models:
-            write_weights(models, folder / PUBLISHED_WEIGHTS)
+            try:
+                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models)
+            except WeightsTooLargeError as error:
+                runner.messages.warn(f"the report is published without weights: {error}")
 
     report = runner.ensure(
         StagePlan(STAGE, study.study, config, inputs, code_of(STAGE, study.report), runner.output),

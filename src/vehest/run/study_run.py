@@ -34,7 +34,12 @@ from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
-from vehest.run.publishing import RESULTS, Publication, publish_study
+from vehest.run.publishing import (
+    RESULTS,
+    Publication,
+    check_results_folder,
+    publish_study,
+)
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
 from vehest.run.run_cache import Ran, RunCache, stamp_of
@@ -122,6 +127,8 @@ def run_study(
         runner.until = _until(options.minutes, begun)
         if study.publish and not options.retrain:
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
+        if options.publish_weights:
+            runner.publishes_to = _weights_to_add_to(study, overrides)
         runner.train_first = f"vehest run {study.file}" if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
         used = [config["dataset"] for config in shown]
@@ -178,6 +185,19 @@ def run_study(
         published,
         None if sweep and runner.dry_run else error,
     )
+
+
+def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeights:
+    """The published weights of a study, which each training adds to; raises `ConfigurationError` where it is not published so."""
+    changes = content_overrides(overrides)
+    if not study.publish or changes:
+        why = f"leave out '{changes[0]}'" if changes else "it needs publish: true"
+        raise ConfigurationError(
+            f"--publish-weights publishes what '{study.file}' says, unchanged; {why}"
+        )
+    folder = RESULTS / study.study
+    check_results_folder(folder)
+    return PublishedWeights(folder / PUBLISHED_WEIGHTS)
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
