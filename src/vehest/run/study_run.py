@@ -44,9 +44,11 @@ from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
 from vehest.run.run_cache import Ran, RunCache, stamp_of
 from vehest.run.runner import Runner
+from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.tracking import Tracker
+from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights
 from vehest.sources.base import kind_of
@@ -142,7 +144,18 @@ def run_study(
         for config in shown:
             with suppress(DryRunStop):
                 datasets.append(_dataset(config, study, runner))
-        comparisons = _planned(study, jobs, runner)
+        planned = _planned(study, jobs, runner)
+        values = {}
+        if study.publish and not (options.retrain or TRAIN in runner.force):
+            values = published_values(study, planned, RESULTS / study.study / SEARCHES)
+        if values:
+            runner.messages.line(
+                "note",
+                "search",
+                f"{len(values)} of {len(study.trials)} trials",
+                f"taken from {RESULTS / study.study / SEARCHES}; --retrain trains them",
+            )
+        comparisons = {name: own for name, own in planned.items() if name not in values}
         for comparison in comparisons.values():
             with suppress(DryRunStop):
                 comparison.collect(*runner.run(comparison.groups))
@@ -153,7 +166,12 @@ def run_study(
         if sweep:
             report, summary = draw_sweep(study, comparisons[""], runner)
         else:
-            report, summary = draw_report(study, comparisons, datasets, runner)
+            trials = trials_of(study, planned, values)
+            remarks = remarks_on(study, planned, trials)
+            for remark in remarks:
+                runner.messages.warn(remark)
+            compared = {name: own for name, own in comparisons.items() if name not in study.trials}
+            report, summary = draw_report(study, compared, datasets, runner, trials, remarks)
         published = None
         if (
             error is None
@@ -162,7 +180,7 @@ def run_study(
         ):
             publication = None
             if study.publish and not content_overrides(overrides):
-                gone = {name: f"part '{name}'" for name in study.parts if name not in comparisons}
+                gone = {name: f"part '{name}'" for name in study.parts if name not in planned}
                 gone |= {
                     own.name: f"data set '{own.name}'"
                     for own in datasets
