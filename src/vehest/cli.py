@@ -688,6 +688,13 @@ def run(
     retrain: Annotated[
         bool, typer.Option("--retrain", help="Train also what is published with weights.")
     ] = False,
+    publish_weights: Annotated[
+        bool,
+        typer.Option(
+            "--publish-weights",
+            help="Add the weights of each training to results/STUDY/weights.safetensors as it ends, instead of those of all with the report.",
+        ),
+    ] = False,
     launcher: LauncherName = "local",
     address: Address = None,
     slurm: Slurm = None,
@@ -704,6 +711,7 @@ def run(
         jobs,
         minutes=minutes,
         retrain=retrain,
+        publish_weights=publish_weights,
         launcher=launcher,
         address=address,
         slurm=slurm or (),

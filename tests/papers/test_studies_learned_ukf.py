@@ -21,7 +21,7 @@ from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
 from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts, Trial
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
 from vehest_papers.learned_ukf.additions import (
@@ -271,7 +271,18 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     }
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
-    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, ["real"])
+    remark = "part 'simulated' does not use what the search 'trial_gru' chose"
+    artefacts = StudyArtefacts(
+        "learned_ukf",
+        "t",
+        "a",
+        "c",
+        titles,
+        parts,
+        ["real"],
+        trials=gru_trials(),
+        search_remarks=[remark],
+    )
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
@@ -337,6 +348,36 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert "authors' public code" not in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
+    assert f"P{remark[1:]}." in text
+    trials = next(
+        block for block in document.blocks if isinstance(block, Table) and block.name == "trials"
+    ).frame
+    assert trials[["candidate", "step_size", "chosen"]].values.tolist() == [
+        ["GRU", 0.001, ""],
+        ["GRU", 0.002, "chosen"],
+    ]
+
+
+def gru_trials():
+    """Two trials of a search, the better one second by its step size."""
+    return [
+        Trial(
+            search="trial_gru",
+            name=f"trial_gru_{number}",
+            options=f"training.phase.learning_rate={rate}",
+            estimator="velocity_gru",
+            variant="velocity_gru",
+            title="GRU",
+            seed=9,
+            training={"phase": {"learning_rate": rate}},
+            metric="mse_weighted",
+            validation=error,
+            key="",
+            evaluation="",
+            chosen=error == 0.01,
+        )
+        for number, (rate, error) in enumerate(((0.002, 0.01), (0.001, 0.02)), start=1)
+    ]
 
 
 def only(part, candidate, training=None):

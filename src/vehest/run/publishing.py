@@ -10,18 +10,18 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from vehest.data.errors import ConfigurationError, VehestError
-from vehest.data.files import sha256_of, written_aside
+from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json
 from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
 from vehest.run.locks import Lock, held
-from vehest.run.weights import DIGEST, PUBLISHED_WEIGHTS
+from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights, WeightsTooLargeError
 
 RESULTS = Path("results")
 PAGE_ENDING = ".html"
@@ -90,11 +90,44 @@ def publish_study(
     return folder
 
 
-def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+def publish_weights(
+    weights: PublishedWeights, models: Sequence[Artefact], output: Path, messages: Messages
+) -> bool:
+    """Add models of finished trainings to a study's published weights; returns whether there was room for them."""
+    study = weights.path.parent.name
+    with held(Lock(output, "publish", study), lambda: False):
+        try:
+            n_added = weights.add(models)
+        except WeightsTooLargeError as error:
+            messages.warn(
+                f"no more weights are published: {error}; '{weights.path}' stays as it is, "
+                "and may be removed to leave out former models"
+            )
+            return False
+    if n_added:
+        number = f"{n_added} model{'s' if n_added > 1 else ''}"
+        messages.line("done", "publish", study, f"{number} added to {weights.path}")
+    return True
+
+
+def check_results_folder(folder: Path) -> None:
+    """Raise `ConfigurationError` where a study cannot be published in a folder: it is reached by a link, or holds something else."""
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(
             f"'{folder}' leads elsewhere through a link; remove the link or set publish: false"
         )
+    if not folder.is_dir():
+        return
+    remove_leftovers(folder)
+    names = {file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()}
+    if PROVENANCE not in names and names - {PUBLISHED_WEIGHTS}:
+        raise ConfigurationError(
+            f"'{folder}' holds files that vehest did not publish; move them away or set publish: false"
+        )
+
+
+def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+    check_results_folder(folder)
     names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]
     contents = {name: published_content(report.folder / name) for name in names}
     if folder.is_dir():
@@ -111,17 +144,11 @@ def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str
             and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}
         ):
             return False
-        if present and PROVENANCE not in present:
-            raise ConfigurationError(
-                f"'{folder}' holds files that vehest did not publish; move them away or set publish: false"
-            )
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
             (aside / name).write_bytes(content)
         about = {**read_json(report.folder / PROVENANCE), "keys": keys}
-        if PUBLISHED_WEIGHTS in contents:
-            about[DIGEST] = hashlib.sha256(contents[PUBLISHED_WEIGHTS]).hexdigest()
         (aside / PROVENANCE).write_text(
             json.dumps(about, indent=1, ensure_ascii=False) + "\n",
             encoding="utf-8",

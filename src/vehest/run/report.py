@@ -34,10 +34,16 @@ from vehest.run.printing import (
 )
 from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
+from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
 from vehest.run.train import new_estimator, read_fit_metrics, recording_file
 from vehest.run.versions import code_of
-from vehest.run.weights import PUBLISHED_WEIGHTS, write_weights
+from vehest.run.weights import (
+    FORMAT,
+    PUBLISHED_WEIGHTS,
+    PublishedWeights,
+    WeightsTooLargeError,
+)
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
     AbsentDataset,
@@ -45,6 +51,7 @@ from vehest.studies.artefacts import (
     PartArtefacts,
     StoredDataset,
     StudyArtefacts,
+    Trial,
     of_parts,
     read_frame,
 )
@@ -64,23 +71,31 @@ def draw_report(
     comparisons: Mapping[str, Comparison],
     datasets: Sequence[StoredDataset | AbsentDataset],
     runner: Runner,
+    trials: Sequence[Trial] = (),
+    search_remarks: Sequence[str] = (),
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent."""
+    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent.
+
+    Trials of searches are in no part, so that a report is the same whether they were trained here or published before.
+    """
     shown = {name: part for name, part in comparisons.items() if part.members}
     left_out = {name: reason for part in shown.values() for name, reason in part.failed.items()}
+    shown_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(
         study=study.study,
         title=study.title,
         about=study.about,
         command=study.command,
-        titles={name: part.title for name, part in study.parts.items()},
+        titles={name: study.parts[name].title for name in shown_parts},
         parts={
             name: _part_artefacts(study, study.parts[name].title, part)
             for name, part in shown.items()
         },
-        absent=[name for name in study.parts if name not in comparisons],
+        absent=[name for name in shown_parts if name not in comparisons],
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
+        trials=trials,
+        search_remarks=search_remarks,
     )
     config: dict[str, Any] = {
         **{
@@ -99,7 +114,9 @@ def draw_report(
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},
         "absent_datasets": [asdict(dataset) for dataset in artefacts.absent_datasets],
-        **({"weights": True} if study.publish else {}),
+        **({"trials": [asdict(trial) for trial in trials]} if trials else {}),
+        **({"search_remarks": list(search_remarks)} if search_remarks else {}),
+        **({"weights": FORMAT} if study.publish else {}),
     }
     ingested = [
         artefact
@@ -122,8 +139,13 @@ def draw_report(
 
     def write(folder: Path) -> None:
         _write(artefacts, study.report, _recordings(shown, ingested), folder)
+        if trials:
+            write_trials(trials, folder / SEARCHES)
         if study.publish and models:
-            write_weights(models, folder / PUBLISHED_WEIGHTS)
+            try:
+                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models)
+            except WeightsTooLargeError as error:
+                runner.messages.warn(f"the report is published without weights: {error}")
 
     report = runner.ensure(
         StagePlan(STAGE, study.study, config, inputs, code_of(STAGE, study.report), runner.output),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import parts_of, plan_ingest, write_ingest
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
+from vehest.run.publishing import publish_weights
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
 from vehest.run.train import DIVERGED, read_fit_metrics
@@ -66,6 +67,7 @@ class Runner:
     weights: PublishedWeights | None = (
         None  # of a published study, which are taken instead of training
     )
+    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
     train_first: str = ""  # command to run first where a training is missing; empty to train here
     artefacts: dict[Path, Artefact] = field(
         default_factory=dict
@@ -217,6 +219,7 @@ class Runner:
             members |= self._received([member for member in found if member.finished])
             missing = [member.job for member in found if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
+        self._publish_weights(members.values())
         failures: dict[str, Failure] = {}
         if waiting and self.train_first:
             return members, {}  # `Comparison.unfinished` has the others
@@ -236,6 +239,7 @@ class Runner:
                     bars.step(ALL, ended, len(waiting))
                     if not isinstance(outcome, Failure):
                         members |= self._received(outcome)
+                        self._publish_weights(outcome)
                     elif outcome.exit_code != DataError.exit_code or len(group.jobs) == 1:
                         failures |= {job.plan.key: outcome for job in group.jobs}
                         self.messages.line("fail", "train", group.name, outcome.message)
@@ -315,6 +319,20 @@ class Runner:
                     self.messages.warn(f"the training of {made.label} {DIVERGED}")
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
+
+    def _publish_weights(self, members: Iterable[Member]) -> None:
+        """Add the models of finished trainings to the published weights, if they are to be; once there is no room, no more."""
+        models = [
+            member.model
+            for member in members
+            if member.model is not None and member.model.status == "complete"
+        ]
+        if (
+            self.publishes_to is not None
+            and not self.dry_run
+            and not publish_weights(self.publishes_to, models, self.output, self.messages)
+        ):
+            self.publishes_to = None
 
     def _report(
         self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None

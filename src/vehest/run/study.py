@@ -20,6 +20,7 @@ from vehest.data.limits import use_limits
 from vehest.data.schema import settings_from_config, validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import read_yaml
+from vehest.evaluation.metrics import UNITS
 from vehest.run.config import (
     GIVEN,
     Config,
@@ -53,6 +54,14 @@ Names = Annotated[tuple[str, ...], "a list of names"]
 
 
 @dataclass(frozen=True)
+class Search:
+    """Candidates of which the one with the lowest metric on the validation range is chosen."""
+
+    candidates: Sweeps = ()
+    metric: str = "rmse_sideslip"
+
+
+@dataclass(frozen=True)
 class Part:
     """One comparison of a study: sweeps of trainings on one split; docs/cli.md says what the keys mean."""
 
@@ -61,6 +70,7 @@ class Part:
     title: str = ""
     optional: bool = False
     overrides: Annotated[tuple[str, ...], "a list of overrides"] = ()
+    search: Search | None = None  # of a trial: its own options alone
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,14 @@ class Study(PipelineFile):
 
     file: Path = Path()
     command: str = ""  # that makes it, without where data come from and results go
+    searches: dict[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # part of the file with a search -> its trials, each a part here
+
+    @property
+    def trials(self) -> frozenset[str]:
+        """Parts that are trials of a search."""
+        return frozenset(trial for trials in self.searches.values() for trial in trials)
 
     @property
     def shows_failed(self) -> bool:
@@ -156,6 +174,20 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
             f"'{file}': the study module '{read.report}' draws its report from {draws}"
         )
     parts = _folds_of(parts[""], file) if takes == "folds" else parts
+    searches: dict[str, tuple[str, ...]] = {}
+    for key in [key for key, part in parts.items() if part.search is not None]:
+        trials = _trials_of(key, parts[key], file)
+        searches[key] = tuple(trials)
+        twins = sorted(trials.keys() & parts.keys())
+        if twins:
+            raise ConfigurationError(
+                f"'{file}': part '{twins[0]}' has the name of a trial of '{key}'"
+            )
+        parts = dict(
+            item
+            for name, part in parts.items()
+            for item in (trials.items() if name == key else [(name, part)])
+        )
     evaluation = [
         f"{'' if key == 'faults' else 'evaluation.'}{key}={_as_override(value)}"
         for key, value in read.evaluation.items()
@@ -173,7 +205,38 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
         },
     }
     command = " ".join([f"vehest run pipelines/{file.name}", *content_overrides(overrides)])
-    return Study(**{**vars(read), **changed}, file=file, command=command)
+    return Study(**{**vars(read), **changed}, file=file, command=command, searches=searches)
+
+
+def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
+    """A part with a search as parts, one a candidate."""
+    search = part.search
+    assert search is not None
+    where = f"'{file}': the search '{name}'"
+    if search.metric not in UNITS:
+        raise ConfigurationError(f"{where} chooses by '{search.metric}', which is no metric")
+    candidates = [tuple(job) for sweep in search.candidates for job in expand(sweep)]
+    if len(candidates) < 2:
+        raise ConfigurationError(
+            f"{where} needs candidates, a list of lists of overrides with two combinations or more"
+        )
+    if len(part.sweeps) != 1 or count(part.sweeps[0]) != 1:
+        raise ConfigurationError(
+            f"{where} needs sweeps with one list of overrides for one training"
+        )
+    stated = {key_of(override) for override in (*part.overrides, *part.sweeps[0])}
+    for key in (key_of(override) for candidate in candidates for override in candidate):
+        if key in stated:
+            raise ConfigurationError(f"{where} tries '{key}', which its sweeps state too")
+    return {
+        f"{name}_{number}": replace(
+            part,
+            title=f"{part.title or name}, {', '.join(candidate)}",
+            overrides=(*part.overrides, *candidate),
+            search=replace(search, candidates=(candidate,)),
+        )
+        for number, candidate in enumerate(candidates, start=1)
+    }
 
 
 def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, Any]]:

@@ -34,14 +34,21 @@ from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
-from vehest.run.publishing import RESULTS, Publication, publish_study
+from vehest.run.publishing import (
+    RESULTS,
+    Publication,
+    check_results_folder,
+    publish_study,
+)
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
 from vehest.run.run_cache import Ran, RunCache, stamp_of
 from vehest.run.runner import Runner
+from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.tracking import Tracker
+from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights
 from vehest.sources.base import kind_of
@@ -122,6 +129,8 @@ def run_study(
         runner.until = _until(options.minutes, begun)
         if study.publish and not options.retrain:
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
+        if options.publish_weights:
+            runner.publishes_to = _weights_to_add_to(study, overrides)
         runner.train_first = f"vehest run {study.file}" if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
         used = [config["dataset"] for config in shown]
@@ -135,7 +144,18 @@ def run_study(
         for config in shown:
             with suppress(DryRunStop):
                 datasets.append(_dataset(config, study, runner))
-        comparisons = _planned(study, jobs, runner)
+        planned = _planned(study, jobs, runner)
+        values = {}
+        if study.publish and not (options.retrain or TRAIN in runner.force):
+            values = published_values(study, planned, RESULTS / study.study / SEARCHES)
+        if values:
+            runner.messages.line(
+                "note",
+                "search",
+                f"{len(values)} of {len(study.trials)} trials",
+                f"taken from {RESULTS / study.study / SEARCHES}; --retrain trains them",
+            )
+        comparisons = {name: own for name, own in planned.items() if name not in values}
         for comparison in comparisons.values():
             with suppress(DryRunStop):
                 comparison.collect(*runner.run(comparison.groups))
@@ -146,7 +166,12 @@ def run_study(
         if sweep:
             report, summary = draw_sweep(study, comparisons[""], runner)
         else:
-            report, summary = draw_report(study, comparisons, datasets, runner)
+            trials = trials_of(study, planned, values)
+            remarks = remarks_on(study, planned, trials)
+            for remark in remarks:
+                runner.messages.warn(remark)
+            compared = {name: own for name, own in comparisons.items() if name not in study.trials}
+            report, summary = draw_report(study, compared, datasets, runner, trials, remarks)
         published = None
         if (
             error is None
@@ -155,7 +180,7 @@ def run_study(
         ):
             publication = None
             if study.publish and not content_overrides(overrides):
-                gone = {name: f"part '{name}'" for name in study.parts if name not in comparisons}
+                gone = {name: f"part '{name}'" for name in study.parts if name not in planned}
                 gone |= {
                     own.name: f"data set '{own.name}'"
                     for own in datasets
@@ -178,6 +203,19 @@ def run_study(
         published,
         None if sweep and runner.dry_run else error,
     )
+
+
+def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeights:
+    """The published weights of a study, which each training adds to; raises `ConfigurationError` where it is not published so."""
+    changes = content_overrides(overrides)
+    if not study.publish or changes:
+        why = f"leave out '{changes[0]}'" if changes else "it needs publish: true"
+        raise ConfigurationError(
+            f"--publish-weights publishes what '{study.file}' says, unchanged; {why}"
+        )
+    folder = RESULTS / study.study
+    check_results_folder(folder)
+    return PublishedWeights(folder / PUBLISHED_WEIGHTS)
 
 
 def _until(minutes: float | None, begun: float) -> float | None:

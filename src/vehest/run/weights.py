@@ -1,6 +1,8 @@
 """Publishes the models of a study in one file, from which the same trainings are taken elsewhere instead of being repeated.
 
-models -> `write_weights` -> results/STUDY/weights.safetensors -> `PublishedWeights.write` -> folder of a training with the same key
+models -> `PublishedWeights.add` -> results/STUDY/weights.safetensors -> `PublishedWeights.write` -> folder of a training with the same key
+
+Each model has its digest in the file, so that the file is consistent by itself: it grows training by training, and is replaced in one step.
 """
 
 from __future__ import annotations
@@ -9,24 +11,28 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
-from vehest.data.errors import DataError
-from vehest.data.files import sha256_of
-from vehest.data.text_files import first_line, read_json
+from vehest.data.errors import DataError, VehestError
+from vehest.data.files import remove_leftovers, sha256_of, written_aside
+from vehest.data.text_files import first_line
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
 from vehest.run.artefacts import TIMINGS, Artefact
+from vehest.run.keys import hash_of
 from vehest.run.train import FIT_METRICS, HISTORY
 
 PUBLISHED_WEIGHTS = "weights.safetensors"
-PROVENANCE = "provenance.json"  # beside it; names the file's digest
-DIGEST = "weights_sha256"
 MODELS = "models"  # the only entry of the file's metadata
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
+FORMAT = 2  # in the key of a report that has weights: 2 has a digest for each model
+MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
+
+
+class WeightsTooLargeError(VehestError):
+    """The weights of a study would exceed `MAX_MEGABYTES`."""
 
 
 @dataclass(frozen=True)
@@ -35,69 +41,87 @@ class PublishedModel:
 
     label: str
     code: str  # version of the training
+    digest: str  # of the training's artefact
     files: dict[str, str] = field(default_factory=dict)  # those of `FILES` that it has -> content
 
 
-def write_weights(models: Iterable[Artefact], path: Path) -> None:
-    """Write the models of trainings into one safetensors file, each under the key of its training."""
-    tensors: dict[str, Any] = {}
-    about: dict[str, Any] = {}
-    for key, model in sorted({model.key: model for model in models}.items()):
-        files = {
-            name: (model.folder / name).read_bytes().decode()
-            for name in FILES
-            if name in model.outputs
-        }
-        about[key] = asdict(PublishedModel(model.label, model.code, files))
-        tensors |= {
-            f"{key}/{name}": values for name, values in load_file(model.folder / WEIGHTS).items()
-        }
-    save_file(tensors, path, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
-
-
-def _check_digest(path: Path) -> None:
-    """Raise `DataError` where published weights are not those whose digest their provenance names."""
-    provenance = path.with_name(PROVENANCE)
-    about = read_json(provenance) if provenance.is_file() else {}
-    stated = about.get(DIGEST) if isinstance(about, dict) else None
-    remedy = f"restore both by 'git checkout {path.parent}', or add --retrain"
-    if stated is None:
-        raise DataError(f"'{path}': '{provenance}' has no {DIGEST} to verify it by; {remedy}")
-    if sha256_of(path) != stated:
-        raise DataError(
-            f"'{path}' was changed after it was published: its SHA-256 is not {DIGEST} in '{provenance}'; {remedy}"
-        )
-
-
 class PublishedWeights:
-    """Models of a published study by the keys of their trainings; none where there is no such file; raises `DataError` where damaged."""
+    """Models of a study by the keys of their trainings; none where there is no such file.
+
+    Raises
+    ------
+    DataError
+        The file is damaged.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._models: dict[str, PublishedModel] = {}
-        if path.is_file():
-            _check_digest(path)
-            try:
-                with safe_open(path, framework="np") as file:
-                    self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
-                        file.metadata()[MODELS]
-                    )
-            except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-                raise DataError(
-                    f"'{path}' is damaged ({first_line(error)}); remove it, or add --retrain"
-                ) from error
+        self._read()
 
     def __contains__(self, key: str) -> bool:
         return key in self._models
 
+    def add(self, models: Iterable[Artefact]) -> int:
+        """Add models of finished trainings, in one step: whoever reads or is killed finds the file of before or after.
+
+        Returns
+        -------
+        int
+            Number of models that were not in the file, or not with this content.
+
+        Raises
+        ------
+        WeightsTooLargeError
+            The file would exceed `MAX_MEGABYTES`; it stays as it is.
+        DataError
+            The present file is damaged.
+        MissingError
+            The disk is full or the folder cannot be written to.
+        """
+        self._read()  # another run may have added to it
+        added = {
+            model.key: model
+            for model in models
+            if model.key not in self._models or self._models[model.key].digest != model.digest
+        }
+        if not added:
+            return 0
+        tensors = {
+            name: values
+            for name, values in (load_file(self.path) if self._models else {}).items()
+            if name.partition("/")[0] not in added
+        }
+        for key, model in added.items():
+            of_model = load_file(model.folder / WEIGHTS)
+            tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
+        records = self._models | {key: _record_of(model) for key, model in added.items()}
+        about = {key: asdict(record) for key, record in sorted(records.items())}
+        remove_leftovers(self.path.parent)
+        with written_aside(self.path) as aside:
+            save_file(tensors, aside, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
+            megabytes = aside.stat().st_size / 1e6
+            if megabytes > MAX_MEGABYTES:
+                raise WeightsTooLargeError(
+                    f"{megabytes:.1f} MB of weights are more than the {MAX_MEGABYTES} MB of a study"
+                )
+        self._models = records
+        return len(added)
+
     def write(self, key: str, folder: Path) -> None:
-        """Write a model into the folder of its training, byte for byte as that did, but without times."""
-        files = self._models[key].files
-        prefix = f"{key}/"
+        """Write a model into the folder of its training, byte for byte as that did, but without times.
+
+        Raises
+        ------
+        DataError
+            The model is not the one that was published.
+        """
+        record = self._models[key]
         for name in FILES:
-            if name in files:
-                (folder / name).write_bytes(files[name].encode())
+            if name in record.files:
+                (folder / name).write_bytes(record.files[name].encode())
         (folder / TIMINGS).write_text("metric,value\n", encoding="utf-8")
+        prefix = f"{key}/"
         with safe_open(self.path, framework="np") as file:
             tensors = {
                 name.removeprefix(prefix): file.get_tensor(name)
@@ -105,3 +129,32 @@ class PublishedWeights:
                 if name.startswith(prefix)
             }
         save_file(tensors, folder / WEIGHTS)
+        names = [WEIGHTS, *record.files]
+        if hash_of({name: sha256_of(folder / name) for name in names}) != record.digest:
+            raise DataError(
+                f"'{self.path}' was changed after it was published: {record.label} does not have its digest; "
+                f"restore the file by 'git checkout {self.path}', or add --retrain"
+            )
+
+    def _read(self) -> None:
+        """Read the models from the file, if there is one."""
+        if not self.path.is_file():
+            self._models = {}
+            return
+        try:
+            with safe_open(self.path, framework="np") as file:
+                self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
+                    file.metadata()[MODELS]
+                )
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+            raise DataError(
+                f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout {self.path}', "
+                "remove it, or add --retrain"
+            ) from error
+
+
+def _record_of(model: Artefact) -> PublishedModel:
+    files = {
+        name: (model.folder / name).read_bytes().decode() for name in FILES if name in model.outputs
+    }
+    return PublishedModel(model.label, model.code, model.digest, files)

@@ -176,6 +176,25 @@ class AbsentDataset:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """One candidate of a search: a training whose error on the validation range is compared with that of others."""
+
+    search: str  # part of the pipeline file that names the candidates
+    name: str  # part that trained this one
+    options: str  # overrides that were tried, for example ``training.learning_rate=0.001``
+    estimator: str  # name in conf/estimator
+    variant: str  # what the paper calls it
+    title: str  # for people
+    seed: int  # its seed
+    training: Mapping[str, Any]  # how it was trained, as configured
+    metric: str  # that chooses
+    validation: float  # value of the metric on the validation range, to six significant digits
+    key: str  # of its training
+    evaluation: str  # version and options of its evaluation
+    chosen: bool = False  # whether it has the lowest value of its search
+
+
+@dataclass(frozen=True)
 class StudyArtefacts:
     """Everything that a study module may look at: parts that compare estimators, or data sets."""
 
@@ -189,6 +208,8 @@ class StudyArtefacts:
     # part -> what was compared in it; a study that is not in parts has one without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
     absent: Sequence[str] = ()  # parts whose raw files were not here
+    trials: Sequence[Trial] = ()  # of searches, which are in no part
+    search_remarks: Sequence[str] = ()  # on parts that do not use what a search chose
     datasets: Sequence[
         StoredDataset
     ] = ()  # of a study of recordings alone, in the order of the pipeline file

@@ -1,11 +1,12 @@
 """Every table and figure of Węgrzynowski, Czechmanowski, Kicki and Walas 2024, on the parts of a pipeline such as ``learned_ukf``.
 
 Parts it knows: ``real`` and ``simulated``, of which it needs one, each with the test sets ``tyre_a`` and ``tyre_d``; and ``length_*``, the
-same candidate trained on sequences of different length, which it goes on without.
+same candidate trained on sequences of different length, which it goes on without. The trials of searches are a table of their own.
 """
 
 from vehest_papers.learned_ukf.document import documents
 
 TAKES = "parts"
+VERSION = "2"  # trials of searches are in searches.csv and no longer in metrics.csv
 
-__all__ = ["TAKES", "documents"]
+__all__ = ["TAKES", "VERSION", "documents"]

@@ -14,13 +14,12 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
-from vehest_papers.learned_ukf.ablations import SCRATCH
-from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
+from vehest_papers.learned_ukf.candidates import SETS
 from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import loaded
 from vehest_papers.learned_ukf.order import differences, order_in_words, pairs_table
-from vehest_papers.learned_ukf.trials import step_size, trials_table
+from vehest_papers.learned_ukf.trials import trials_table
 
 
 def appendix_of_part(
@@ -76,7 +75,6 @@ def appendix_of_part(
 def how_it_was_made(
     artefacts: StudyArtefacts,
     main: Mapping[str, PartArtefacts],
-    trials: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
     """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
@@ -97,25 +95,10 @@ def how_it_was_made(
         "Every setting of every training: [CSV](tables/training_settings.csv).",
     ]
     blocks: list[Block] = []
-    if trials:
-        used = {
-            candidate: step_size(models[0])
-            for part in main.values()
-            for candidate, models in models_by_candidate(part).items()
-            if candidate in (paper.NNTF_UH, paper.GRU, paper.LSTM)
-        }
-        if SCRATCH in artefacts.parts:
-            used |= {
-                candidate: step_size(own[0])
-                for candidate, own in models_by_candidate(artefacts.parts[SCRATCH]).items()
-            }
-        table, other = trials_table(trials, used)
-        words = (
-            ""
-            if not other
-            else f"The tables do not use what validation chose for {', '.join(other)}."
-        )
-        blocks += ["## Appendix: trials", *([words] if words else []), table]
+    if artefacts.trials:
+        remarks = " ".join(f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks)
+        table = trials_table(artefacts.trials)
+        blocks += ["## Appendix: trials", *([remarks] if remarks else []), table]
     return [
         *blocks,
         methods.how_it_was_made(lines),

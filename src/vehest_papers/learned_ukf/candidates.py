@@ -21,7 +21,7 @@ from vehest.evaluation.metrics import (
     scored_range,
     weighted_errors,
 )
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, Trial
 from vehest_papers.kit import reading
 from vehest_papers.kit.paired import sequence_labels
 from vehest_papers.kit.reading import metric_values
@@ -51,7 +51,7 @@ _NETWORKS = {"velocity_gru": paper.GRU, "velocity_lstm": paper.LSTM}
 _BASELINES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP, "data_sheet": paper.DATA_SHEET}
 
 
-def candidate_of(model: EvaluatedModel) -> str:
+def candidate_of(model: EvaluatedModel | Trial) -> str:
     """What the paper calls a model; its own title if the paper has none like it."""
     if model.estimator == "learned_ukf":
         name = (_FILTERS | _VARIANTS).get(model.variant, model.title)

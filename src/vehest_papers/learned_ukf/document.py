@@ -34,7 +34,6 @@ from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
 MAIN = ("real", "simulated")
 LIKELIHOOD = "likelihood"
-TRIAL = "trial_"
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 NOTE = (
@@ -83,9 +82,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks += [*own.picture, *own.front]
     for own in found.values():
         blocks += own.appendix
-    blocks += how_it_was_made(
-        artefacts, main, {n: p for n, p in artefacts.parts.items() if n.startswith(TRIAL)}, data
-    )
+    blocks += how_it_was_made(artefacts, main, data)
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 

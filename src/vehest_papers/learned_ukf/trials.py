@@ -2,61 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 
-from vehest.data.splits import VALIDATION
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest_papers.kit.reading import metric_values
+from vehest.studies.artefacts import Trial
 from vehest_papers.learned_ukf.candidates import candidate_of
 
 
-def step_size(model: EvaluatedModel) -> float:
-    """Of the training through the filter, or on sequences."""
-    training = model.training
+def step_size(trial: Trial) -> float:
+    """Step size of the training through the filter, or on sequences."""
+    training = trial.training
     return float(training["through" if "through" in training else "phase"]["learning_rate"])
 
 
-def trials_table(
-    parts: Mapping[str, PartArtefacts], used: Mapping[str, float]
-) -> tuple[Table, list[str]]:
-    """A row a trial, and the candidates whose tables do not use what validation chose; ``used``: candidate -> step size of the tables."""
-    rows = []
-    for part in parts.values():
-        values = metric_values(part)
-        for model in part.models:
-            key = (model.estimator, model.variant, model.seed, VALIDATION, "mse_weighted")
-            row = {
-                "candidate": candidate_of(model),
-                "step_size": step_size(model),
-                "seed": model.seed,
-            }
-            row["start"] = str(model.training.get("start_noise", MISSING))
-            rows.append(row | {"validation": values.get(key, np.nan)})
+def trials_table(trials: Sequence[Trial]) -> Table:
+    """A row a trial of the study's searches."""
+    rows = [
+        {
+            "candidate": candidate_of(trial),
+            "step_size": step_size(trial),
+            "start": str(trial.training.get("start_noise", MISSING)),
+            "seed": trial.seed,
+            "validation": trial.validation,
+            "chosen": "chosen" if trial.chosen else "",
+        }
+        for trial in trials
+    ]
     frame = (
         pd.DataFrame(rows)
         .sort_values(["candidate", "step_size"], kind="stable")
         .reset_index(drop=True)
     )
-    frame["chosen"] = [
-        "chosen"
-        if own["validation"] == frame[frame["candidate"] == own["candidate"]]["validation"].min()
-        else ""
-        for own in frame.to_dict("records")
-    ]
-    best = {
-        str(row["candidate"]): float(row["step_size"])
-        for row in frame[frame["chosen"] == "chosen"].to_dict("records")
-    }
-    other = [
-        candidate
-        for candidate, size in best.items()
-        if candidate in used and used[candidate] != size
-    ]
     columns = {
         "candidate": Column("method"),
         "step_size": Column("step size", digits=1, each=True),
@@ -66,4 +45,4 @@ def trials_table(
         "chosen": Column("chosen"),
     }
     caption = "Step sizes that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
-    return Table("trials", caption, frame, columns), other
+    return Table("trials", caption, frame, columns)

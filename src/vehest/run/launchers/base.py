@@ -34,6 +34,7 @@ class RunOptions:
     track: bool = False
     minutes: float | None = None
     retrain: bool = False
+    publish_weights: bool = False
     launcher: str = "local"  # one of `LAUNCHERS`
     address: str | None = None  # of a cluster
     slurm: Sequence[str] = ()  # resources of SLURM jobs, NAME=VALUE

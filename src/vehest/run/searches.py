@@ -1,0 +1,198 @@
+"""Searches of a study: what each trial reached on the validation range, and which one that chooses.
+
+planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations -> `trials_of` -> `remarks_on` parts -> report
+
+A search is finished where the file has all of its trials with today's keys: then none of them is trained, wherever the study runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vehest.data.errors import DataError
+from vehest.data.splits import VALIDATION
+from vehest.data.text_files import number_in, read_rows
+from vehest.run.comparison import Comparison
+from vehest.run.config import Config, key_of
+from vehest.run.evaluate import COLUMNS, METRICS, evaluation_options
+from vehest.run.evaluate_faults import faults_of
+from vehest.run.keys import hash_of
+from vehest.run.study import Job, Study
+from vehest.run.train import new_estimator, training_options
+from vehest.run.versions import code_of
+from vehest.studies.artefacts import Trial, read_frame
+
+SEARCHES = "searches.csv"
+TRIAL_COLUMNS = (
+    "search",
+    "name",
+    "options",
+    "title",
+    "seed",
+    "metric",
+    "validation",
+    "key",
+    "evaluation",
+    "chosen",
+)
+DIGITS = 6  # significant ones of a validation value, as in published CSV files
+
+
+def published_values(
+    study: Study, comparisons: Mapping[str, Comparison], path: Path
+) -> dict[str, float]:
+    """Validation value of each trial of those searches that a published file has in full, with today's keys; raises `DataError`."""
+    if not path.is_file():
+        return {}
+    values = {
+        (row["key"], row["evaluation"], row["metric"]): number_in(row, "validation", path)
+        for row in read_rows(path, TRIAL_COLUMNS)
+    }
+    finished: dict[str, float] = {}
+    for trials in study.searches.values():
+        planned = [_planned_trial(study, name, comparisons) for name in trials]
+        found = {
+            trial.name: values[trial.key, trial.evaluation, trial.metric]
+            for trial in planned
+            if trial is not None and (trial.key, trial.evaluation, trial.metric) in values
+        }
+        if len(found) == len(trials):
+            finished |= found
+    return finished
+
+
+def trials_of(
+    study: Study, comparisons: Mapping[str, Comparison], published: Mapping[str, float]
+) -> list[Trial]:
+    """The trials of every search of which all have a value: a published one, or that of their evaluation."""
+    finished: list[Trial] = []
+    for names in study.searches.values():
+        trials = []
+        for name in names:
+            trial = _planned_trial(study, name, comparisons)
+            if trial is None or not (name in published or comparisons[name].members):
+                break
+            value = published.get(name)
+            if value is None:
+                value = _validation_value(comparisons[name], trial)
+            trials.append(replace(trial, validation=float(f"{value:.{DIGITS}g}")))
+        if len(trials) == len(names):
+            lowest = min(math.inf if math.isnan(t.validation) else t.validation for t in trials)
+            best = next((t.name for t in trials if t.validation == lowest), "")
+            finished += [replace(trial, chosen=trial.name == best) for trial in trials]
+    return finished
+
+
+def remarks_on(
+    study: Study, comparisons: Mapping[str, Comparison], trials: Sequence[Trial]
+) -> list[str]:
+    """A line for each part and search where the part trains what was searched for, with other options than those chosen.
+
+    What was searched for is a job that differs from the trials in nothing but the options that they try, and the seed.
+    """
+    remarks: dict[str, None] = {}
+    for chosen in (trial for trial in trials if trial.chosen):
+        tried = {
+            key_of(override)
+            for trial in trials
+            if trial.search == chosen.search
+            for override in _options(study, trial.name)
+        }
+        best = comparisons[chosen.name].jobs[0].config
+        for name, comparison in comparisons.items():
+            if name in study.trials:
+                continue
+            for config in (job.config for job in comparison.usable):
+                is_searched = _compared(config, tried) == _compared(best, tried)
+                if is_searched and _compared(config) != _compared(best):
+                    remarks[
+                        f"part '{name}' does not use what the search '{chosen.search}' chose by {chosen.metric} "
+                        f"on validation: {chosen.options}"
+                    ] = None
+    return list(remarks)
+
+
+def write_trials(trials: Sequence[Trial], path: Path) -> None:
+    """Write the trials of searches, a row each, with their keys."""
+    rows = [{column: getattr(trial, column) for column in TRIAL_COLUMNS} for trial in trials]
+    table = pd.DataFrame(rows, columns=list(TRIAL_COLUMNS))
+    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
+
+
+def _options(study: Study, name: str) -> tuple[str, ...]:
+    search = study.parts[name].search
+    assert search is not None
+    return search.candidates[0]
+
+
+def _planned_trial(study: Study, name: str, comparisons: Mapping[str, Comparison]) -> Trial | None:
+    """A trial before it has a value; none where its recordings are not here or it cannot be trained."""
+    if name not in comparisons:
+        return None
+    comparison = comparisons[name]
+    job: Job = comparison.jobs[0]
+    if job.training is None:
+        return None
+    search = study.parts[name].search
+    assert search is not None
+    estimator = new_estimator(job.config["estimator"])
+    faults = faults_of(job.config)
+    options = evaluation_options(comparison.evaluation.protocol, faults)
+    code = code_of("evaluate", estimator.name, faults=bool(faults))
+    return Trial(
+        search=next(key for key, names in study.searches.items() if name in names),
+        name=name,
+        options=" ".join(_options(study, name)),
+        estimator=estimator.name,
+        variant=estimator.variant,
+        title=estimator.full_title,
+        seed=job.training.seed,
+        training=dict(job.config["training"]),
+        metric=search.metric,
+        validation=math.nan,
+        key=job.training.plan.key,
+        evaluation=f"{code} {hash_of(options)[:16]}",
+    )
+
+
+def _validation_value(comparison: Comparison, trial: Trial) -> float:
+    """Value of the metric that chooses, over all samples of the validation range."""
+    evaluation = comparison.members[0].evaluation
+    assert evaluation is not None
+    table = read_frame(evaluation.folder / METRICS, COLUMNS, numbers=("value",))
+    rows = table[
+        (table["metric"] == trial.metric)
+        & (table["test_set"] == VALIDATION)
+        & (table["subset"] == "all")
+        & (table["condition"] == "nominal")
+    ]
+    if len(rows) != 1:
+        raise DataError(
+            f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a validation range"
+        )
+    return float(rows["value"].iloc[0])
+
+
+def _compared(config: Config, tried: set[str] | frozenset[str] = frozenset()) -> dict[str, Any]:
+    """What determines a training, without its seed and the options that are tried."""
+    options = training_options(config)
+    content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}
+    for key in tried:
+        content = _without(content, key.split("."))
+    return content
+
+
+def _without(content: Any, path: Sequence[str]) -> Any:
+    """A mapping without a nested key, and without mappings that are empty then."""
+    first, *rest = path
+    if not isinstance(content, dict) or first not in content:
+        return content
+    others = {key: value for key, value in content.items() if key != first}
+    nested = _without(content[first], rest) if rest else {}
+    return {**others, first: nested} if nested else others

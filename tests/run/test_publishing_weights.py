@@ -1,0 +1,200 @@
+"""Weights are published training by training: a study that was stopped goes on elsewhere, and trains only what is missing."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from place import write_drives
+from vehest.data.files import ASIDE_PREFIX
+from vehest.run import runner, weights
+from vehest.run.artefacts import read_artefact
+from vehest.run.weights import PublishedWeights, WeightsTooLargeError
+
+GRU = ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"]
+LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]
+RUN = ("run", "pair", "tracking=none", "--publish-weights", "--jobs", "1")
+FILE = "results/pair/weights.safetensors"
+
+
+@pytest.fixture
+def pair(place):
+    """A place with a study of two parts, each of a training and a group of two seeds."""
+    write_drives(place.folder, 60.0)
+    for name, train, test in (("forth", "one", "three"), ("back", "three", "one")):
+        place.change(
+            f"conf/split/{name}.yaml",
+            name=name,
+            dataset="mine",
+            train=[{"recording": train}],
+            validation=[{"recording": "two"}],
+            tests={"unseen": [{"recording": test}]},
+        )
+    parts = {
+        name: {"title": name, "split": name, "sweeps": [LUENBERGER, GRU]}
+        for name in ("forth", "back")
+    }
+    place.change("pipelines/pair.yaml", study="pair", report="transfer", publish=True, parts=parts)
+    return place
+
+
+def digests(output):
+    """Folder of a training -> digest of its weights."""
+    return {
+        folder.name: read_artefact(folder).outputs["model.safetensors"]
+        for folder in (output / "train").iterdir()
+    }
+
+
+def stop_once_published(patch, n_models):
+    """Send Ctrl-C after so many models have been published."""
+
+    def publish_weights(published, models, output, messages):
+        has_room = publish(published, models, output, messages)
+        if len(published._models) >= n_models:
+            os.kill(os.getpid(), signal.SIGINT)
+        return has_room
+
+    publish = runner.publish_weights
+    patch.setattr(runner, "publish_weights", publish_weights)
+
+
+def test_a_study_stopped_in_a_part_goes_on_from_an_empty_output_root_with_what_is_missing(
+    pair, monkeypatch
+):
+    with monkeypatch.context() as patch:
+        stop_once_published(patch, 4)
+        code, _, _ = pair(*RUN)
+    assert code == 128 + signal.SIGINT
+    assert sorted(os.listdir("results/pair")) == ["weights.safetensors"]
+    assert len(PublishedWeights(pair.folder / FILE)._models) == 4
+    assert len(digests(pair.folder / "outputs")) == 4
+    shutil.rmtree("outputs")
+    _, err = pair.done(*RUN)
+    said = " ".join(err.split())
+    assert "3 of 3 taken from results/pair/weights.safetensors" in said
+    assert "1 of 3 taken from results/pair/weights.safetensors" in said
+    assert err.count("epochs,") == 2
+    resumed = pair.folder / "outputs"
+    published = {
+        file.name: file.read_bytes()
+        for file in (pair.folder / "results/pair").iterdir()
+        if file.is_file()
+    }
+    shutil.rmtree("results")
+    pair.done(*RUN[:3], "output=uninterrupted")
+    assert digests(resumed) == digests(pair.folder / "uninterrupted")
+    assert len(digests(resumed)) == 6
+    for name in set(published) - {"provenance.json"}:
+        assert (pair.folder / "results/pair" / name).read_bytes() == published[name], name
+
+
+def test_models_of_a_run_that_was_killed_are_published_by_the_next_and_former_ones_stay(
+    pair, monkeypatch
+):
+    pair.done(*RUN[:3])
+    former = PublishedWeights(pair.folder / FILE)
+    report = (pair.folder / "results/pair/report.md").read_bytes()
+    pipeline = pair.change("pipelines/pair.yaml")
+    pipeline["parts"]["back"]["sweeps"] = [[*GRU[:2], "seed=2", GRU[3]]]
+    pair.change("pipelines/pair.yaml", parts=pipeline["parts"])
+    with monkeypatch.context() as patch:
+        stop_once_published(patch, 7)
+        assert pair(*RUN)[0] == 128 + signal.SIGINT
+    grown = PublishedWeights(pair.folder / FILE)
+    assert grown._models.items() > former._models.items()
+    assert (pair.folder / "results/pair/report.md").read_bytes() == report
+    (pair.folder / FILE).unlink()
+    _, err = pair.done(*RUN)
+    assert "epochs," not in err
+    assert "3 models added to results/pair/weights.safetensors" in " ".join(err.split())
+    assert len(PublishedWeights(pair.folder / FILE)._models) == 4  # the report is published anew
+
+
+def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monkeypatch):
+    def report(self, groups, bars, at, news):
+        if getattr(news, "epoch", 0) == 1 and groups[at].name.startswith("gru"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner.Runner, "_report", report)
+        code, _, err = pair(*RUN)
+    assert (code, "the best so far is kept" in " ".join(err.split())) == (130, True)
+    labels = [model.label for model in PublishedWeights(pair.folder / FILE)._models.values()]
+    assert labels == ["luenberger-luenberger-seed0"]
+
+
+def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatch):
+    first, second, *others = trained(pair)
+    file = pair.folder / "some" / "weights.safetensors"
+    published = PublishedWeights(file)
+    assert published.add([first]) == 1
+    before = file.read_bytes()
+    monkeypatch.setattr(weights, "MAX_MEGABYTES", len(before) / 1e6)
+    assert published.add([first]) == 0
+    with pytest.raises(WeightsTooLargeError, match=r"MB of weights are more than the 0\.0"):
+        published.add([second, *others])
+    assert (os.listdir(file.parent), file.read_bytes()) == ([file.name], before)
+    assert (first.key in published, second.key in published) == (True, False)
+    _, err = pair.done(*RUN)
+    said = " ".join(err.split())
+    assert said.count("no more weights are published") == 1
+    assert "the report is published without weights" in said
+    assert not (pair.folder / FILE).exists()
+    assert (pair.folder / "results/pair/report.md").is_file()
+
+
+def trained(pair):
+    """The models of the study, which was run without being published."""
+    pair.change("pipelines/pair.yaml", publish=False)
+    pair.done(*RUN[:3])
+    pair.change("pipelines/pair.yaml", publish=True)
+    return [read_artefact(folder) for folder in sorted((pair.folder / "outputs/train").iterdir())]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from vehest.data import files
+from vehest.run.artefacts import read_artefact
+from vehest.run.weights import PublishedWeights
+weights = PublishedWeights(Path(sys.argv[1]))
+when, replace = sys.argv[3], os.replace
+def killed(*paths):
+    if when == "after":
+        replace(*paths)
+    os.kill(os.getpid(), signal.SIGKILL)
+os.replace = killed
+weights.add([read_artefact(Path(sys.argv[2]))])
+"""
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_kill_while_writing_leaves_the_file_of_before_or_after(pair, when):
+    first, second, *_ = trained(pair)
+    file = pair.folder / "some" / "weights.safetensors"
+    PublishedWeights(file).add([first])
+    before = file.read_bytes()
+    words = [sys.executable, "-c", KILLED, str(file), str(second.folder), when]
+    assert subprocess.run(words, check=False).returncode == -signal.SIGKILL
+    published = PublishedWeights(file)
+    if when == "before":
+        assert file.read_bytes() == before
+        assert any(name.startswith(ASIDE_PREFIX) for name in os.listdir(file.parent))
+        assert published.add([second]) == 1
+    assert published.add([first, second]) == 0
+    assert os.listdir(file.parent) == [file.name]
+
+
+def test_what_is_not_published_as_it_is_or_somewhere_else_is_refused(pair):
+    pair.refused(*RUN, "training.max_epochs=1", code=2, says="leave out 'training.max_epochs=1'")
+    pair.change("pipelines/pair.yaml", publish=False)
+    pair.refused(*RUN, code=2, says="it needs publish: true")
+    pair.change("pipelines/pair.yaml", publish=True)
+    other = pair.folder / "results" / "pair" / "notes.txt"
+    other.parent.mkdir(parents=True)
+    other.write_text("mine", encoding="utf-8")
+    pair.refused(*RUN, code=2, says="holds files that vehest did not publish")
