@@ -259,7 +259,7 @@ def test_failing_combinations_are_named_and_the_others_go_on(place):
         words in last
         for words in (
             "n_hidden=-1, learning_rate=0.001",
-            "estimator.n_hidden must be at least 0, not -1",
+            "estimator.n_hidden must lie between 0 and 4096, not at -1",
         )
     )
     assert "Traceback" not in err
@@ -302,7 +302,7 @@ def test_dry_run_tells_and_makes_nothing_and_the_same_training_twice_is_refused(
         (("split=mine,quickstart",), "'split' takes one value in a sweep"),
         (("evaluation.rate_hz=10,20",), "'evaluation.rate_hz' takes one value"),
         (("seed=1", "seed=2"), "'seed' is named twice"),
-        (("estimator=gru", "estimator.n_states=0,-1"), "estimator.n_states must be"),
+        (("estimator=gru", "estimator.n_states=0,-1"), "estimator.n_states must lie"),
     ],
 )
 def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):

@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,11 +21,11 @@ from vehest.data.text_files import read_json
 from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
 from vehest.run.locks import Lock, held
-from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights, WeightsTooLargeError
 
 RESULTS = Path("results")
 PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
+PUBLISHED_WEIGHTS = "weights.safetensors"
 DIGITS = 6
 
 
@@ -88,26 +88,6 @@ def publish_study(
         if _publish(report, folder, publication.keys):
             messages.line("done", "publish", str(folder))
     return folder
-
-
-def publish_weights(
-    weights: PublishedWeights, models: Sequence[Artefact], output: Path, messages: Messages
-) -> bool:
-    """Add models of finished trainings to a study's published weights; returns whether there was room for them."""
-    study = weights.path.parent.name
-    with held(Lock(output, "publish", study), lambda: False):
-        try:
-            n_added = weights.add(models)
-        except WeightsTooLargeError as error:
-            messages.warn(
-                f"no more weights are published: {error}; '{weights.path}' stays as it is, "
-                "and may be removed to leave out former models"
-            )
-            return False
-    if n_added:
-        number = f"{n_added} model{'s' if n_added > 1 else ''}"
-        messages.line("done", "publish", study, f"{number} added to {weights.path}")
-    return True
 
 
 def check_results_folder(folder: Path) -> None:

@@ -32,7 +32,7 @@ from vehest.run.printing import (
     summary_of_overview,
     summary_of_sweep,
 )
-from vehest.run.publishing import PROVENANCE
+from vehest.run.publishing import PROVENANCE, PUBLISHED_WEIGHTS
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
@@ -40,7 +40,6 @@ from vehest.run.train import new_estimator, read_fit_metrics, recording_file
 from vehest.run.versions import code_of
 from vehest.run.weights import (
     FORMAT,
-    PUBLISHED_WEIGHTS,
     PublishedWeights,
     WeightsTooLargeError,
 )

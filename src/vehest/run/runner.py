@@ -31,12 +31,11 @@ from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import parts_of, plan_ingest, write_ingest
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
-from vehest.run.publishing import publish_weights
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
 from vehest.run.train import DIVERGED, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.weights import PublishedWeights
+from vehest.run.weights import PublishedWeights, publish_weights
 from vehest.sources.base import car_of, kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.health import SLOW_KERNEL

@@ -35,6 +35,7 @@ from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import (
+    PUBLISHED_WEIGHTS,
     RESULTS,
     Publication,
     check_results_folder,
@@ -50,7 +51,7 @@ from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_
 from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
-from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights
+from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
 

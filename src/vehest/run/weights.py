@@ -8,7 +8,7 @@ Each model has its digest in the file, so that the file is consistent by itself:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -21,10 +21,11 @@ from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.text_files import first_line
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
 from vehest.run.artefacts import TIMINGS, Artefact
+from vehest.run.console import Messages
 from vehest.run.keys import hash_of
+from vehest.run.locks import Lock, held
 from vehest.run.train import FIT_METRICS, HISTORY
 
-PUBLISHED_WEIGHTS = "weights.safetensors"
 MODELS = "models"  # the only entry of the file's metadata
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
 FORMAT = 2  # in the key of a report that has weights: 2 has a digest for each model
@@ -158,3 +159,23 @@ def _record_of(model: Artefact) -> PublishedModel:
         name: (model.folder / name).read_bytes().decode() for name in FILES if name in model.outputs
     }
     return PublishedModel(model.label, model.code, model.digest, files)
+
+
+def publish_weights(
+    weights: PublishedWeights, models: Sequence[Artefact], output: Path, messages: Messages
+) -> bool:
+    """Add models of finished trainings to a study's published weights; returns whether there was room for them."""
+    study = weights.path.parent.name
+    with held(Lock(output, "publish", study), lambda: False):
+        try:
+            n_added = weights.add(models)
+        except WeightsTooLargeError as error:
+            messages.warn(
+                f"no more weights are published: {error}; '{weights.path}' stays as it is, "
+                "and may be removed to leave out former models"
+            )
+            return False
+    if n_added:
+        number = f"{n_added} model{'s' if n_added > 1 else ''}"
+        messages.line("done", "publish", study, f"{number} added to {weights.path}")
+    return True
