@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save, save_file
 
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
@@ -98,14 +98,15 @@ class PublishedWeights:
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
         records = self._models | {key: _record_of(model) for key, model in added.items()}
         about = {key: asdict(record) for key, record in sorted(records.items())}
+        content = save(tensors, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
+        megabytes = len(content) / 1e6
+        if megabytes > MAX_MEGABYTES:
+            raise WeightsTooLargeError(
+                f"{megabytes:.1f} MB of weights are more than the {MAX_MEGABYTES} MB of a study"
+            )
         remove_leftovers(self.path.parent)
         with written_aside(self.path) as aside:
-            save_file(tensors, aside, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
-            megabytes = aside.stat().st_size / 1e6
-            if megabytes > MAX_MEGABYTES:
-                raise WeightsTooLargeError(
-                    f"{megabytes:.1f} MB of weights are more than the {MAX_MEGABYTES} MB of a study"
-                )
+            aside.write_bytes(content)
         self._models = records
         return len(added)
 
