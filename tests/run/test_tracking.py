@@ -1,5 +1,6 @@
 """Runs in MLflow: in the local store, on a server of its own, and what happens when that server is away."""
 
+import json
 import os
 import signal
 import socket
@@ -10,11 +11,12 @@ import threading
 import urllib.request
 from contextlib import suppress
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import ClassVar
 
 import pytest
 
 from processes import start, wait_for
-from vehest.data.errors import MissingError
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.tracking import Tracker
 
@@ -92,9 +94,11 @@ def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, mon
 @pytest.mark.parametrize("step", ["log_batch", "log_artifact", "set_terminated"])
 def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
     from mlflow import MlflowClient
+    from mlflow.store.artifact.local_artifact_repo import LocalArtifactRepository
 
+    owner = LocalArtifactRepository if step == "log_artifact" else MlflowClient
     with monkeypatch.context() as killed:
-        killed.setattr(MlflowClient, step, _raising(KeyboardInterrupt()))
+        killed.setattr(owner, step, _raising(KeyboardInterrupt()))
         assert place(*TRAIN)[0] == 130
     assert ([run.info.status for run in _local(place, "train")], place(*TRAIN)[0]) == (
         ["RUNNING"],
@@ -105,12 +109,12 @@ def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
 
 
 def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypatch):
-    from mlflow import MlflowClient
+    from mlflow.store.artifact.local_artifact_repo import LocalArtifactRepository
 
     shared = f"tracking.uri=sqlite:///{place.folder / 'outputs' / 'mlflow.db'}"
     (place.folder / "outputs").mkdir()
     with monkeypatch.context() as killed:
-        killed.setattr(MlflowClient, "log_artifact", _raising(KeyboardInterrupt()))
+        killed.setattr(LocalArtifactRepository, "log_artifact", _raising(KeyboardInterrupt()))
         assert place(*TRAIN, shared, "output=there")[0] == 130
     assert place(*TRAIN, shared, "output=here")[0] == 0
     assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
@@ -284,12 +288,162 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     }
 
 
+def _small_artefact(folder):
+    """A training of two tables, to be logged."""
+    folder.mkdir()
+    (folder / MANIFEST).write_text("{}")
+    for file in ("fit.csv", "timings.csv"):
+        (folder / file).write_text("metric,value\n")
+    outputs = {"fit.csv": "0" * 64}
+    return Artefact(folder, "train", "model", "abc", "complete", outputs, {}, {})
+
+
 @pytest.mark.parametrize(
-    "address", ["/etc", "file:///etc/x", "{root}/../x", "file:{root}/../x", "dbfs:/x", "c:/x"]
+    "name",
+    ["a'b", 'a"b', "a\nb", "a\rb", "a%b", "a%(x)sb", "a#b", "aöü漢b", " a  b ", "a;b&c=d", "a:b@c"],
 )
-def test_a_server_may_not_choose_a_local_folder_outside_the_output_root(tmp_path, address):
-    tracker = Tracker({"name": "mlflow", "uri": "http://localhost:1"}, tmp_path, print)
-    with pytest.raises(MissingError, match="no folder of the output root and no server"):
-        tracker._require_place(address.format(root=tmp_path))
-    for allowed in (f"file://{tmp_path}/mlartifacts/0", "mlflow-artifacts:/0", "s3://runs/0"):
-        tracker._require_place(allowed)
+def test_an_output_root_of_any_name_has_its_store(tmp_path, name):
+    warnings = []
+    output = tmp_path / name / "outputs"
+    Tracker({"name": "mlflow"}, output, warnings.append).log(_small_artefact(tmp_path / "model"))
+    assert warnings == []
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("mlflow.db")] == [
+        f"{name}/outputs/mlflow.db"
+    ]
+    copies = {path for path in tmp_path.rglob("fit.csv") if path.parent.name != "model"}
+    assert [path.is_relative_to(output / "mlartifacts") for path in copies] == [True]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["model", name])
+
+
+@pytest.mark.parametrize("name", ["a?b", "a%20b", "a\udcffb"])
+def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(tmp_path, name):
+    warnings = []
+    output = tmp_path / name / "outputs"
+    Tracker({"name": "mlflow"}, output, warnings.append).log(_small_artefact(tmp_path / "model"))
+    [warning] = warnings
+    assert "MLflow opens no store at a path with '?'" in warning
+    assert "\n" not in warning
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["model", name])
+    assert not list(tmp_path.rglob("*.db*"))
+
+
+def test_the_output_root_of_the_environment_may_have_quotes_a_newline_and_a_hash(
+    place, monkeypatch
+):
+    output = place.folder / "a'b\"c\nd#e%f ü"
+    monkeypatch.setenv("VEHEST_OUTPUT", str(output))
+    _, err = place.done(*TRAIN)
+    assert "MLflow" not in err
+    assert (output / "mlflow.db").is_file()
+    assert list((output / "mlartifacts").rglob("model.safetensors"))
+
+
+class RestServer(BaseHTTPRequestHandler):
+    """The calls of MLflow's REST interface that log a run, with addresses of the test's choice."""
+
+    addresses: ClassVar[list[str]] = []  # of the run's artefacts, an answer each; the last stays
+    uploads: ClassVar[list[str]] = []
+
+    def do_GET(self):
+        if "experiments/get-by-name" in self.path:
+            self.answer({"experiment": {"experiment_id": "1", "name": "vehest"}})
+        elif "runs/get" in self.path:
+            self.answer({"run": self.run()})
+        else:
+            self.answer({}, 404)
+
+    def do_POST(self):
+        self.rfile.read(int(self.headers["Content-Length"]))
+        answers = {"runs/create": lambda: {"run": self.run()}, "runs/update": self.run}
+        answer = next((make for call, make in answers.items() if call in self.path), dict)
+        self.answer(answer())
+
+    def do_PUT(self):
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.uploads.append(self.path)
+        self.answer({})
+
+    def run(self):
+        address = self.addresses.pop(0) if len(self.addresses) > 1 else self.addresses[0]
+        info = {"run_id": "a" * 32, "experiment_id": "1", "status": "RUNNING", "start_time": 1}
+        return {"info": {**info, "artifact_uri": address}, "data": {}}
+
+    def answer(self, content, status=200):
+        body = json.dumps(content).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *arguments):
+        pass
+
+
+@pytest.fixture
+def rest_server(monkeypatch):
+    """Address of a server that names the addresses that a test puts into `RestServer.addresses`."""
+    monkeypatch.setattr(RestServer, "uploads", [])
+    with ThreadingHTTPServer(("127.0.0.1", 0), RestServer) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "{outside}",
+        "file://{outside}",
+        "FILE:{outside}",
+        " file:{outside}",
+        "{output}/../outside",
+        "{output}/train",
+        "file:{output}/mlartifacts",
+        "dbfs:/x",
+        "c:/x",
+        "",
+    ],
+)
+def test_a_server_may_not_choose_a_folder_of_this_machine(
+    tmp_path, rest_server, monkeypatch, address
+):
+    outside = tmp_path / "outside"
+    output = tmp_path / "outputs"
+    address = address.format(outside=outside, output=output)
+    monkeypatch.setattr(RestServer, "addresses", [address])
+    warnings = []
+    config = {"name": "mlflow", "uri": rest_server}
+    Tracker(config, output, warnings.append).log(_small_artefact(tmp_path / "model"))
+    [warning] = warnings
+    assert "for artefacts, which is no server; start it with --serve-artifacts" in warning
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "outputs"]
+    assert [path.name for path in output.iterdir()] == ["locks"]
+    assert RestServer.uploads == []
+
+
+def test_a_server_that_changes_its_answer_receives_the_artefacts_at_the_first_address(
+    tmp_path, rest_server, monkeypatch
+):
+    outside = tmp_path / "outside"
+    addresses = ["mlflow-artifacts:/1/run", str(outside)]
+    monkeypatch.setattr(RestServer, "addresses", addresses)
+    warnings = []
+    config = {"name": "mlflow", "uri": rest_server}
+    Tracker(config, tmp_path / "outputs", warnings.append).log(_small_artefact(tmp_path / "model"))
+    assert warnings == []
+    assert not outside.exists()
+    served = "/api/2.0/mlflow-artifacts/artifacts/1/run"
+    assert RestServer.uploads == [f"{served}/fit.csv", f"{served}/{MANIFEST}"]
+
+
+def test_a_store_of_this_machine_keeps_artefacts_where_its_owner_wants_them(tmp_path):
+    from mlflow import MlflowClient
+
+    uri = f"sqlite:///{tmp_path / 'mine.db'}"
+    MlflowClient(uri).create_experiment("vehest", (tmp_path / "runs").as_uri())
+    config = {"name": "mlflow", "uri": uri}
+    Tracker(config, tmp_path / "outputs", pytest.fail).log(_small_artefact(tmp_path / "model"))
+    assert [path.name for path in (tmp_path / "runs").rglob("*.csv")] == ["fit.csv"]

@@ -27,10 +27,12 @@ from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators import registry
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.export.program import exportable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
 from vehest.run.usable import all_usabilities, lacking_to_train, usability
+from vehest.studies.registry import study_names
 from vehest.training.context import FitContext
 
 RADIUS = 0.32
@@ -579,3 +581,83 @@ def test_an_estimator_of_another_package_that_cannot_be_loaded_is_listed_with_th
     row = usability("broken", config, [])
     assert row.usable == "no"
     assert "cannot be loaded (RuntimeError: no such GPU)" in row.to_give
+
+
+PLUGINS = {
+    "broken_import": ("raise RuntimeError('no such GPU')", "loaded (RuntimeError: no such GPU)"),
+    "broken_class": ("Plugin = 3", "loaded (TypeError: 3 is no class derived from Estimator)"),
+    "broken_constructor": (
+        "class Plugin(Zero):\n"
+        "    def __init__(self, *arguments, **options): raise RuntimeError('no licence')",
+        "made (RuntimeError: no licence)",
+    ),
+    "broken_property": (
+        "class Plugin(Zero):\n"
+        "    @property\n"
+        "    def channels(self): raise RuntimeError('no channels')",
+        "used (RuntimeError: no channels)",
+    ),
+}
+
+
+@pytest.fixture
+def plugins(tmp_path, monkeypatch):
+    """An installed package whose estimators and whose study fail in one way each."""
+    info = tmp_path / "plugins" / "broken-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
+    points = "\n".join(f"{name} = {name}:Plugin" for name in PLUGINS)
+    (info / "entry_points.txt").write_text(
+        f"[vehest.estimators]\n{points}\n[vehest.studies]\nbroken_study = broken_import\n"
+    )
+    for name, (code, _) in PLUGINS.items():
+        code = f"from vehest.estimators.zero import ESTIMATOR as Zero\n{code}\n"
+        (info.parent / f"{name}.py").write_text(code)
+    monkeypatch.syspath_prepend(str(info.parent))
+    caches = (registry.estimator_names, registry.estimator_class, study_names)
+    for function in caches:
+        function.cache_clear()
+    yield
+    for function in caches:
+        function.cache_clear()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_plugins_that_fail_are_named_and_the_others_are_listed():
+    table = rows(log(FULL))
+    for name, (_, failure) in PLUGINS.items():
+        assert table[name]["usable"] == "no"
+        assert f"'{name}' of another package cannot be {failure}" in table[name]["to_give"]
+    assert table["zero"]["usable"] == "yes"
+    loadable = {"zero", "ksnn", "broken_constructor", "broken_property"}
+    assert loadable <= set(registry.estimator_classes())
+    assert {"broken_import", "broken_class"}.isdisjoint(registry.estimator_classes())
+    assert "ksnn" in exportable()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_study_names_the_plugins_that_fail_and_finishes_the_others(place):
+    add_logged(place, FULL)
+    for name in PLUGINS:
+        place.change(f"conf/estimator/{name}.yaml", name=name)
+    add_study(place, ["estimator=zero"], *([f"estimator={name}"] for name in PLUGINS))
+    code, out, _ = place("run", "logged", "--json", "tracking=none")
+    assert code == 5
+    told = json.loads(out)
+    assert {row["estimator"] for row in told["leaderboard"]} == {"zero"}
+    assert {name.split("-")[0] for name in told["failed"]} == set(PLUGINS)
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
+    place.change(
+        "pipelines/odd.yaml",
+        study="odd",
+        report="broken_study",
+        split="mine",
+        sweeps=[["estimator=zero"]],
+    )
+    said = "study module 'broken_study' of another package cannot be loaded (RuntimeError: no such"
+    for command in ("run", "report"):
+        place.refused(command, "odd", "tracking=none", code=2, says=said)
+    place.done("data", "list")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import entry_points
 
@@ -42,14 +43,35 @@ def estimator_class(name: str) -> type[Estimator]:
     points = entry_points(group=ENTRY_POINTS, name=name)
     if points:
         try:
-            loaded: type[Estimator] = next(iter(points)).load()
+            loaded = next(iter(points)).load()
+            if not (isinstance(loaded, type) and issubclass(loaded, Estimator)):
+                raise TypeError(f"{loaded!r} is no class derived from Estimator")
         except Exception as error:  # a package may raise anything when it is imported
-            what = f"{type(error).__name__}: {printable(first_line(error))}"
-            raise ConfigurationError(
-                f"estimator '{name}' of another package cannot be loaded ({what}); repair or remove it"
-            ) from error
+            raise plugin_failure(name, "loaded", error) from error
         return loaded
     raise ConfigurationError(f"estimator '{name}' is not one of: {', '.join(estimator_names())}")
+
+
+def estimator_classes() -> dict[str, type[Estimator]]:
+    """Name -> class of all estimators but those of other packages that cannot be loaded."""
+    classes = {}
+    for name in estimator_names():
+        with suppress(ConfigurationError):
+            classes[name] = estimator_class(name)
+    return classes
+
+
+def is_plugin(name: str) -> bool:
+    """Whether an estimator comes from another package, which may raise anything."""
+    return _own_class(name) is None
+
+
+def plugin_failure(name: str, failed: str, error: Exception) -> ConfigurationError:
+    """The error to raise where an estimator of another package cannot be ``failed``, as "loaded"."""
+    reason = f"{type(error).__name__}: {printable(first_line(error))}"
+    return ConfigurationError(
+        f"estimator '{name}' of another package cannot be {failed} ({reason}); repair or remove it"
+    )
 
 
 def _own_class(name: str) -> type[Estimator] | None:

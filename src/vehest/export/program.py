@@ -19,7 +19,7 @@ from vehest.data import derived
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
-from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.estimators.registry import estimator_classes
 from vehest.export.rendering import (
     Precision,
     ascii_only,
@@ -91,7 +91,7 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
 
 def exportable() -> tuple[str, ...]:
     """Names of families that have C."""
-    return tuple(name for name in estimator_names() if estimator_class(name).template)
+    return tuple(name for name, family in estimator_classes().items() if family.template)
 
 
 def channels_of(estimator: Estimator) -> list[tuple[str, str]]:

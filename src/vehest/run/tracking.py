@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from vehest.data.errors import MissingError, printable
 from vehest.data.files import regular_file, remove_leftovers, written_aside
@@ -31,6 +30,7 @@ STORE = "mlflow.db"
 REMOTE_ARTIFACTS = frozenset(
     ["mlflow-artifacts", "http", "https", "s3", "gs", "wasbs", "abfss", "ftp", "sftp", "hdfs"]
 )  # schemes of addresses at which MLflow writes to another machine
+LOCAL_STORES = frozenset(["sqlite", "file", ""])  # schemes of stores that no server answers for
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
 KEY_TAG = "vehest.key"
@@ -77,7 +77,7 @@ class Tracker:
         except Exception as error:  # results matter more than any failure of a tracking server
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
             self.warn(
-                f"logging to MLflow at {self._address} failed ({why}); going on without tracking, the next run makes up for it"
+                f"logging to MLflow at {printable(self._address)} failed ({why}); going on without tracking, the next run makes up for it"
             )
 
     def _log(self, artefact: Artefact) -> None:
@@ -113,28 +113,27 @@ class Tracker:
         for start in range(0, max(len(points), len(parameters)), VALUES_A_REQUEST):
             batch = slice(start, start + VALUES_A_REQUEST)
             client.log_batch(run_id, points[batch], parameters[batch])
-        self._require_place(str(run.info.artifact_uri))
+        repository = self._artifact_repository(str(run.info.artifact_uri))
         for file in [*artefact.outputs, MANIFEST]:
             if not file.endswith(".parquet"):
-                client.log_artifact(run_id, str(artefact.folder / file), os.path.dirname(file))
+                repository.log_artifact(str(artefact.folder / file), os.path.dirname(file) or None)
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else "KILLED")
 
-    def _require_place(self, address: str) -> None:
-        """Refuse artefacts at an address that is a folder of this machine outside the output root.
+    def _artifact_repository(self, address: str) -> Any:
+        """Return MLflow's repository at the address of a run's artefacts, which its store names.
 
-        A server says where the artefacts of a run go. MLflow writes to a ``file:`` address, or to
-        one without a scheme, on this machine; no server may choose what is overwritten here.
+        No server may choose a folder of this machine. `MlflowClient.log_artifact` would ask the
+        server for the address again and may be answered differently.
         """
-        parts = urlsplit(address)
-        if parts.scheme in REMOTE_ARTIFACTS:
-            return
-        folder = Path(url2pathname(parts.path) if parts.scheme else address)
-        if parts.scheme in ("", "file") and folder.resolve().is_relative_to(self._root):
-            return
-        raise MissingError(
-            f"it names '{printable(address[:80])}' for artefacts, no folder of the output root and "
-            "no server; start it with --serve-artifacts"
-        )
+        by_server = urlsplit(self._address).scheme not in LOCAL_STORES
+        if by_server and urlsplit(address).scheme not in REMOTE_ARTIFACTS:
+            raise MissingError(
+                f"it names '{printable(address[:80])}' for artefacts, which is no server; start it "
+                "with --serve-artifacts and without --default-artifact-root"
+            )
+        from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+        return get_artifact_repository(address, tracking_uri=self._address)
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
         wanted = " and ".join(
@@ -169,6 +168,7 @@ class Tracker:
         )  # its errors are raised too
         if self.store:
             store = self.output / STORE
+            _require_sqlite_path(store.resolve())
             remove_leftovers(self.output)
             if not store.exists():
                 with written_aside(
@@ -196,6 +196,22 @@ class Tracker:
     @property
     def _address(self) -> str:
         return str(self.config.get("uri") or f"sqlite:///{(self.output / STORE).resolve()}")
+
+
+def _require_sqlite_path(store: Path) -> None:
+    """Refuse a path that MLflow would read as another one or that it cannot take.
+
+    SQLAlchemy takes what follows ``?`` for options and ``%20`` for a blank. Quoted it reads the
+    path, but MLflow creates the folder of the quoted path, too.
+    """
+    from sqlalchemy import make_url
+
+    is_text = all(not "\ud800" <= letter <= "\udfff" for letter in str(store))
+    if not is_text or make_url(f"sqlite:///{store}").database != str(store):
+        raise MissingError(
+            "MLflow opens no store at a path with '?', '%' before two hexadecimal digits or bytes "
+            "that are not UTF-8; give another output=FOLDER, or tracking=none"
+        )
 
 
 def _flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

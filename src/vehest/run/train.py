@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
-from vehest.estimators.registry import estimator_class
+from vehest.estimators.registry import estimator_class, is_plugin, plugin_failure
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
 from vehest.run.keys import changed_options
 from vehest.run.versions import code_of
@@ -63,7 +63,15 @@ class TrainJob:
 
 def new_estimator(config: Mapping[str, Any]) -> Estimator:
     """An estimator before its fit; raises `ConfigurationError` for an unknown name or setting."""
-    return estimator_class(str(config["name"])).from_config(config)
+    name = str(config["name"])
+    try:
+        return estimator_class(name).from_config(config)
+    except VehestError:
+        raise
+    except Exception as error:
+        if is_plugin(name):
+            raise plugin_failure(name, "made", error) from error
+        raise
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:

@@ -8,12 +8,17 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vehest.data.derivable_channels import Derivation, derivation_of, made_by
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, VehestError
 from vehest.data.recording_summary import RecordingSummary, common_channels
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
-from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.estimators.registry import (
+    estimator_class,
+    estimator_names,
+    is_plugin,
+    plugin_failure,
+)
 from vehest.run.car_record import with_car_values
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
@@ -118,7 +123,26 @@ def usability(
     to_estimate: Sequence[RecordingSummary] | None = None,
 ) -> Usability:
     """Whether the estimator of a configuration can be trained on recordings and used on them."""
+    family = str(config["estimator"]["name"])
     to_estimate = recordings if to_estimate is None else to_estimate
+    try:
+        return _usability(name, config, recordings, to_estimate)
+    except VehestError:
+        raise
+    except Exception as error:
+        if not is_plugin(family):
+            raise
+        reason = str(plugin_failure(family, "used", error))
+        return Usability(name, None, None, Missing([], [], {}), to_give=reason)
+
+
+def _usability(
+    name: str,
+    config: Config,
+    recordings: Sequence[RecordingSummary],
+    to_estimate: Sequence[RecordingSummary],
+) -> Usability:
+    """As `usability`, where nothing but vehest's errors is expected."""
     both = [*recordings, *to_estimate]
     own = str(config["estimator"]["name"])
     try:

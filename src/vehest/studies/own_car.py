@@ -17,7 +17,7 @@ from vehest.constants import FloatArray
 from vehest.data.files import file_name
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
-from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.estimators.registry import estimator_classes
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.metrics import is_fast_enough, pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
@@ -305,10 +305,10 @@ def not_compared(part: PartArtefacts) -> list[str]:
     if not files:
         return lines
     channels = set(read_recording(files[0]).channels)
-    for name in estimator_names():
+    for name, family in estimator_classes().items():
         if name in there:
             continue
-        reads = getattr(estimator_class(name), "channels", None)
+        reads = getattr(family, "channels", None)
         lacking = (
             [channel for channel in reads if channel not in channels]
             if isinstance(reads, tuple)

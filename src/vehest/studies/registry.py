@@ -19,7 +19,8 @@ from functools import cache
 from importlib.metadata import entry_points
 from types import ModuleType
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, printable
+from vehest.data.text_files import first_line
 
 ENTRY_POINTS = "vehest.studies"
 OWN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer")
@@ -32,7 +33,7 @@ def study_names() -> list[str]:
 
 
 def study_module(name: str) -> ModuleType:
-    """The module behind a name; raises `ConfigurationError` where the name is unknown."""
+    """The module behind a name; raises `ConfigurationError` where none is or it cannot be loaded."""
     if name in OWN:
         return importlib.import_module(f"{ENTRY_POINTS}.{name}")
     point = next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)
@@ -40,4 +41,11 @@ def study_module(name: str) -> ModuleType:
         raise ConfigurationError(
             f"there is no study module '{name}'; there are: {', '.join(study_names())}"
         )
-    return importlib.import_module(point.module)
+    try:
+        return importlib.import_module(point.module)
+    except Exception as error:  # a package may raise anything when it is imported
+        reason = f"{type(error).__name__}: {printable(first_line(error))}"
+        raise ConfigurationError(
+            f"study module '{name}' of another package cannot be loaded ({reason}); repair or "
+            "remove it"
+        ) from error

@@ -20,7 +20,12 @@ from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording_summary import RecordingSummary
 from vehest.estimators.base import Trial
-from vehest.estimators.registry import ENTRY_POINTS, estimator_class, estimator_names
+from vehest.estimators.registry import (
+    ENTRY_POINTS,
+    estimator_class,
+    estimator_classes,
+    estimator_names,
+)
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
@@ -343,8 +348,8 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
             *own,
             *(
                 (trial, name)
-                for name in estimator_names()
-                for trial in estimator_class(name).trials
+                for name, family in estimator_classes().items()
+                for trial in family.trials
             ),
         ]
     )
@@ -375,8 +380,11 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
             plan.estimators.extend(tried)
     known = {name for names in sweeps.values() for name in names}
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
+    by_default = "none of the families tried by default; --with adds it"
+    plan.lacking.update(dict.fromkeys(others, by_default))
+    broken = set(estimator_names()) - set(estimator_classes())
     plan.lacking.update(
-        dict.fromkeys(others, "none of the families tried by default; --with adds it")
+        dict.fromkeys(broken, "it cannot be loaded; 'vehest data usable' names the reason")
     )
     return plan if plan.sweeps else Plan()
 

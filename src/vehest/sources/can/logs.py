@@ -26,7 +26,7 @@ class Frames:
     def __iter__(self) -> Iterator[Any]:
         from can import Message
 
-        data = memoryview(self.arrays["data"])
+        data = self.arrays["data"].data
         at = 0
         names = ("time", "identifier", "extended", "fd", "fast", "length", "bus")
         for begin in range(0, len(self.arrays["time"]), FRAMES_AT_A_TIME):
