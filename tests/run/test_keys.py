@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import pytest
 
 from place import PIPELINE, Place, undrawn
+from vehest.data.recording_summary import RecordingSummary
 from vehest.estimators.gru import Gru
+from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import training_options
 
@@ -52,7 +54,7 @@ def test_new_option_removed_default_and_edited_title_retrain_nothing(published, 
     published.change("conf/dataset/mine.yaml", title="Another title of the car")
     published.change("pipelines/small.yaml", title="Another title", about="Other words")
     file = published.folder / "conf" / "estimator" / "gru.yaml"
-    file.write_text("# a comment\nname: gru\nrate_hz: 20\nn_states: 5\n", encoding="utf-8")
+    file.write_text("# a comment\nname: gru\nn_states: 5\n", encoding="utf-8")
     weights = published.folder / "results" / "small" / "weights.safetensors"
     before = weights.read_bytes()
     assert published("report", "--check") == (0, "small: up to date\n", "")
@@ -93,3 +95,22 @@ def test_option_that_differs_from_its_default_is_in_the_key():
     )
     assert nested["estimator"] == {"name": "learned_ukf", "car": {"mass": 6.0}}
     assert nested["training"] == {"through": {"max_epochs": 50}}
+
+
+def test_sideslip_is_scored_by_the_wheelbase_of_today(published):
+    published.change("conf/dataset/mine.yaml", car={"wheelbase": 0.33})
+    code, said, _ = published("report", "--check")
+    assert code == 3
+    assert "evaluate zero, evaluate gru" in said
+    assert "train" not in said
+
+
+def test_rate_that_is_left_out_is_lowered_to_that_of_the_recordings_too():
+    config = compose_config("eval", ["estimator=gru", "split=sim_bmw"])
+    slow = RecordingSummary("slow", 10.0, frozenset())
+    for group in ("estimator", "evaluation"):
+        short = {**config, group: {**config[group]}}
+        del short[group]["rate_hz"]
+        lowered, notes = lower_rate(short, group, slow)
+        assert lowered[group]["rate_hz"] == 10.0
+        assert "10 Hz instead of" in notes[0][1]

@@ -17,14 +17,14 @@ from vehest.run.artefacts import Artefact
 from vehest.run.car_record import with_car_values
 from vehest.run.config import GIVEN, Config
 from vehest.run.estimate import find_model, model_artefact
-from vehest.run.evaluate import Evaluation
+from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
 from vehest.run.group import Group, Member
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
-from vehest.run.train import TrainJob, new_estimator, plan_train
+from vehest.run.train import TrainJob, estimator_rate, new_estimator, plan_train
 from vehest.run.usable import lack
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
@@ -100,9 +100,7 @@ class Comparison:
             checked = self.usable
             for job in checked:
                 try:
-                    data = runner.data_for(
-                        split, new_estimator(job.config["estimator"]).settings.rate_hz, job.config
-                    )
+                    data = runner.data_for(split, estimator_rate(job.config), job.config)
                     training = plan_training(job.config, split, data)
                     check_channels(faults_of(job.config), split, data)
                     _check_name(job, training, names)
@@ -207,10 +205,15 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
     """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
-    rate = config.get(group, {}).get("rate_hz")
+    if group not in config:
+        return config, []
+    if group == "estimator":
+        rate = estimator_rate(config)
+    else:
+        rate = protocol_from_config(config[group]).rate_hz
     key = f"{group}.rate_hz"
     lowest = limit.rate_hz
-    if not isinstance(rate, int | float) or not rate > lowest * (1.0 + TOLERANCE):
+    if not rate > lowest * (1.0 + TOLERANCE):
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):
@@ -316,8 +319,8 @@ def _names(jobs: Iterable[Job]) -> list[str]:
 def resampling_fact(configs: Sequence[Config]) -> str:
     """How recordings came to the rates that estimators work at."""
     rates = sorted(
-        {float(config["estimator"]["rate_hz"]) for config in configs}
-        | {float(configs[0]["evaluation"]["rate_hz"])}
+        {estimator_rate(config) for config in configs}
+        | {protocol_from_config(configs[0]["evaluation"]).rate_hz}
     )
     options = configs[0]["downsample"]
     how = {

@@ -21,7 +21,7 @@ from vehest.data.transforms import Preparation
 from vehest.run.config import Config
 from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
-from vehest.run.evaluate import evaluation_options, protocol_from_config
+from vehest.run.evaluate import evaluation_options
 from vehest.run.evaluate_faults import all_of, faults_of
 from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.keys import changed_options, hash_of
@@ -29,7 +29,7 @@ from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
-from vehest.run.train import training_options
+from vehest.run.train import estimator_rate, training_options
 from vehest.run.versions import code_of
 
 Keys = dict[str, dict[str, str]]
@@ -62,7 +62,9 @@ def keys_of_study(
             keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
     for part in (name for name in study.parts if name not in absent):
         configs = [job.config for job in jobs[part]]
-        keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
+        keys |= {
+            f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs, runner)
+        }
     return keys | {"report": {CODE: code_of("report", study.report)}}
 
 
@@ -86,15 +88,12 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
     }
 
 
-def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
+def _of_jobs(configs: Sequence[Config], runner: Runner) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
     faults = all_of(map(faults_of, configs))
-    protocol = protocol_from_config(first["evaluation"])
-    rates = sorted(
-        {float(config["estimator"]["rate_hz"]) for config in configs}
-        | {float(first["evaluation"]["rate_hz"])}
-    )
+    protocol = runner.protocol(first, dataset_names(first["split"]))
+    rates = sorted({*map(estimator_rate, configs), protocol.rate_hz})
     preparation = changed_options(
         validated(Preparation, first["downsample"], "", error=ConfigurationError)
     )

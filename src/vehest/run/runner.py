@@ -20,6 +20,7 @@ from vehest.data.splits import Split
 from vehest.data.store import read_recording
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.registry import estimator_class
+from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
@@ -160,21 +161,27 @@ class Runner:
             for name in split.datasets
         }
 
+    def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
+        """How estimates are scored, with the lowest speed of sideslip on each data set, by its car."""
+        cars = {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+        return protocol_from_config(config["evaluation"]).with_wheelbases(
+            {name: car.wheelbase for name, car in cars.items()}
+        )
+
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
         """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
         split = self.split(config)
-        datasets = {name: self.dataset_config(name, config)["dataset"] for name in split.datasets}
-        protocol = protocol_from_config(config["evaluation"]).with_wheelbases(
-            {name: car_of(dataset).wheelbase for name, dataset in datasets.items()}
-        )
+        protocol = self.protocol(config, split.datasets)
         references = self.data_for(
             split,
             protocol.rate_hz,
             {**config, "downsample": {**config["downsample"], "transforms": []}},
         )
-        kinds = {name: kind_of(dataset) for name, dataset in datasets.items()}
+        kinds = {
+            name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets
+        }
         return Evaluation(split, data, references, kinds, protocol, self.output, faults)
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:

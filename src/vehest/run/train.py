@@ -74,6 +74,11 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
         raise
 
 
+def estimator_rate(config: Mapping[str, Any]) -> float:
+    """The rate that the estimator of a configuration works at [Hz]; raises `ConfigurationError` for a wrong setting."""
+    return new_estimator(config["estimator"]).settings.rate_hz
+
+
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
     """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
     estimator = new_estimator(config["estimator"])
@@ -95,7 +100,12 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         ),  # otherwise part of the inputs
     }
     stated = {key: value for key, value in config["training"].items() if key not in UNKEYED}
-    content = {"estimator": dict(config["estimator"]), "training": stated, "seed": seed, **ranges}
+    content = {
+        "estimator": {**config["estimator"], "rate_hz": estimator.settings.rate_hz},
+        "training": stated,
+        "seed": seed,
+        **ranges,
+    }
     inputs = {
         f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
         for span in (*split.train, *split.validation)
