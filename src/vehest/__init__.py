@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from vehest.version import __version__
+
+TYPE_CHECKING = False  # as `typing` names it, which takes half of the start of a process
+if TYPE_CHECKING:
+    from typing import Any
 
 _API = (
     "Estimate",

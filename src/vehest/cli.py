@@ -1041,14 +1041,17 @@ def data_align(
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
-    from vehest.run.signals import DryRunStop, Stopped
+    from vehest.run.signals import DryRunStop, Stopped, StopSignals
 
     gc.set_threshold(
         10_000
     )  # new objects, after which cycles are looked for; at 700, libraries and compilers spend 8 % of a run on it
     open_streams()
+    stop = StopSignals()
     try:
-        code = app(prog_name="vehest", standalone_mode=False)
+        with stop.installed():
+            code = app(prog_name="vehest", standalone_mode=False)
+            stop.raise_if_requested()
     except _USAGE_ERROR as error:
         _fail_usage(error)
     except DryRunStop:
@@ -1061,7 +1064,7 @@ def main() -> None:
             f"stopped by {stopped}; finished artefacts are kept, the same command goes on",
             stopped.exit_code,
         )
-    except (KeyboardInterrupt, typer.Abort):
+    except typer.Abort:
         _fail("stopped", 130)
     except Exception as error:
         from vehest.run.failures import failure_of

@@ -1,8 +1,8 @@
 """Press Ctrl-C at random moments of a study's first seconds, while its workers start, and see that every run ends: `make interrupts`.
 
-The signal goes to the whole process group, as that of a terminal does. All runs share an output root, so that each goes on from what
-the one before has finished; once a run ends before its signal, its trainings and what follows are removed. The last run is not
-interrupted.
+The signal goes to the whole process group, as that of a terminal does, and in every other run a second time while the run ends. All runs
+share an output root, so that each goes on from what the one before has finished; once a run ends before its signal, its trainings and what
+follows are removed. The last run is not interrupted, and its artefacts must have the digests of a run in an output root of its own.
 """
 
 import argparse
@@ -15,24 +15,26 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
-from kills import STUDY, broken, locks_held, strays
+from kills import STUDY, broken, content, locks_held, strays
 from processes import end_all, start
 
 SECONDS = 5.0  # after the start of a run, up to which it is interrupted
 HANGS = 120.0  # s after its signal from which a run counts as hanging
-LAST_LINES = (
-    "error: stopped by SIGINT; finished artefacts are kept, the same command goes on",
-    "error: stopped",
-)
+MAX_SECOND_DELAY = 0.5  # s between two signals
+LAST_LINE = "error: stopped by SIGINT; finished artefacts are kept, the same command goes on"
 INTERRUPTED = 130
-DEFAULT_ACTION = -signal.SIGINT  # before Python runs the first line of vehest
+UNTIL_VEHEST = 0.3  # s within which Python may not yet run the first line of vehest
 REMADE = ("train", "calibrate", "evaluate", "report", "checkpoints", "finished")
 
 
-def interrupted(output, delay):
-    """Interrupt a run after ``delay`` seconds: its exit code, and what was wrong; the code is None where it hung."""
+def interrupted(output, delay, second_delay=None):
+    """Interrupt a run after ``delay`` seconds, and again after ``second_delay``: its exit code, and what was wrong.
+
+    The code is None where it hung.
+    """
     log = output.with_suffix(".log")
     with open(log, "wb") as stream:
         process = start(
@@ -47,20 +49,30 @@ def interrupted(output, delay):
         os.killpg(process.pid, signal.SIGINT)
     begun = time.monotonic()
     try:
+        if second_delay is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(second_delay)
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
         code = process.wait(HANGS)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         return None, [f"hangs, see '{log}'"]
     faults = strays(process.pid) + locks_held(output) + broken(output)
     said = log.read_text(encoding="utf-8").splitlines()
-    if code == INTERRUPTED and said[-1] not in LAST_LINES:
-        faults.append(f"it says '{said[-1]}'")
-    if code == INTERRUPTED and any(line.startswith("Traceback") for line in said):
-        faults.append("it prints a traceback")
-    if code not in (0, INTERRUPTED, DEFAULT_ACTION):
+    has_begun = delay > UNTIL_VEHEST or any("vehest" in line for line in said)
+    if has_begun and code not in (0, INTERRUPTED):
         faults.append(f"exit code {code}: {said[-1:]}")
-    print(f"{delay:.3f} s: exit code {code} after {time.monotonic() - begun:.2f} s", flush=True)
-    return code, faults
+    if has_begun and any(line.startswith(("Traceback", "Exception ignored")) for line in said):
+        faults.append("it prints a traceback")
+    errors = [line for line in said if line.startswith("error: ")]
+    if errors not in ([], [LAST_LINE]):
+        faults.append(f"it says {errors}")
+    again = "" if second_delay is None else f" and {second_delay:.3f} s"
+    moment = f"{delay:.3f} s{again}"
+    seconds = time.monotonic() - begun
+    print(f"{moment}: exit code {code} after {seconds:.2f} s, says {said[-1:]}", flush=True)
+    return code, [f"{moment}: {fault}" for fault in faults]
 
 
 def main():
@@ -89,7 +101,8 @@ def main():
         output.mkdir(exist_ok=True)
         try:
             while codes.total() < asked.interrupts:
-                code, wrong = interrupted(output, draw.uniform(0.0, asked.seconds))
+                second = draw.uniform(0.0, MAX_SECOND_DELAY) if codes.total() % 2 else None
+                code, wrong = interrupted(output, draw.uniform(0.0, asked.seconds), second)
                 faults += wrong
                 if code == 0:
                     for folder in REMADE:
@@ -98,6 +111,12 @@ def main():
                     codes[code] += 1
             last, wrong = interrupted(output, 1800.0)
             faults += wrong + ([] if last == 0 else [f"the last run left with {last}"])
+            digests = content(output)
+            reference = Path(scratch) / "reference"
+            interrupted(reference, 1800.0)
+            equal = digests == content(reference)
+            faults += [] if equal else ["the last run has other digests than one by itself"]
+            print(f"last run: exit code {last}, {len(digests)} digests, equal: {equal}")
         finally:
             end_all()
     print(f"{codes.total()} interrupts, exit codes {dict(codes)}; {len(faults)} faults")

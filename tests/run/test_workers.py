@@ -35,6 +35,19 @@ if __name__ == "__main__":
         sys.exit(stopped.exit_code)
 """
 
+SLOW_IMPORTS = """
+import signal, time
+
+if __name__ == "__mp_main__":
+    print("imports", flush=True)
+    try:
+        signal.pause()
+    except KeyboardInterrupt:
+        time.sleep(1.0)
+        raise
+"""
+ENDS = 60.0  # s within which an interrupted run has to end
+
 
 def killed(should_stop, on_progress, others_run):
     """Kill this process once another task runs."""
@@ -126,6 +139,22 @@ def test_ctrl_c_while_workers_start_ends_them_all(tmp_path):
             assert process.returncode == 130
             assert log.read_text() == "installed\n", "no worker prints a traceback"
             wait_for(lambda workers=workers: not any(map(is_alive, workers)))
+    finally:
+        end_all()
+
+
+def test_ctrl_c_while_workers_import_ends_them_all(tmp_path):
+    """Workers that Ctrl-C reached and that took a moment to end left tasks behind that nobody ended."""
+    script = tmp_path / "driver.py"
+    script.write_text(SLOW_IMPORTS + DRIVER, encoding="utf-8")
+    log = tmp_path / "log"
+    try:
+        with open(log, "wb") as stream:
+            process = start([sys.executable, script], stdout=stream, stderr=subprocess.STDOUT)
+        wait_for(lambda: log.read_text().count("imports\n") == 2, process, log.read_text)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(ENDS) == 130
+        assert log.read_text() == "installed\nimports\nimports\n", "no worker prints a traceback"
     finally:
         end_all()
 

@@ -40,13 +40,19 @@ class StopSignals:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Listen, and restore the former handlers afterwards."""
+        """Listen, and restore the former handlers afterwards.
+
+        Raises `Stopped` in place of an exception after a signal: compiled modules turn one into another, and what a signal ends may fail.
+        """
         former = {
             number: signal.signal(number, self._handle)
             for number in (signal.SIGINT, signal.SIGTERM)
         }
         try:
             yield
+        except Exception:
+            self.raise_if_requested()
+            raise
         finally:
             for number, handler in former.items():
                 signal.signal(number, handler)

@@ -132,8 +132,9 @@ def _launch_in_processes(
                         del workers[worker.connection]
                     yield message
         finally:
-            for worker in workers.values():
-                worker.kill()
+            with blocked_signals():  # a worker that outlives this would be waited for at exit
+                for worker in workers.values():
+                    worker.kill()
 
 
 class _Worker:
