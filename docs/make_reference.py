@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from make_configuration import field_comments
+
+from vehest.run.setting_lines import field_comments
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"

@@ -813,12 +813,14 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.run.config import GIVEN, as_yaml
+    from vehest.run.config import GIVEN
+    from vehest.run.setting_lines import config_as_commented_yaml
 
     config = {
         key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN
     }
-    echo(as_json_text(config) if as_json else as_yaml(config).rstrip(), keep="\n")
+    text = as_json_text(config) if as_json else config_as_commented_yaml(config).rstrip()
+    echo(text, keep="\n")
 
 
 @app.command(rich_help_panel=STAGES)

@@ -12,7 +12,8 @@ from refusals import refusal
 from place import run_vehest
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.config import compose_config, expand
-from vehest.run.config_files import GROUPS, choices
+from vehest.run.config_files import GROUPS, choices, packaged
+from vehest.run.setting_lines import config_as_commented_yaml
 from vehest.run.study import jobs_of, read_study
 
 
@@ -212,3 +213,25 @@ def test_references_of_an_override_are_bounded_too(elsewhere):
     words = [f"++k{n}={value}" for n, value in enumerate(repeated(40, "${{k{}}}").values())]
     with pytest.raises(ConfigurationError, match="stand for more than 20000 values"):
         compose_config("ingest", ["dataset=ferrari_250lm", *words])
+
+
+@pytest.mark.parametrize("estimator", choices("estimator"))
+def test_config_prints_what_it_composes_with_comments(elsewhere, estimator):
+    config = compose_config("train", [f"estimator={estimator}", "seed=3"])
+    assert yaml.safe_load(config_as_commented_yaml(config)) == config
+
+
+def test_config_prints_settings_with_the_comments_of_their_files(elsewhere, capsys):
+    words = ["config", "train", "estimator=gru", "estimator.n_states=3", "training.patience=7"]
+    code, out, _ = run_vehest(capsys, *words)
+    assert code == 0
+    printed = set(out.splitlines())
+    estimator = (packaged("conf") / "estimator" / "gru.yaml").read_text(encoding="utf-8")
+    training = (packaged("conf") / "training" / "supervised.yaml").read_text(encoding="utf-8")
+    settings = estimator[estimator.index("rate_hz") :].splitlines()
+    settings += training[training.index("learning_rate") :].splitlines()
+    for line in settings:
+        key_and_value, _, comment = line.partition(" # ")
+        key, _, value = key_and_value.strip().partition(": ")
+        value = {"n_states": "3", "patience": "7"}.get(key, value.strip())
+        assert f"{f'  {key}: {value}':<44} # {comment}" in printed

@@ -38,6 +38,7 @@ if __name__ == "__main__":
 SLOW_IMPORTS = """
 import signal, time
 
+signal.signal(signal.SIGINT, signal.default_int_handler)
 if __name__ == "__mp_main__":
     print("imports", flush=True)
     try:

@@ -204,7 +204,9 @@ class DugoffUkf(SigmaPointEstimator):
     )
     noise: TrackLevels = setting(TrackLevels(), "levels of noise")
     tyres: AxleTyres = setting(AxleTyres(), "of both axles")
-    car: LoadedCar = setting(BMW_545I, "parameters of the car")
+    car: LoadedCar = setting(
+        BMW_545I, "BMW 545i of Bertipaglia et al. 2024; replace by your car's parameters"
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)

@@ -37,12 +37,12 @@ class ThroughFilterSettings(Group):
     version: ClassVar[str] = "1"
     one_step: PhaseSettings = setting(
         PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine"),
-        "the model as a one-step predictor",
+        "the model as a one-step predictor; paper: constant step size 5e-4, 1000 epochs",
     )
     one_step_batch: int = setting(2048, "pairs of samples in a batch", least=1)
     through: PhaseSettings = setting(
         PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine"),
-        "model and noise together, through the filter; for models that learn so",
+        "model and noise together, through the filter, for models that learn so; paper: constant step size 5e-4, 1000 epochs of one batch each",
     )
     noise: PhaseSettings = setting(
         PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine"),
@@ -50,9 +50,11 @@ class ThroughFilterSettings(Group):
     )
     steps: int = setting(500, "samples T of a training sequence", least=1)
     drop_steps: int = setting(0, "first samples of a sequence that do not count", least=0)
-    batch_size: int = setting(6, "sequences in a batch", least=1)
+    batch_size: int = setting(
+        6, "sequences in a batch; paper: 256, which is all of them at once", least=1
+    )
     placing: Literal["fixed", "random"] = setting(
-        "random", "fixed: the same sequences every epoch; random: starts are drawn"
+        "random", "fixed: the same sequences every epoch, as in the paper; random: starts are drawn"
     )
     curriculum: tuple[int, ...] = setting(
         (), "lengths of shorter sequences to begin with, each for curriculum_epochs"
@@ -65,19 +67,19 @@ class ThroughFilterSettings(Group):
     validation_drop_steps: int = setting(200, "first samples of it that do not count", least=0)
     start_spread: float = setting(
         0.2,
-        "by how much the last state (friction) is off at the start of a training sequence, at most, up or down",
+        "by how much the last state (friction) is off at the start of a training sequence, at most, up or down; paper: 0",
         least=0.0,
     )
     mirrored: float = setting(
         0.5,
-        "share of sequences and pairs that are seen in a mirror, left for right",
+        "share of sequences and pairs that are seen in a mirror, left for right; paper: 0",
         least=0.0,
         most=1.0,
     )
     likelihood: float = setting(
         0.0,
         "weight of the mean negative log-likelihood of the errors of those states that epochs are judged by, under the filter's own "
-        "covariance [nat], in the loss: it teaches a filter how sure to be; 0 leaves it out",
+        "covariance [nat], in the loss: it teaches a filter how sure to be; 0 leaves it out, as in the paper",
         least=0.0,
     )
     start_noise: Literal["residuals", "given"] = setting(

@@ -65,7 +65,9 @@ class SideslipFilter(GatedFilter, Recursive):
     skippable = ("yaw_rate", "ay")
     refuses = ("NaN", "infinite")
     covariance_of = ("vy", "yaw_rate")
-    car: SingleTrackParameters = setting(FERRARI_250LM, "parameters of the car")
+    car: SingleTrackParameters = setting(
+        FERRARI_250LM, "Ferrari 250 LM, from the authors' code; replace by your car's parameters"
+    )
     minimum_speed: float = setting(
         3.0, "speed below which the model is held at this speed", unit="m/s", positive=True
     )
