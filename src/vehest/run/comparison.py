@@ -207,10 +207,11 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
     """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
     if group not in config:
         return config, []
-    if group == "estimator":
-        rate = estimator_rate(config)
-    else:
-        rate = protocol_from_config(config[group]).rate_hz
+    rate = (
+        estimator_rate(config)
+        if group == "estimator"
+        else protocol_from_config(config[group]).rate_hz
+    )
     key = f"{group}.rate_hz"
     lowest = limit.rate_hz
     if not rate > lowest * (1.0 + TOLERANCE):
