@@ -73,12 +73,13 @@ TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py
 
-lint: $(INSTALLED) ## style, types, layers of imports
+lint: $(INSTALLED) ## style, types, layers of imports, published results that are stale
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy docs/*.py
 	$(BIN)/lint-imports
+	$(BIN)/vehest report --check
 
 test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for the real recordings
 	$(BIN)/python -m pytest -m slow

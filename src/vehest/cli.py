@@ -746,18 +746,21 @@ def report(
     """Draw a study's tables, figures and page from what `vehest run` has made; trains nothing.
 
     `vehest report --check` needs neither models nor an output root. A line a study: up to date; stale, and what has changed; or not known.
-    Exit code 3 unless all are up to date.
+    Exit code 3 unless all are up to date; without names, those that results/stale.yaml lists may be stale.
     """
     if check:
-        from vehest.run.published import check_published, in_words
+        from vehest.run.published import check_listed, check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
-        verdicts = check_published(
-            [word for word in words if is_file_name(word)],
-            [word for word in words if not is_file_name(word)],
-        )
+        names = [word for word in words if is_file_name(word)]
+        others = [word for word in words if not is_file_name(word)]
+        verdicts = check_published(names, others) if names else check_listed(others)
         emit(as_json, verdicts, map(in_words, verdicts))
-        raise typer.Exit(3 if any(verdict["state"] != "up to date" for verdict in verdicts) else 0)
+        failed = any(
+            verdict["failure"] if "failure" in verdict else verdict["state"] != "up to date"
+            for verdict in verdicts
+        )
+        raise typer.Exit(3 if failed else 0)
     if pipeline is None:
         raise ConfigurationError(
             f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check"

@@ -116,7 +116,9 @@ def part(folder, name):
         models.append(model)
         model.model_folder.mkdir(parents=True)
         fitted = estimator_class("ksnn").from_config({"name": "ksnn"})
-        weights = {key: np.full_like(value, 0.1 * seed) for key, value in fitted.weights().items()}
+        weights = {
+            key: np.full_like(value, 0.1 * (seed + 1)) for key, value in fitted.weights().items()
+        }
         fitted.load_weights(weights)
         save_model(fitted, model.model_folder)
         for (where, span), size in zip(spans.items(), sizes or [0.0] * 4, strict=True):

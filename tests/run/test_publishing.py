@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from refusals import refusal
 from safetensors import safe_open
 from safetensors.numpy import load, load_file, save_file
@@ -17,7 +18,7 @@ from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.run import published as study_keys
 from vehest.run.artefacts import TIMINGS, read_artefact
 from vehest.run.publishing import PROVENANCE, published_content
-from vehest.run.versions import code_of
+from vehest.run.versions import VERSIONS, code_of
 
 QUICK = PIPELINE | {
     "publish": True,
@@ -149,6 +150,7 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
         ["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True
     )
     assert (status.stdout, run_vehest(capsys, *CHECK)[:2]) == ("", (0, "small: up to date\n"))
+    shutil.rmtree(published / ".git")  # which other tests copy
 
 
 def other_code_of(changed):
@@ -201,7 +203,16 @@ def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(c
     changes = [{"what": what, "cause": "configuration"} for what in ("train gru",)]
     assert (code, json.loads(out)) == (
         3,
-        [{"study": "small", "state": "stale", "changes": changes, "note": ""}],
+        [
+            {
+                "study": "small",
+                "state": "stale",
+                "changes": changes,
+                "note": "",
+                "failure": "it is not in 'results/stale.yaml'",
+                "may_be_stale": "",
+            }
+        ],
     )
 
 
@@ -228,11 +239,11 @@ def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_a
         patch.setattr(study_keys, "code_of", other_code_of("report"))
         assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
     shutil.rmtree(checked.folder / "raw")
-    assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
+    assert verdict(checked) == (0, "small: up to date: data not checked, raw files not here: mine")
     checked.change("conf/dataset/mine.yaml", vehicle="another car")
     assert verdict(checked) == (
         3,
-        "small: stale: configuration (ingest mine); raw files not here, not compared: mine",
+        "small: stale: configuration (ingest mine); data not checked, raw files not here: mine",
     )
 
 
@@ -370,3 +381,88 @@ def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
         assert read_artefact(output / Path(*file.relative_to(output).parts[:2]))
         if file.suffix in (".safetensors", ".yaml", ".parquet") or file.name == "metrics.csv":
             assert file.read_bytes() == before[file], file
+
+
+def listed(place, **reasons):
+    """Exit code and outcome of a check beside a list of studies that may be stale."""
+    place.change("results/stale.yaml", **reasons)
+    return verdict(place)
+
+
+def test_a_stale_study_passes_only_while_it_is_listed(checked):
+    assert listed(checked, small="it is run again") == (
+        3,
+        "small: up to date: may be until it is run again; it is up to date; "
+        "remove it from 'results/stale.yaml'",
+    )
+    checked.change(
+        "pipelines/small.yaml",
+        sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]],
+    )
+    code, line = verdict(checked)
+    assert (code, "stale: configuration (train gru); may be until it is run again" in line) == (
+        0,
+        True,
+    )
+    (checked.folder / "results" / "stale.yaml").unlink()
+    assert verdict(checked) == (3, "small: stale: configuration (train gru)")
+
+
+def test_a_listed_study_of_other_stages_is_not_composed(checked, monkeypatch):
+    monkeypatch.setitem(VERSIONS, "calibrate", "another")
+    monkeypatch.delattr(study_keys, "jobs_of")
+    code, line = listed(checked, small="bands are calibrated again")
+    assert code == 0
+    assert line.startswith("small: stale: code (calibrate luenberger, calibrate gru); may be until")
+
+
+def test_a_deleted_study_does_not_end_its_entry(checked):
+    code, out = listed(checked, removed="it is run again")
+    assert code == 3
+    assert "removed: not known: nothing is published, which does not end its entry" in out
+    checked.change("results/stale.yaml", removed=None)
+    checked.refused(*CHECK, code=2, says="'results/stale.yaml' must give a reason for each study")
+
+
+def test_results_of_a_work_tree_with_changes_are_not_published(published, place, monkeypatch):
+    shutil.rmtree(place.folder)
+    shutil.copytree(published, place.folder)
+    monkeypatch.chdir(place.folder)
+    author = ("-c", "user.name=a", "-c", "user.email=a")
+    for command in (["init", "-q"], ["add", "conf", "pipelines"], [*author, "commit", "-qm", "a"]):
+        subprocess.run(["git", *command], check=True)
+    metrics = place.folder / "results" / "small" / "metrics.csv"
+    metrics.write_text("changed\n")
+    pipeline = place.folder / "pipelines" / "small.yaml"
+    pipeline.write_text(pipeline.read_text() + "# a change\n")
+    code, _, err = place(*RUN)
+    assert code == 0, err
+    assert "not published: the work tree has changes that are not committed" in err
+    assert "(pipelines/small.yaml); commit them and run it again" in err
+    assert metrics.read_text() == "changed\n"
+    code, _, err = place(*RUN, "--force", "--publish-weights")
+    assert code == 2
+    assert "error: --publish-weights: the work tree has changes" in err
+    subprocess.run(["git", *author, "commit", "-qam", "b"], check=True)
+    place.done(*RUN)
+    assert metrics.read_text() != "changed\n"
+
+
+def test_the_list_of_stale_studies_only_shrinks():
+    may_be_listed = {
+        "cnn_ukf",
+        "heavy_ekf",
+        "ksnn",
+        "learned_ukf",
+        "learned_ukf_sim",
+        "leave_one_out",
+        "reference_minutes",
+        "sim_to_real",
+        "trust",
+    }
+    results = Path(__file__).parents[2] / "results"
+    entries = yaml.safe_load((results / "stale.yaml").read_text(encoding="utf-8"))
+    assert set(entries) <= may_be_listed
+    assert [name for name in may_be_listed if not (results / name / PROVENANCE).is_file()] == [], (
+        "deleting a study does not end its entry"
+    )

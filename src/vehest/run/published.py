@@ -17,6 +17,7 @@ from typing import Any
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
+from vehest.data.text_files import read_yaml
 from vehest.data.transforms import Preparation
 from vehest.run.config import Config
 from vehest.run.config_files import find_pipeline, pipeline_names
@@ -30,7 +31,7 @@ from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
 from vehest.run.train import estimator_rate, training_options
-from vehest.run.versions import code_of
+from vehest.run.versions import code_of, is_of_other_stages
 
 Keys = dict[str, dict[str, str]]
 """What is made, for example ``scheme_1: train ksnn`` -> ``code``, ``configuration`` and, of an ingest, ``data`` -> version or hash."""
@@ -40,6 +41,8 @@ CONFIGURATION = "configuration"
 DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
+STALE_LIST = "stale.yaml"
+"""File in results/: studies that may still be stale, each with the reason and what will end it."""
 
 
 def keys_of_study(
@@ -135,7 +138,11 @@ def in_words(verdict: Mapping[str, Any]) -> str:
         if named:
             more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
             words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
-    why = "; ".join(part for part in (", ".join(words), verdict["note"]) if part)
+    may_be = verdict.get("may_be_stale")
+    listed = f"may be until {may_be}" if may_be else ""
+    failure = verdict["failure"] if may_be else ""
+    parts = (", ".join(words), verdict["note"], listed, failure)
+    why = "; ".join(dict.fromkeys(part for part in parts if part))
     return ": ".join(part for part in (verdict["study"], verdict["state"], why) if part)
 
 
@@ -163,6 +170,58 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
     return [_verdict(study, pipeline, overrides) for study, pipeline in pipelines.items()]
+
+
+def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Compare all published studies as `check_published`, and those that are not up to date with the list of those that may be stale.
+
+    Returns the same, each with ``failure``, empty for a study as it should be. A listed study with keys of other stages than today's, or
+    without keys, is stale without a look at its configuration, which takes a minute for all.
+    """
+    reasons = _stale_list()
+    verdicts = []
+    settled = set()
+    for study in sorted(reasons):
+        published = published_in(RESULTS / study)
+        if published is None:
+            note = f"nothing is published, which does not end its entry in '{RESULTS / STALE_LIST}'"
+            verdicts.append(_outcome(study, "not known", note=note) | {"failure": note})
+        elif not published.keys:
+            verdicts.append(
+                _outcome(study, "not known", note="published before keys were recorded")
+            )
+        elif changes := [
+            (what, CODE)
+            for what, entry in published.keys.items()
+            if is_of_other_stages(entry.get(CODE, ""))
+        ]:
+            verdicts.append(_outcome(study, "stale", changes))
+        else:
+            continue
+        settled.add(study)
+    names = {file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")} - settled
+    for verdict in check_published(sorted(names), overrides) if names or not settled else ():
+        if verdict["state"] == "up to date" and verdict["study"] in reasons:
+            verdict["failure"] = f"it is up to date; remove it from '{RESULTS / STALE_LIST}'"
+        elif verdict["state"] != "up to date" and verdict["study"] not in reasons:
+            verdict["failure"] = f"it is not in '{RESULTS / STALE_LIST}'"
+        verdicts.append(verdict)
+    for verdict in verdicts:
+        verdict.setdefault("failure", "")
+        verdict["may_be_stale"] = reasons.get(verdict["study"], "")
+    return sorted(verdicts, key=lambda verdict: str(verdict["study"]))
+
+
+def _stale_list() -> dict[str, str]:
+    """Study -> why it may still be stale; raises `ConfigurationError` for anything but text by study."""
+    file = RESULTS / STALE_LIST
+    content = read_yaml(file) if file.is_file() else {}
+    if not isinstance(content, dict) or not all(
+        isinstance(study, str) and isinstance(reason, str) and reason
+        for study, reason in content.items()
+    ):
+        raise ConfigurationError(f"'{file}' must give a reason for each study")
+    return content
 
 
 def _pipeline_of(study: str) -> Study | None:
@@ -195,6 +254,12 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
         except ConfigurationError as error:
             note = f"today it cannot be run ({error})"
         state = "stale" if changes else "up to date"
+    return _outcome(study, state, changes, note)
+
+
+def _outcome(
+    study: str, state: str, changes: Sequence[tuple[str, str]] = (), note: str = ""
+) -> dict[str, Any]:
     return {
         "study": study,
         "state": state,
@@ -231,4 +296,4 @@ def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple
         with suppress(MissingError):
             runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
             changes.append((f"{name}, which was not here", DATA))
-    return changes, f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
+    return changes, f"data not checked, raw files not here: {', '.join(missing)}" if missing else ""

@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import math
+import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ RESULTS = Path("results")
 PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
 PUBLISHED_WEIGHTS = "weights.safetensors"
+SOURCES_OF_RESULTS = ("src", "conf", "pipelines")
 DIGITS = 6
 
 
@@ -85,9 +87,28 @@ def publish_study(
         messages.warn(f"not published: '{folder}' shows {lost[0]}, and this run could not read it")
         return None
     with held(Lock(report.folder.parents[1], "publish", publication.study), lambda: False):
-        if _publish(report, folder, publication.keys):
-            messages.line("done", "publish", str(folder))
+        if _is_published(report, folder, publication.keys):
+            return folder
+        if changed := uncommitted_changes():
+            messages.warn(f"not published: {changed}; commit them and run it again")
+            return None
+        _publish(report, folder, publication.keys)
+        messages.line("done", "publish", str(folder))
     return folder
+
+
+def uncommitted_changes() -> str:
+    """Files that determine results and differ from the last commit, in words; empty where there are none, or no git checkout."""
+    command = ["git", "status", "--porcelain", "--untracked-files=all", "--", *SOURCES_OF_RESULTS]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    files = [line[3:] for line in result.stdout.splitlines()]
+    if not files:
+        return ""
+    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    return f"the work tree has changes that are not committed ({', '.join(files[:3])}{more})"
 
 
 def check_results_folder(folder: Path) -> None:
@@ -106,24 +127,31 @@ def check_results_folder(folder: Path) -> None:
         )
 
 
-def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
-    check_results_folder(folder)
+def _contents(report: Artefact) -> dict[str, bytes]:
+    """Files of a report that are published: name -> content."""
     names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]
-    contents = {name: published_content(report.folder / name) for name in names}
-    if folder.is_dir():
-        present = {
-            file.relative_to(folder).as_posix(): sha256_of(file)
-            for file in folder.rglob("*")
-            if file.is_file()
-        }
-        former = published_in(folder)
-        wanted = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        if (
-            former is not None
-            and former.keys == keys
-            and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}
-        ):
-            return False
+    return {name: published_content(report.folder / name) for name in names}
+
+
+def _is_published(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether a folder holds these results already, its provenance aside."""
+    check_results_folder(folder)
+    former = published_in(folder)
+    if former is None or former.keys != keys:
+        return False
+    present = {
+        file.relative_to(folder).as_posix(): sha256_of(file)
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+    needed = {
+        name: hashlib.sha256(content).hexdigest() for name, content in _contents(report).items()
+    }
+    return {**present, PROVENANCE: ""} == {**needed, PROVENANCE: ""}
+
+
+def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> None:
+    contents = _contents(report)
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +162,6 @@ def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str
             encoding="utf-8",
             errors="backslashreplace",
         )
-    return True
 
 
 def published_content(file: Path) -> bytes:

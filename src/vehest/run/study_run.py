@@ -40,6 +40,7 @@ from vehest.run.publishing import (
     Publication,
     check_results_folder,
     publish_study,
+    uncommitted_changes,
 )
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
@@ -214,6 +215,8 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
         raise ConfigurationError(
             f"--publish-weights publishes what '{study.file}' says, unchanged; {why}"
         )
+    if changes_of_tree := uncommitted_changes():
+        raise ConfigurationError(f"--publish-weights: {changes_of_tree}; commit them first")
     folder = RESULTS / study.study
     check_results_folder(folder)
     return PublishedWeights(folder / PUBLISHED_WEIGHTS)
