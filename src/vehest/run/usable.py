@@ -253,6 +253,8 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         for part in (_recordings([*split.train, *split.validation], contents), scored)
     )
     found = usability(estimator.name, config, to_train, to_estimate)
+    if found.to_give:  # its settings are complete: a class of another package that fails
+        raise ConfigurationError(found.to_give)
     by_scores = absent_channels(SCORED, scored)
     parts = (
         (found.missing.to_train, to_train),
