@@ -11,7 +11,7 @@ from refusals import refusal
 
 from every_estimator import fitted
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.model_files import save_model
+from vehest.estimators.model_files import model_digest, save_model
 from vehest.export.folder import FILES, export_model
 from vehest.trust.record import write_trust
 
@@ -81,7 +81,7 @@ def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path
     folder = tmp_path / "model"
     folder.mkdir()
     save_model(model("kinematic"), folder)
-    write_trust(trust("kinematic"), folder)
+    write_trust(trust("kinematic"), folder, model_digest(folder))
     words = [
         sys.executable,
         "-m",
