@@ -161,7 +161,7 @@ def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(p
     assert (place.folder / "results" / "both" / "report.md").read_bytes() == published
     assert place("report", "--check")[:2] == (
         0,
-        "both: up to date: raw files not here, not compared: other\n",
+        "both: up to date: data not checked, raw files not here: other\n",
     )
     change_parts(place, lambda parts: parts["ferrari_drive"].pop("optional") and None)
     place.refused("run", "both", "tracking=none", code=4, says="other")
