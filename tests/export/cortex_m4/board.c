@@ -46,7 +46,7 @@ bool board_step_at(vehest_state *state, double time, const vehest_sample *sample
     uint32_t before;
     uint32_t taken;
     bool due;
-    const bool gap = time - state->last_time > 1.5 / VEHEST_INPUT_RATE_HZ; /* steps for what is missing come first then */
+    const bool gap = time - state->clock.last > 1.5 / VEHEST_INPUT_RATE_HZ; /* steps for what is missing come first then */
     SYST_RVR = LARGEST_TICK;
     SYST_CVR = 0U;
     SYST_CSR = 5U; /* on, by the processor's clock */
