@@ -995,8 +995,12 @@ def data_align(
         ),
     ] = None,
     cutoff: Annotated[
-        float, typer.Option("--cutoff", help="Low-pass that both sides go through [Hz].")
-    ] = 2.0,
+        float | None,
+        typer.Option(
+            "--cutoff",
+            help="Low-pass that both sides go through [Hz]; by default 2, or less below 23 Hz.",
+        ),
+    ] = None,
     max_delay: Annotated[
         float, typer.Option("--max-delay", help="Largest delay to look for, either way [s].")
     ] = 0.5,

@@ -27,7 +27,7 @@ from vehest.data.store import write_recording
 from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_from_config
 from vehest.run.align import FILES, override_of
 from vehest.run.config import compose_config
-from vehest.run.downsample import transforms_of
+from vehest.run.downsample import resampled, transforms_of
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.levels import PRESETS, SensorLevel, Tilt
@@ -299,6 +299,16 @@ def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
     ratio = values.std(axis=0, ddof=1) / np.sqrt(np.square(stated).mean(axis=0))
     assert ratio.min() > 0.7  # intervals are not merely wide
     assert ratio.max() < 1.4  # the standard deviation of 30 values is itself known to 13 %
+
+
+def test_log_of_20_hz_is_aligned_without_options():
+    slow = resampled(weaving(0), 20.0, {"method": "polyphase", "transforms": []})
+    found = align(slow, AlignmentSettings(IMU, tilt=0.0))
+    assert found.settings.cutoff_at(20.0) == pytest.approx(1.767, abs=1e-3)
+    assert found.settings.cutoff_at(22.0) < found.settings.cutoff_at(50.0) == 2.0
+    for parameter in found.parameters:
+        error = abs(parameter.value - PLANTED[parameter.name])
+        assert error < 3 * parameter.uncertainty < 0.3, parameter.name
 
 
 def test_unmeasured_tilt_adds_to_the_uncertainty():

@@ -299,7 +299,7 @@ def _align_steering(
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
     yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
     require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")
-    smoothing = smoothing_of(recording, STEERING_CUTOFF * settings.cutoff_hz)
+    smoothing = smoothing_of(recording, STEERING_CUTOFF * settings.cutoff_at(recording.rate_hz))
     lost = 2 * smoothing.reach / recording.rate_hz
     require_length(recording, recording.duration - lost, lost)
 
