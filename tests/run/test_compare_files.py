@@ -210,9 +210,16 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
     )
     rows = {row["estimate"] for row in json.loads(out)["rows"]}
     assert rows == {"mine", "luenberger", "pretrained", "zero", "static_map"}
-    assert "learnt on this recording" not in err
-    _, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
-    assert "warning: 'luenberger' learnt on this recording: its row is no test" in err
+    assert "trained on this recording" not in err
+    out, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
+    assert "warning: 'luenberger' was trained on this recording: its row is no test" in err
+    assert "No estimator can be called best: 'luenberger' was trained on this recording." in out
+    trained_on = "'luenberger' was trained on this recording"
+    for recording, is_named in (("one", True), ("three", False)):
+        _, err = place.done(
+            "estimate", "luenberger", f"{raw}/{recording}.csv", "dataset=mine", "-o", "of.csv"
+        )
+        assert (trained_on in err) == is_named
     assert (
         place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1]
         == "error: name at least one estimate to compare"

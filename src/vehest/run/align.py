@@ -171,9 +171,10 @@ def _report(alignment: Alignment) -> str:
     from vehest.report.document import as_text
 
     shown = in_words(alignment, None)[:-1]  # without the override, which stands below
+    cutoff_hz = alignment.settings.cutoff_at(alignment.recording.rate_hz)
     parts = [
         f"# Alignment of {as_text(alignment.recording.id)}",
-        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {alignment.settings.cutoff_at(alignment.recording.rate_hz):.3g} Hz.",
+        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {cutoff_hz:.3g} Hz.",
         *(as_text(one) if isinstance(one, str) else _markdown(one) for one in shown),
         "Transforms that would correct it, in this order, for `downsample`:",
         f"```yaml\n{_transforms(alignment).rstrip()}\n```",

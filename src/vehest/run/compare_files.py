@@ -16,13 +16,12 @@ import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.errors import ConfigurationError, DataError, listed, printable
 from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_estimate
-from vehest.estimators.model_files import read_description
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
@@ -34,6 +33,7 @@ from vehest.run.downsample import resampled
 from vehest.run.estimate import (
     estimate_recording,
     finding_in_words,
+    is_training_recording,
     open_model,
     same_vehicle_from_config,
     split_settings,
@@ -80,6 +80,7 @@ def compare_files(
     config = compose_config("estimate", overrides)
     car = car_of(config["dataset"])
     notes: list[str] = []
+    trained_here: list[str] = []
     with use_limits(limits_from_config(config["limits"])):
         drive = read_single(config["dataset"], recording)
         findings = [
@@ -100,16 +101,19 @@ def compare_files(
             folder, model, trust = open_model(name, Path(config["output"]), note)
             model, trust, remarks = adapted(model, trust, car, settings)
             notes += [f"'{name}': {remark}" for remark in remarks]
-            about = read_description(folder).about
-            if any(
-                span.startswith((f"{drive.id} [", f"{drive.id} ("))
-                for span in (*about.trained_on, *about.validated_on)
-            ):
-                complain(f"warning: '{name}' learnt on this recording: its row is no test")
+            if is_training_recording(folder, drive.id):
+                trained_here.append(f"'{name}'")
+                complain(f"warning: '{name}' was trained on this recording: its row is no test")
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, same_vehicle_from_config(config)
             )
         found = compare_estimates(drive, estimates, car.wheelbase)
+    if trained_here:
+        found["verdict"] = (
+            f"No estimator can be called best: {listed(trained_here)} "
+            f"{'was' if len(trained_here) == 1 else 'were'} trained on this recording. "
+            "Compare on another one."
+        )
     for text in notes:
         note(text)
     cells = [

@@ -157,6 +157,10 @@ def estimate_file(
         record = None if car is None else read_car(car)
         model, trust, of_car = adapted(model, trust, car_of(dataset), settings, record)
         remarks += of_car
+        if is_training_recording(folder, first.id):
+            remarks.append(
+                f"'{name}' was trained on this recording: its errors here are no test of it"
+            )
         if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
@@ -214,6 +218,15 @@ def _estimates(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate
             if len(going) > 1:
                 yield going.pop(0).result()
         yield going.pop().result()
+
+
+def is_training_recording(model_folder: Path, recording_id: str) -> bool:
+    """Whether a model was trained or validated on some part of a recording."""
+    about = read_description(model_folder).about
+    return any(
+        span.startswith((f"{recording_id} [", f"{recording_id} ("))
+        for span in (*about.trained_on, *about.validated_on)
+    )
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
