@@ -86,6 +86,14 @@ def regular_file(path: Path) -> Path:
     return path
 
 
+def without_links(path: Path) -> Path:
+    """The absolute path behind all links; raises `DataError` where links lead to each other."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # the latter up to Python 3.12
+        raise DataError(f"cannot follow '{path}': its links lead to each other") from None
+
+
 def file_name(name: str, ending: str = "") -> str:
     """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
     at 100 bytes, and the start of its hash added."""

@@ -16,6 +16,7 @@ from vehest.bus.outputs import write_dbc as write_dbc_file
 from vehest.bus.replay import Bus, Replay, survey
 from vehest.bus.view import View
 from vehest.data.errors import ConfigurationError
+from vehest.data.files import without_links
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.estimators.base import Estimator
@@ -65,7 +66,8 @@ def replay_log(
         )
     written = output_files(out) + ([write_dbc] if write_dbc else [])
     for path in written:
-        if any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
+        inputs = [without_links(file) for file in (log, dbc) if file is not None]
+        if without_links(path) in inputs:
             raise ConfigurationError(f"'{path}' is an input; name another file")
     settings, others = split_settings(overrides)
     config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *others])
