@@ -660,3 +660,32 @@ def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
     for command in ("run", "report"):
         place.refused(command, "odd", "tracking=none", code=2, says=said)
     place.done("data", "list")
+
+
+BAD_ESTIMATORS = {
+    "aliases": "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 7)),
+    "nameless": "rate_hz: 20\n",
+    "no_yaml": "{{: [",
+    "round": "defaults: [roundabout, _self_]\nname: zero\n",
+    "roundabout": "defaults: [round, _self_]\nname: zero\n",
+}
+
+
+def test_a_file_of_an_estimator_that_cannot_be_read_is_a_row_with_the_reason(tmp_path, monkeypatch):
+    folder = tmp_path / "conf" / "estimator"
+    folder.mkdir(parents=True)
+    for name, text in BAD_ESTIMATORS.items():
+        (folder / f"{name}.yaml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("vehest.run.usable.choices", lambda group: [*BAD_ESTIMATORS, "zero"])
+    monkeypatch.setattr("vehest.run.usable.estimator_names", lambda: ["zero"])
+    rows = all_usabilities([summary_of(planar_drive(20.0, 50.0))])
+    reasons = {row.estimator: row.to_give for row in rows if row.usable == "no"}
+    assert [row.estimator for row in rows] == [*BAD_ESTIMATORS, "zero"]
+    assert "zero" not in reasons
+    assert "aliases.yaml' nests deeper than 60 levels or holds more than" in reasons["aliases"]
+    assert reasons["nameless"] == "estimator.name is missing"
+    assert "no_yaml.yaml' cannot be read as YAML" in reasons["no_yaml"]
+    assert reasons["round"].startswith("the defaults of 'conf/estimator/round.yaml' and ")
+    assert "'conf/estimator/roundabout.yaml' lead back to themselves" in reasons["round"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import yaml
 from hydra import compose, initialize_config_dir
@@ -28,7 +28,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import Container, OmegaConf
+from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
@@ -108,6 +108,8 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
 class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
     """The files of ./conf: each is read within the limits on text and values before OmegaConf copies what its aliases repeat."""
 
+    with_defaults: ClassVar[list[Path]] = []  # files with a list of defaults, in their order
+
     @staticmethod
     def scheme() -> str:
         return LOCAL_SCHEME
@@ -115,7 +117,10 @@ class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(os.path.relpath(self.path), self._normalize_file_name(config_path))
         check_yaml_size(read_text(file), f"'{file}'", MAX_CONFIG_VALUES)
-        return super().load_config(config_path)
+        loaded = super().load_config(config_path)
+        if isinstance(loaded.config, DictConfig) and "defaults" in loaded.config:
+            self.with_defaults.append(file)
+        return loaded
 
 
 @contextmanager
@@ -178,6 +183,7 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(_LocalFirst)
     SourcesRegistry.instance().register(_LimitedFiles)
+    _LimitedFiles.with_defaults.clear()
     try:
         with (
             _limited_references(),
@@ -192,6 +198,11 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing
+        if isinstance(error, RecursionError) and (files := _LimitedFiles.with_defaults):
+            names = " and ".join(f"'{file}'" for file in files)
+            raise ConfigurationError(
+                f"the defaults of {names} lead back to themselves; remove an entry of them"
+            ) from None
         raise ConfigurationError(_one_line(error, command)) from None
     validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]

@@ -186,20 +186,26 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
     }
 
 
+def _datasets_with_download() -> list[str]:
+    """Names of the data sets whose files can be fetched; those whose configuration cannot be read are left out."""
+    names = []
+    for name in choices("dataset"):
+        with suppress(ConfigurationError):
+            if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download"):
+                names.append(name)
+    return names
+
+
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
     """Fetch a data set's missing files and record or compare the others' checksums; raises as `Download.fetch`, or `ConfigurationError`."""
     from vehest.sources.download import download_of
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
-        known = [
-            name
-            for name in choices("dataset")
-            if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")
-        ]
+        others = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"data sets that do: {', '.join(known) or 'none'}"
+            f"put them into its folder by hand, or declare download in its file; data sets that do: {others}"
         )
     download = download_of(source)
     if dry_run:
