@@ -6,7 +6,6 @@ Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,7 +21,7 @@ from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
-from vehest.run.config import Config, compose_config, missing_keys
+from vehest.run.config import Config, compose_config, missing_keys, quoted
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
@@ -103,7 +102,7 @@ class Runner:
 
     def dataset_config(self, name: str, config: Config) -> Config:
         """The configuration of a data set's ingest, with the root and output of another command's."""
-        root = [] if config.get("root") is None else [f"root={_quoted(config['root'])}"]
+        root = [] if config.get("root") is None else [f"root={quoted(config['root'])}"]
         return self._once(
             "dataset",
             name,
@@ -390,11 +389,3 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         "done",
         f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}",
     )
-
-
-def _quoted(text: Any) -> str:
-    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
-    escaped = re.sub(
-        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
-    )
-    return f"'{escaped}'"
