@@ -21,7 +21,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_estimate
+from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.estimators.model_files import read_description
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
@@ -59,6 +59,8 @@ SPELLINGS = {
     },
 }
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
+OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
+"""Columns that estimates of vehest have, and those of other tools do not."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 CHECKS_OF_ESTIMATES = ("impossible", "sign", "unit", "stuck")
@@ -138,10 +140,14 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     is a `DataError`. Where only β is there, v = u tan β with the recording's u. Prints a warning where unit or sign contradict the
     recording.
     """
-    if file.suffix == ".parquet":
-        with suppress(DataError):  # a table of another tool
-            return read_estimate(file)
+    if file.suffix == ".parquet" and is_stored_estimate(file):
+        return read_estimate(file)
     names = column_names(file)
+    if file.suffix == ".parquet" and OF_VEHEST.intersection(names):
+        complain(
+            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            "description: another program has written it anew; it is read like another tool's table"
+        )
     found: dict[str, dict[str, str]] = {}
     for quantity, spellings in SPELLINGS.items():
         for name in names:
