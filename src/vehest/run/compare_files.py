@@ -39,6 +39,7 @@ from vehest.run.estimate import (
     split_settings,
 )
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
+from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
 from vehest.sources.base import car_of, read_single
 from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
@@ -63,8 +64,6 @@ OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
 """Columns that estimates of vehest have, and those of other tools do not."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-CHECKS_OF_ESTIMATES = ("impossible", "sign", "unit", "stuck")
-"""What concerns how an estimate was written; that it departs from the kinematics is for its score to say."""
 LEAST_SECONDS = 5.0
 LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
@@ -209,7 +208,7 @@ def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recordin
         concerns = finding.channel == channel or (
             not finding.channel and channel in finding.message
         )
-        if concerns and finding.check in CHECKS_OF_ESTIMATES:
+        if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
             complain(
                 f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
             )

@@ -91,6 +91,7 @@ class Comparison:
         try:
             split = runner.split(usable[0].config)
             contents = runner.contents(usable[0].config)
+            runner.warn_of_references(split, usable[0].config)
             for job in usable:
                 job.config = with_car_values(job.config, runner.datasets_of(job.config))
             notes = dict.fromkeys(

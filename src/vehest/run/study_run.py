@@ -282,7 +282,7 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
         return AbsentDataset(own["name"], title, licence, citation)
-    if runner.train_first and find(planned) is None:
+    if runner.train_first and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
@@ -361,6 +361,7 @@ def evaluate_one(
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)
         if model is not None:
+            runner.warn_of_references(split, config)
             config, notes = lower_rate(config, "evaluation", slowest(runner.contents(config)))
             print_notes(notes, runner)
             trained = model_artefact(find_model(model, runner.output, note))
@@ -373,7 +374,7 @@ def evaluate_one(
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (found := find(plan)) is None:
+            if (found := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
                     f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
