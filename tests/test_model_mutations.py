@@ -152,3 +152,15 @@ def test_a_number_that_no_fit_makes_is_one_line_that_names_the_file(tmp_path, na
         assert str(refused.value).startswith(f"'{tmp_path / WEIGHTS}': ")
         assert says in str(refused.value)
         assert "\n" not in str(refused.value)
+
+
+def test_settings_with_which_no_estimator_can_be_built_are_one_line(tmp_path, monkeypatch):
+    save_model(fitted("gru"), tmp_path)
+    kind = type(fitted("gru"))
+
+    def damaged(self):
+        raise TypeError("a defect")
+
+    monkeypatch.setattr(kind, "fewest_weights", damaged)
+    with pytest.raises(DataError, match=r"model\.yaml': no estimator can be built .*a defect"):
+        load_model(tmp_path)
