@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from refusals import refusal
 
@@ -14,6 +15,7 @@ from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.data.store import write_estimate
 from vehest.run.compare_files import compare_estimates, compare_files, read_estimate_table
 from vehest.run.inspect_data import check
 
@@ -140,6 +142,61 @@ def test_an_unknown_unit_in_a_name_is_an_error_and_not_si(drive, tmp_path, name)
     assert "has the unknown unit 'min' (known are s, sec," in refusal(
         lambda: read_estimate_table(file, drive)
     )
+
+
+def _rewritten(file, change):
+    """Write an estimate of vehest anew with another description beside its table."""
+    table = pq.read_table(file)
+    described = table.schema.metadata[b"vehest"]
+    pq.write_table(table.replace_schema_metadata(change(described)), file)
+
+
+def _described_as(content):
+    return lambda text: {b"vehest": json.dumps({**json.loads(text), **content}).encode()}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: {b"vehest": text[:-3]}, "cannot be read as JSON"),
+        (lambda text: {b"vehest": b"[]"}, "is damaged (it is no mapping)"),
+        (_described_as({"content": "estimat"}), "names neither a recording nor an estimate"),
+        (_described_as({"rate_hz": "20"}), "rate_hz"),
+        (_described_as({"format": 99}), "format 99"),
+    ],
+)
+def test_an_estimate_with_a_damaged_description_is_no_table_of_another_tool(
+    drive, tmp_path, change, says
+):
+    file = _stored_estimate(drive, tmp_path)
+    _rewritten(file, change)
+    assert says in refusal(lambda: read_estimate_table(file, drive))
+
+
+def _stored_estimate(drive, folder):
+    vy = drive["vy_ref"] + 0.1
+    band = np.full(len(drive), 0.2)
+    channels = {"vy": vy, "sideslip": np.arctan2(vy, drive["vx"]), "band_vy": band}
+    estimate = Estimate(drive.id, "ksnn", drive.rate_hz, drive.start_time, channels)
+    file = folder / "mine.parquet"
+    write_estimate(estimate, file)
+    return file
+
+
+def test_an_estimate_without_its_description_is_read_with_a_warning(drive, tmp_path, capsys):
+    file = _stored_estimate(drive, tmp_path)
+    complete = read_estimate_table(file, drive)
+    assert capsys.readouterr().err == ""
+    _rewritten(file, lambda text: None)
+    without = read_estimate_table(file, drive)
+    assert "has columns of 'vehest estimate' (1 (band_vy)), but not its description" in (
+        capsys.readouterr().err
+    )
+    np.testing.assert_array_equal(without["vy"], complete["vy"])
+    plain = pq.read_table(file).select(["time", "vy"])
+    pq.write_table(plain, file)
+    read_estimate_table(file, drive)
+    assert capsys.readouterr().err == ""
 
 
 def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):

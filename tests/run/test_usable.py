@@ -602,15 +602,18 @@ PLUGINS = {
 
 @pytest.fixture
 def plugins(tmp_path, monkeypatch):
-    """An installed package whose estimators and whose study fail in one way each."""
+    """An installed package whose estimators and whose study fail in one way each, but for the estimator `sound`."""
     info = tmp_path / "plugins" / "broken-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    points = "\n".join(f"{name} = {name}:Plugin" for name in PLUGINS)
+    modules = {name: code for name, (code, _) in PLUGINS.items()} | {
+        "sound": "class Plugin(Zero): name = 'sound'"
+    }
+    points = "\n".join(f"{name} = {name}:Plugin" for name in modules)
     (info / "entry_points.txt").write_text(
         f"[vehest.estimators]\n{points}\n[vehest.studies]\nbroken_study = broken_import\n"
     )
-    for name, (code, _) in PLUGINS.items():
+    for name, code in modules.items():
         code = f"from vehest.estimators.zero import ESTIMATOR as Zero\n{code}\n"
         (info.parent / f"{name}.py").write_text(code)
     monkeypatch.syspath_prepend(str(info.parent))
@@ -633,6 +636,22 @@ def test_plugins_that_fail_are_named_and_the_others_are_listed():
     assert loadable <= set(registry.estimator_classes())
     assert {"broken_import", "broken_class"}.isdisjoint(registry.estimator_classes())
     assert "ksnn" in exportable()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
+    place.add_steered()
+    logs = [f"raw/steered/{name}.csv" for name in ("first", "second")]
+    said, _ = place.done("new", "my_car", *logs, "--yes")
+    lacking = dict(
+        line.removeprefix("left out: ").split(": ", 1)
+        for line in said.splitlines()
+        if line.startswith("left out: ")
+    )
+    assert "is not there" not in said
+    assert lacking["sound"].startswith("there is no conf/estimator/sound.yaml; write one with")
+    for name in ("broken_constructor", "broken_property"):
+        assert f"of another package cannot be {PLUGINS[name][1]}" in lacking[name]
 
 
 @pytest.mark.usefixtures("plugins")

@@ -168,18 +168,7 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
         The manifest is damaged, or a file differs from it.
     """
     path = folder / MANIFEST
-    try:
-        content = read_json(path)
-    except MissingError:
-        raise MissingError(
-            f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it"
-        ) from None
-    if not isinstance(content, dict):
-        raise DataError(
-            f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again"
-        )
-    check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
-    manifest = validated(Manifest, content, f"'{path}'")
+    manifest = read_manifest(folder)
     files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
     for name, output in manifest.outputs.items():
         if files.get(name) != output.bytes:
@@ -193,6 +182,23 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
             )
     outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
     return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """What the manifest of a stage's folder says, its files not looked at; raises as `read_artefact`."""
+    path = folder / MANIFEST
+    try:
+        content = read_json(path)
+    except MissingError:
+        raise MissingError(
+            f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it"
+        ) from None
+    if not isinstance(content, dict):
+        raise DataError(
+            f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again"
+        )
+    check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
+    return validated(Manifest, content, f"'{path}'")
 
 
 def _digest_of(path: Path, stat: os.stat_result) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from vehest.data.errors import DataError, VehestError
+from vehest.data.files import file_name
 from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
@@ -29,7 +29,7 @@ from vehest.estimators.model_files import (
     model_digest,
     read_description,
 )
-from vehest.run.artefacts import Artefact, StagePlan, read_artefact
+from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, read_artefact, read_manifest
 from vehest.run.train import file_digest, recording_file
 from vehest.run.versions import code_of
 from vehest.trust.bands import Piece, band_inputs, calibrated
@@ -57,7 +57,7 @@ def plan_calibrate(
     }
     config = {role: [str(span) for span in own] for role, own in spans.items()}
     code = code_of(STAGE, read_description(model.folder).estimator)
-    plan = StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output)
+    plan = StagePlan(STAGE, _label(model), config, inputs, code, output)
     return plan, partial(_write, model.folder, split, data)
 
 
@@ -209,18 +209,37 @@ def trust_of(
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
     """The calibration of a model in its own output root or in another; the newest of several.
 
-    Raises `DataError`: it was changed after it was made.
+    Raises `DataError`: the model or a calibration of it is damaged or was changed after it was made; also one whose manifest cannot be
+    read, where its folder has the model's name.
     """
-    found = []
-    with suppress(VehestError):
-        digest = read_artefact(model_folder, hash_files=False).digest
-        roots = {model_folder.resolve().parent.parent, output.resolve()}
-        for folder in sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")}):
-            with suppress(VehestError):
-                artefact = read_artefact(folder, hash_files=False)
-                if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
-                    found.append(artefact)
+    if not os.path.lexists(model_folder / MANIFEST):
+        return None  # a model that was saved from Python, which no calibration names
+    model = read_artefact(model_folder, hash_files=False)
+    roots = {model_folder.resolve().parent.parent, output.resolve()}
+    folders = sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")})
+    calibrations = [folder for folder in folders if _calibrates(folder, model)]
     newest = max(
-        found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None
+        map(read_artefact, calibrations),
+        key=lambda artefact: str(artefact.provenance.get("created", "")),
+        default=None,
     )
-    return None if newest is None else read_artefact(newest.folder)
+    return newest
+
+
+def _calibrates(folder: Path, model: Artefact) -> bool:
+    """Whether a folder holds the calibration of a model; raises `DataError` where its manifest is damaged and its name is the model's."""
+    try:
+        manifest = read_manifest(folder)
+    except VehestError as error:
+        if not folder.name.startswith(file_name(_label(model), "-")):
+            return False  # of another model
+        raise DataError(
+            f"'{folder}' may be the calibration of this model, and cannot be read ({error}); "
+            f"remove the folder, and the stage '{STAGE}' makes it again"
+        ) from None
+    return manifest.stage == STAGE and manifest.inputs.get("model") == model.digest
+
+
+def _label(model: Artefact) -> str:
+    """Start of the name of a model's calibration."""
+    return f"{model.label}-trust"

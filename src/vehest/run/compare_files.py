@@ -21,7 +21,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_estimate
+from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
@@ -39,6 +39,7 @@ from vehest.run.estimate import (
     split_settings,
 )
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
+from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
 from vehest.sources.base import car_of, read_single
 from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
@@ -59,10 +60,10 @@ SPELLINGS = {
     },
 }
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
+OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
+"""Columns that estimates of vehest have, and those of other tools do not."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-CHECKS_OF_ESTIMATES = ("impossible", "sign", "unit", "stuck")
-"""What concerns how an estimate was written; that it departs from the kinematics is for its score to say."""
 LEAST_SECONDS = 5.0
 LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
@@ -142,10 +143,14 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     is a `DataError`. Where only β is there, v = u tan β with the recording's u. Prints a warning where unit or sign contradict the
     recording.
     """
-    if file.suffix == ".parquet":
-        with suppress(DataError):  # a table of another tool
-            return read_estimate(file)
+    if file.suffix == ".parquet" and is_stored_estimate(file):
+        return read_estimate(file)
     names = column_names(file)
+    if file.suffix == ".parquet" and OF_VEHEST.intersection(names):
+        complain(
+            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            "description: another program has written it anew; it is read like another tool's table"
+        )
     found: dict[str, dict[str, str]] = {}
     for quantity, spellings in SPELLINGS.items():
         for name in names:
@@ -207,7 +212,7 @@ def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recordin
         concerns = finding.channel == channel or (
             not finding.channel and channel in finding.message
         )
-        if concerns and finding.check in CHECKS_OF_ESTIMATES:
+        if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
             complain(
                 f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
             )

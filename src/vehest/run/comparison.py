@@ -21,6 +21,7 @@ from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
 from vehest.run.group import Group, Member
+from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
@@ -90,6 +91,7 @@ class Comparison:
         try:
             split = runner.split(usable[0].config)
             contents = runner.contents(usable[0].config)
+            runner.warn_of_references(split, usable[0].config)
             for job in usable:
                 job.config = with_car_values(job.config, runner.datasets_of(job.config))
             notes = dict.fromkeys(
@@ -119,7 +121,10 @@ class Comparison:
             reasons = "; ".join(
                 dict.fromkeys(job.failure.message for job in usable if job.failure is not None)
             )
-            known = ", ".join(f"'vehest data usable {name}'" for name in split.datasets)
+            location = location_of_config(usable[0].config)
+            known = ", ".join(
+                f"'{command_line('data usable', [name, *location])}'" for name in split.datasets
+            )
             raise DataError(
                 f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
                 f"{known} shows what each estimator needs"

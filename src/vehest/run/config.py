@@ -350,6 +350,14 @@ def has_key(config: Config, key: str) -> bool:
     )
 
 
+def quoted(text: Any) -> str:
+    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
+    escaped = re.sub(
+        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
+    )
+    return f"'{escaped}'"
+
+
 def as_yaml(config: Config) -> str:
     """A configuration as YAML, control characters as escapes."""
     text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, width=120)

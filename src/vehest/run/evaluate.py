@@ -416,6 +416,9 @@ def _training_rows(how: Evaluation, model: Artefact, estimator: Estimator) -> li
         estimates = _estimates(estimator, how, sequences(spans, how.reference, how.protocol))
         figures = accuracy(how.score(spans, estimates))
     except DataError:
+        for span in spans:  # what cannot be read is an error, a gap in it is not
+            how.reference(span)
+            how.measured(span)
         return []
     return _rows(
         _head(how, model, estimator, TRAINING, spans),

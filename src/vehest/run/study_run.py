@@ -33,6 +33,7 @@ from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
+from vehest.run.next_commands import command_line, overrides_of_config
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import (
     PUBLISHED_WEIGHTS,
@@ -133,7 +134,7 @@ def run_study(
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
         if options.publish_weights:
             runner.publishes_to = _weights_to_add_to(study, overrides)
-        runner.train_first = f"vehest run {study.file}" if only_report else ""
+        runner.train_first = command_line("run", study.words) if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
         used = [config["dataset"] for config in shown]
         for part in study.parts:
@@ -281,7 +282,7 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
         return AbsentDataset(own["name"], title, licence, citation)
-    if runner.train_first and find(planned) is None:
+    if runner.train_first and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
@@ -320,11 +321,12 @@ def _error_of(
             f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}"
         )
     if unfinished and not runner.dry_run:
+        going_on = command_line("run" if study.file.name else "sweep", study.words)
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished)}; '{study.command}' goes on with them",
+            f"{', '.join(unfinished)}; '{going_on}' goes on with them",
         )
     return error
 
@@ -359,6 +361,7 @@ def evaluate_one(
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)
         if model is not None:
+            runner.warn_of_references(split, config)
             config, notes = lower_rate(config, "evaluation", slowest(runner.contents(config)))
             print_notes(notes, runner)
             trained = model_artefact(find_model(model, runner.output, note))
@@ -371,9 +374,10 @@ def evaluate_one(
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (found := find(plan)) is None:
+            if (found := find(plan, runner.messages.warn)) is None:
+                training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
-                    f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first"
+                    f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
                 )
             assert group.evaluation is not None
             trained = found
