@@ -10,11 +10,12 @@ import pytest
 import yaml
 
 import vehest_papers
+from vehest_papers.heavy_ekf import paper as heavy_ekf
 from vehest_papers.learned_ukf import paper as learned_ukf
 
 FOLDER = Path(vehest_papers.__file__).parent
 RESULTS = Path(__file__).parents[2] / "results"
-CLAIMS_BEFORE = {"learned_ukf": 42, "learned_ukf_sim": 12}
+CLAIMS_BEFORE = {"learned_ukf": 42, "learned_ukf_sim": 12, "heavy_ekf": 52}
 """Study -> rows of its tables of claims before claims were data."""
 PAPERS = tuple(name for name in CLAIMS_BEFORE if name != "learned_ukf_sim")
 ROUNDING = 0.012  # relative: two printed figures of three digits each, and their ratio
@@ -165,3 +166,21 @@ def test_velocity_errors_of_learned_ukf_are_those_of_the_report():
             (candidate, "rmse_vx"): vx,
             (candidate, "rmse_vy"): vy,
         }
+
+
+def test_ratios_of_heavy_ekf_are_those_of_the_report():
+    orders = [
+        claim
+        for claim in read_claims("heavy_ekf")["claims"]
+        if claim.get("kind") == "order" and "ratio" in claim
+    ]
+    pairs = {(claim["candidate"], claim["other"]) for claim in orders}
+    assert pairs == set(heavy_ekf.GAINS)
+    for claim in orders:
+        gain = heavy_ekf.GAINS[claim["candidate"], claim["other"]]
+        assert claim["ratio"] == pytest.approx(1.0 - gain / 100.0), claim["id"]
+
+
+def test_fast_lap_of_heavy_ekf_is_that_of_the_report():
+    fast = float(heavy_ekf.FAST[heavy_ekf.RATTE])
+    assert table_of("heavy_ekf", "Section IV", "nominal_fast") == {("RATTE", "rmse_sideslip"): fast}
