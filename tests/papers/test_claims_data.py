@@ -10,12 +10,13 @@ import pytest
 import yaml
 
 import vehest_papers
+from vehest_papers.cnn_ukf import paper as cnn_ukf
 from vehest_papers.heavy_ekf import paper as heavy_ekf
 from vehest_papers.learned_ukf import paper as learned_ukf
 
 FOLDER = Path(vehest_papers.__file__).parent
 RESULTS = Path(__file__).parents[2] / "results"
-CLAIMS_BEFORE = {"learned_ukf": 42, "learned_ukf_sim": 12, "heavy_ekf": 52}
+CLAIMS_BEFORE = {"learned_ukf": 42, "learned_ukf_sim": 12, "heavy_ekf": 52, "cnn_ukf": 42}
 """Study -> rows of its tables of claims before claims were data."""
 PAPERS = tuple(name for name in CLAIMS_BEFORE if name != "learned_ukf_sim")
 ROUNDING = 0.012  # relative: two printed figures of three digits each, and their ratio
@@ -184,3 +185,20 @@ def test_ratios_of_heavy_ekf_are_those_of_the_report():
 def test_fast_lap_of_heavy_ekf_is_that_of_the_report():
     fast = float(heavy_ekf.FAST[heavy_ekf.RATTE])
     assert table_of("heavy_ekf", "Section IV", "nominal_fast") == {("RATTE", "rmse_sideslip"): fast}
+
+
+@pytest.mark.parametrize(("table", "part"), [("Table II", "full"), ("Table III", "limited")])
+def test_tables_of_cnn_ukf_are_those_of_the_report(table: str, part: str):
+    metrics = {
+        "mse_sideslip": "mse",
+        "mse_sideslip_nonlinear": "mse_nonlinear",
+        "max_error_sideslip": "max_error",
+        "max_error_sideslip_nonlinear": "max_error_nonlinear",
+    }
+    expected = {
+        (table, part, "test", candidate, metric): getattr(row, name)
+        for candidate, row in cnn_ukf.TABLES[part].items()
+        for metric, name in metrics.items()
+    }
+    figures = published_figures("cnn_ukf")
+    assert {key: value for key, value in figures.items() if key[0] == table} == expected
