@@ -12,13 +12,20 @@ import yaml
 import vehest_papers
 from vehest_papers.cnn_ukf import paper as cnn_ukf
 from vehest_papers.heavy_ekf import paper as heavy_ekf
+from vehest_papers.ksnn import paper as ksnn
 from vehest_papers.learned_ukf import paper as learned_ukf
 
 FOLDER = Path(vehest_papers.__file__).parent
 RESULTS = Path(__file__).parents[2] / "results"
-CLAIMS_BEFORE = {"learned_ukf": 42, "learned_ukf_sim": 12, "heavy_ekf": 52, "cnn_ukf": 42}
+CLAIMS_BEFORE = {
+    "learned_ukf": 42,
+    "learned_ukf_sim": 12,
+    "heavy_ekf": 52,
+    "cnn_ukf": 42,
+    "ksnn": 44,
+}
 """Study -> rows of its tables of claims before claims were data."""
-PAPERS = tuple(name for name in CLAIMS_BEFORE if name != "learned_ukf_sim")
+PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
 ROUNDING = 0.012  # relative: two printed figures of three digits each, and their ratio
 
 
@@ -202,3 +209,48 @@ def test_tables_of_cnn_ukf_are_those_of_the_report(table: str, part: str):
     }
     figures = published_figures("cnn_ukf")
     assert {key: value for key, value in figures.items() if key[0] == table} == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "constants"), [("Table IV", ksnn.TABLE_IV), ("Table V", ksnn.TABLE_V)]
+)
+@pytest.mark.parametrize("test_set", ["c2", "f2"])
+def test_tables_of_ksnn_are_those_of_the_report(table: str, constants: Any, test_set: str):
+    expected: dict[tuple[str, str], float] = {}
+    for candidate, row in constants.items():
+        expected[candidate, "fvu"] = row.fvu(test_set)
+        expected[candidate, "rmse_vy"] = row.rmse(test_set)
+    assert table_of("ksnn", table, test_set) == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "constants"), [("Table IV", ksnn.TABLE_IV), ("Table V", ksnn.TABLE_V)]
+)
+def test_structures_of_ksnn_are_those_of_the_report(table: str, constants: Any):
+    rows = [
+        row for own in read_claims("ksnn")["tables"] if own["table"] == table for row in own["rows"]
+    ]
+    for row in rows:
+        published = constants[row["candidate"]]
+        words = f"{published.n_parameters} parameters"
+        if published.structure != "–":
+            words = f"{published.structure}, {words}"
+        assert row["structure"] == words
+
+
+def test_table_vi_of_ksnn_is_that_of_the_report():
+    expected = {(name, "rmse_sideslip"): value for name, value in ksnn.TABLE_VI.items()}
+    assert table_of("ksnn", "Table VI", "test") == expected
+
+
+def test_table_vii_of_ksnn_is_that_of_the_report():
+    names = {ksnn.LSTM: "LSTM, 2 states", ksnn.NONLINEAR: "KS-NN nonlinear no bias, P = 2, Q = 2"}
+    parts = {True: "scheme_2", False: "one_vehicle"}
+    expected: dict[tuple[str, str, str, str, str], float] = {}
+    for (category, regularised), row in ksnn.TABLE_VII.items():
+        for test_set in ("c2", "f2"):
+            key = ("Table VII", parts[regularised], test_set, names[category])
+            expected[(*key, "fvu")] = row.fvu(test_set)
+            expected[(*key, "rmse_vy")] = row.rmse(test_set)
+    figures = published_figures("ksnn")
+    assert {key: value for key, value in figures.items() if key[0] == "Table VII"} == expected
