@@ -92,6 +92,18 @@ def test_mapping_names_claims_that_exist_and_says_why_others_were_removed():
 
 
 @pytest.mark.parametrize("paper", PAPERS)
+def test_paper_is_cited_by_its_doi(paper: str):
+    citation = yaml.safe_load((RESULTS.parent / "CITATION.cff").read_text(encoding="utf-8"))
+    content = read_claims(paper)
+    titles = {
+        reference["doi"]: reference["title"]
+        for reference in citation["references"]
+        if "doi" in reference
+    }
+    assert titles[content["doi"]].lower() in content["reference"].lower()
+
+
+@pytest.mark.parametrize("paper", PAPERS)
 def test_ids_are_unique(paper: str):
     ids = [claim["id"] for claim in read_claims(paper)["claims"]]
     assert sorted(set(ids)) == sorted(ids)
