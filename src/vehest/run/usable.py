@@ -24,6 +24,7 @@ from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
+from vehest.sources.base import car_of
 
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
@@ -110,8 +111,9 @@ def all_usabilities(
     }
     for name in estimator_names():
         configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
+    cars = [car_of(dataset)] if dataset else []
     return [
-        usability(name, with_car_values(config, [dataset] if dataset else []), recordings)
+        usability(name, with_car_values(config, cars), recordings)
         for name, config in configs.items()
     ]
 
