@@ -92,7 +92,9 @@ def replay_log(
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
         figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
-            lambda: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere), out, view
+            lambda clock: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere, clock=clock),
+            out,
+            view,
         )
     return {
         "log": str(log),
