@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from place import run_vehest
-from real_drives import real_drive
+from real_drives import real_drive, source_of
 from vehest.alignment.align import align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
@@ -556,6 +556,24 @@ def test_the_ratio_of_a_fast_ferrari_is_uncertain_and_covered(data_root):
     assert ratio.low <= 1.0 <= ratio.high
     assert abs(ratio.value - 1.0) < ratio.uncertainty
     assert abs(ratio.value - 1.0) > 2.0 * ratio.scatter
+
+
+@pytest.mark.parametrize(
+    ("dataset", "wheelbase", "truth", "n_recordings"),
+    [("tum", 3.0, 1.0, 3), ("ferrari_250lm_unlabelled", 2.4, 13.955, 4)],
+)
+def test_a_ratio_lies_within_two_deviations_on_every_recording_of_known_ratio(
+    data_root, dataset, wheelbase, truth, n_recordings
+):
+    """The DevBot's road-wheel angles have a ratio of 1, and the Ferrari's is that of its handwheel to `delta` of the same drive."""
+    source = source_of(data_root, dataset)
+    errors = []
+    for recording in source.ids():
+        settings = AlignmentSettings(("steering_ratio",), wheelbase=wheelbase)
+        ratio = align(source.read(recording), settings)["steering_ratio"]
+        errors.append((ratio.value - truth) / ratio.uncertainty)
+    assert len(errors) == n_recordings
+    assert np.abs(errors).max() < 2.0
 
 
 def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused():

@@ -10,12 +10,14 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import file_name
 from vehest.data.recording import Recording
@@ -43,9 +45,16 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 
 def plan_calibrate(
-    model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path
+    model: Artefact,
+    split: Split,
+    data: Mapping[str, Artefact],
+    output: Path,
+    cars: Mapping[str, CarValues],
 ) -> tuple[StagePlan, Callable[[Path], None]] | None:
-    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range."""
+    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range.
+
+    ``cars`` are values of the cars of data sets.
+    """
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
@@ -55,19 +64,33 @@ def plan_calibrate(
         for own in spans.values()
         for span in own
     }
-    config = {role: [str(span) for span in own] for role, own in spans.items()}
+    config: dict[str, Any] = {role: [str(span) for span in own] for role, own in spans.items()}
+    calibrated_cars = {
+        name: asdict(cars[name])
+        for name in sorted({span.dataset for span in split.validation})
+        if cars.get(name, UNKNOWN_CAR) != UNKNOWN_CAR
+    }
+    if calibrated_cars:
+        config["cars"] = calibrated_cars
     code = code_of(STAGE, read_description(model.folder).estimator)
     plan = StagePlan(STAGE, _label(model), config, inputs, code, output)
-    return plan, partial(_write, model.folder, split, data)
+    return plan, partial(_write, model.folder, split, data, cars)
 
 
-def _write(model_folder: Path, split: Split, data: Mapping[str, Artefact], folder: Path) -> None:
+def _write(
+    model_folder: Path,
+    split: Split,
+    data: Mapping[str, Artefact],
+    cars: Mapping[str, CarValues],
+    folder: Path,
+) -> None:
     """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
 
     def stretch(span: Span) -> Stretch:
         recording = read_recording(recording_file(data[span.dataset], span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
+        recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))
         return Stretch(
             recording, max(span.start, recording.start_time), span.dataset, span.describe()
         )
@@ -122,6 +145,13 @@ def learn_trust(
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
             horizon_steps=estimator.horizon_steps,
+            cars=tuple(
+                dict.fromkeys(
+                    stretch.recording.car
+                    for stretch in validation
+                    if stretch.recording.car != UNKNOWN_CAR
+                )
+            ),
         )
     except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))

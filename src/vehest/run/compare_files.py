@@ -16,10 +16,12 @@ import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
 from vehest.constants import FloatArray
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, listed, printable
 from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
+from vehest.data.schema import validated
 from vehest.data.splits import Span
 from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.estimators.static_map import StaticMap
@@ -40,7 +42,7 @@ from vehest.run.estimate import (
 )
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
-from vehest.sources.base import car_of, read_single
+from vehest.sources.base import read_single
 from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
@@ -79,7 +81,6 @@ def compare_files(
     files = [Path(word) for word in words if is_file_name(word)]
     settings, overrides = split_settings([word for word in words if not is_file_name(word)])
     config = compose_config("estimate", overrides)
-    car = car_of(config["dataset"])
     notes: list[str] = []
     trained_here: list[str] = []
     with use_limits(limits_from_config(config["limits"])):
@@ -100,7 +101,7 @@ def compare_files(
             )
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
-            model, trust, remarks = adapted(model, trust, car, settings)
+            model, trust, remarks = adapted(model, trust, drive.car, settings)
             notes += [f"'{name}': {remark}" for remark in remarks]
             if is_training_recording(folder, drive.id):
                 trained_here.append(f"'{name}'")
@@ -108,7 +109,13 @@ def compare_files(
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, same_vehicle_from_config(config)
             )
-        found = compare_estimates(drive, estimates, car.wheelbase)
+        wheelbase = drive.car.wheelbase
+        if "wheelbase" in settings:
+            of_command = {"wheelbase": settings["wheelbase"]}
+            wheelbase = validated(
+                CarValues, of_command, "", error=ConfigurationError, group="estimator"
+            ).wheelbase
+        found = compare_estimates(drive, estimates, wheelbase)
     if trained_here:
         found["verdict"] = (
             f"No estimator can be called best: {listed(trained_here)} "
@@ -122,9 +129,7 @@ def compare_files(
         for row in found["rows"]
     ]
     scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
-    of_wheelbase = (
-        "wheelbase not known" if car.wheelbase is None else f"wheelbase {car.wheelbase:g} m"
-    )
+    of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
         f", sideslip from {found['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
         f"{100 * found['share_below_min_speed']:.1f} % of the samples"

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording_summary import RecordingSummary
 from vehest.data.splits import Split
@@ -51,6 +52,7 @@ class Comparison:
     ] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
+    cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
     found: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
@@ -92,8 +94,9 @@ class Comparison:
             split = runner.split(usable[0].config)
             contents = runner.contents(usable[0].config)
             runner.warn_of_references(split, usable[0].config)
+            self.cars = runner.cars(usable[0].config, split.datasets)
             for job in usable:
-                job.config = with_car_values(job.config, runner.datasets_of(job.config))
+                job.config = with_car_values(job.config, self.cars.values())
             notes = dict.fromkeys(
                 note for job in usable for note in _fit_to_recordings(job, split, contents)
             )
@@ -166,6 +169,7 @@ class Comparison:
                 replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None,
                 force,
                 label,
+                self.cars,
             )
             for (_, faults, label), own in groups.items()
         ]

@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from vehest.data.car import CarValues
 from vehest.data.errors import DataError
 from vehest.data.recording_summary import RecordingSummary, stored_summary
 from vehest.data.split_files import Reader, dataset_names, split_from_config
@@ -189,9 +190,13 @@ class Runner:
             for name in split.datasets
         }
 
+    def cars(self, config: Config, datasets: Iterable[str]) -> dict[str, CarValues]:
+        """Values of the cars of data sets."""
+        return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
         """How estimates are scored, with the lowest speed of sideslip on each data set, by its car."""
-        cars = {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+        cars = self.cars(config, datasets)
         return protocol_from_config(config["evaluation"]).with_wheelbases(
             {name: car.wheelbase for name, car in cars.items()}
         )
@@ -210,7 +215,16 @@ class Runner:
         kinds = {
             name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets
         }
-        return Evaluation(split, data, references, kinds, protocol, self.output, faults)
+        return Evaluation(
+            split,
+            data,
+            references,
+            kinds,
+            protocol,
+            self.output,
+            faults,
+            self.cars(config, split.datasets),
+        )
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         """Make an artefact unless it is there."""

@@ -6,7 +6,7 @@ jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> re
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +20,13 @@ from vehest.data.errors import (
     VehestError,
 )
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
 from vehest.run.calibrate import calibration_of, plan_calibrate
 from vehest.run.comparison import Comparison, lower_rate, named_failures, print_notes, slowest
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import fault_figures, test_figures
+from vehest.run.evaluate import Evaluation, fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
@@ -382,7 +381,7 @@ def evaluate_one(
             assert group.evaluation is not None
             trained = found
             how = group.evaluation
-        calibration = _calibration(trained, split, how.data, runner)
+        calibration = _calibration(trained, how, runner)
         artefact = runner.ensure(*how.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
     return {
@@ -393,16 +392,14 @@ def evaluate_one(
     }
 
 
-def _calibration(
-    model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner
-) -> Artefact | None:
+def _calibration(model: Artefact, how: Evaluation, runner: Runner) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
     learnt = learnt_spans(model)
     found = None
     if model.status == "complete" and (
-        not learnt or set(learnt) == {*split.train, *split.validation}
+        not learnt or set(learnt) == {*how.split.train, *how.split.validation}
     ):
-        job = plan_calibrate(model, split, data, runner.output)
+        job = plan_calibrate(model, how.split, how.data, runner.output, how.cars)
         if job is not None:
             found = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests

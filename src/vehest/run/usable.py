@@ -24,6 +24,7 @@ from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
+from vehest.sources.base import car_of
 
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
@@ -132,7 +133,9 @@ def _usability_with_car(
     dataset: Mapping[str, Any] | None,
 ) -> Usability:
     """A row with the car of a data set, if any."""
-    return usability(name, with_car_values(config, [dataset] if dataset else []), recordings)
+    return usability(
+        name, with_car_values(config, [car_of(dataset)] if dataset else []), recordings
+    )
 
 
 def usability(
