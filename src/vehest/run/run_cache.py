@@ -203,24 +203,6 @@ class RunCache:
         return digest.hexdigest()
 
 
-def stamp_of(path: str) -> str:
-    """Hash of names, sizes, times and inodes of all files below a folder, links followed; times of inodes show replaced files."""
-    entries: list[tuple[str, int, int, int, int]] = []
-    visited: set[str] = set()
-    for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
-        if os.path.realpath(folder) in visited:
-            folders.clear()
-            continue
-        visited.add(os.path.realpath(folder))
-        for file in (os.path.join(folder, name) for name in names):
-            with suppress(OSError):  # a link to nothing
-                about = os.stat(file)
-                entries.append(
-                    (file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino)
-                )
-    return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
-
-
 def _configuration(pipeline: str) -> Iterator[Path]:
     """Files of the configuration and of the pipeline, with the one that it is based on."""
     for folder in [*conf_folders(), packaged("pipelines")]:
