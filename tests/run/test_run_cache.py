@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from vehest.run.run_cache import RunCache, stamp_of
+from vehest.data.files import stamp_of
+from vehest.run.run_cache import RunCache
 
 HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
 WORDS = ("small", "tracking=none")
@@ -139,9 +140,9 @@ def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_ov
 def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
     (tmp_path / "again").symlink_to(tmp_path)  # walked once
     (tmp_path / "lap.csv").write_text("1")
-    before = stamp_of(str(tmp_path))
+    before = stamp_of(tmp_path)
     about = (tmp_path / "lap.csv").stat()
     (tmp_path / "new.csv").write_text("2")
     os.utime(tmp_path / "new.csv", ns=(about.st_atime_ns, about.st_mtime_ns))
     os.replace(tmp_path / "new.csv", tmp_path / "lap.csv")
-    assert stamp_of(str(tmp_path)) != before
+    assert stamp_of(tmp_path) != before
