@@ -41,7 +41,10 @@ class DataSheet(Recursive):
         unit="m",
     )
     cornering_coefficient: float = setting(
-        10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True
+        10.0,
+        "cornering stiffness of the rear axle over its load; assumed",
+        unit="1/rad",
+        positive=True,
     )
 
     def check(self) -> None:
