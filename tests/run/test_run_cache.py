@@ -1,5 +1,6 @@
 """A finished study is recognised by what it was made from, and prints what a run in full would print."""
 
+import json
 import os
 import subprocess
 import sys
@@ -105,6 +106,8 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
         changed(file, file.read_bytes() + b"\n# a comment\n")
     manifest = next((study.folder / "outputs" / "evaluate").glob("*/manifest.json"))
     changed(manifest, manifest.read_bytes().replace(b'"sha256": "', b'"sha256": "0', 1))
+    key = json.loads(manifest.read_bytes())["key"]
+    changed(manifest, manifest.read_bytes().replace(key.encode(), key[::-1].encode(), 1))
     estimate = next((study.folder / "outputs" / "evaluate").glob("*/test/0.parquet"))
     changed(estimate, b"")
     record = next((study.folder / "outputs" / "finished").glob("*.json"))
