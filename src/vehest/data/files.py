@@ -192,6 +192,31 @@ def sha256_of(path: Path) -> str:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
 
 
+def stamp_of(*paths: Path) -> str:
+    """Hash of names, sizes, times and inodes of files and of all files below folders, but for compiled code; links are followed.
+
+    Times of inodes show files that were replaced by others of the same size and date.
+    """
+    files = {str(path) for path in paths}
+    visited: set[str] = set()
+    for path in paths:
+        for folder, folders, names in os.walk(path, followlinks=True):
+            if os.path.realpath(folder) in visited or folder.endswith("__pycache__"):
+                folders.clear()
+                continue
+            visited.add(os.path.realpath(folder))
+            files.update(os.path.join(folder, name) for name in names)
+    states = []
+    for file in sorted(files):
+        with suppress(OSError):  # a link to nothing
+            about = os.stat(file)
+            if not stat.S_ISDIR(about.st_mode):
+                states.append(
+                    (file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino)
+                )
+    return hashlib.sha256(repr(states).encode("utf-8", "surrogateescape")).hexdigest()
+
+
 @cache
 def _host() -> str:
     """Start of a hash of this host's name, since process numbers mean nothing on another host that shares the folder."""

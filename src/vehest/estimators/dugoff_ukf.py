@@ -189,7 +189,9 @@ class DugoffUkf(SigmaPointEstimator):
         "full",
         "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car",
     )
-    curve: Literal["plain", "smooth"] = setting("plain", "tyres of Eq. 9 (plain) or 10 (smooth)")
+    curve: Literal["plain", "smooth"] = setting(
+        "plain", "tyres of Eq. 9 (plain) or 10 (smooth), as in training through the filter"
+    )
     minimum_speed: float = setting(
         3.0,
         "speed below which wheels roll without slip, and nothing counts as measured",
@@ -208,8 +210,11 @@ class DugoffUkf(SigmaPointEstimator):
         "low-pass of f Hz",
         positive=True,
     )
-    noise: TrackLevels = setting(TrackLevels(), "levels of noise")
-    tyres: AxleTyres = setting(AxleTyres(), "of both axles")
+    noise: TrackLevels = setting(TrackLevels(), "standard deviations; null: found by the training")
+    tyres: AxleTyres = setting(
+        AxleTyres(),
+        "of both axles, all or none; null: identified on training recordings with a reference",
+    )
     car: LoadedCar = setting(
         BMW_545I, "BMW 545i of Bertipaglia et al. 2024; replace by your car's parameters"
     )

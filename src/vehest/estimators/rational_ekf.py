@@ -168,8 +168,14 @@ class RationalFilter(SideslipFilter):
         unit="m/s²",
         least=0.0,
     )
-    noise: TrackNoise = setting(TrackNoise(), "levels of noise")
-    curves: AxleCurves = setting(AxleCurves(), "axle curves")
+    noise: TrackNoise = setting(
+        TrackNoise(),
+        "standard deviations, the first three all or none; null: found by the training",
+    )
+    curves: AxleCurves = setting(
+        AxleCurves(),
+        "of the axles at friction 1, all or none; null: fitted to the reference sideslip",
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)

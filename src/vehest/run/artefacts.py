@@ -1,6 +1,6 @@
 """Artefacts: one folder a stage, with a manifest; a folder is complete, or it does not exist.
 
-StagePlan -> `find`, or `make` under its lock -> Artefact
+StagePlan -> `find`, or `make` under its lock -> Artefact; folder, key -> `valid_artefact` -> Artefact or none
 
 The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration (`keys`), the
 digests of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
@@ -141,15 +141,30 @@ class Manifest:
 
 
 def find(plan: StagePlan, warn: Callable[[str], None] = lambda text: None) -> Artefact | None:
-    """The complete artefact of a plan; none where it is missing, damaged (which ``warn`` is told), interrupted or another's."""
+    """The artefact of a plan, as `valid_artefact`."""
+    return valid_artefact(plan.folder, plan.key, warn)
+
+
+def valid_artefact(
+    folder: Path,
+    key: str,
+    warn: Callable[[str], None] = lambda text: None,
+    *,
+    hash_files: bool = True,
+) -> Artefact | None:
+    """The artefact of a folder, if it is valid for a key; there is no other check of that.
+
+    None where it is missing, damaged (which ``warn`` is told), interrupted or of another key. ``hash_files`` is that of
+    `read_artefact`.
+    """
     try:
-        artefact = read_artefact(plan.folder)
+        artefact = read_artefact(folder, hash_files=hash_files)
     except MissingError:
         return None
     except DataError as error:
         warn(f"damaged, and not used: {error}")
         return None
-    return artefact if artefact.key == plan.key and artefact.status == "complete" else None
+    return artefact if artefact.key == key and artefact.status == "complete" else None
 
 
 def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:

@@ -19,6 +19,7 @@ from vehest.data.errors import (
     MissingError,
     VehestError,
 )
+from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.run.artefacts import Artefact, find
 from vehest.run.calibrate import calibration_of, plan_calibrate
@@ -44,7 +45,7 @@ from vehest.run.publishing import (
 )
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
-from vehest.run.run_cache import Ran, RunCache, stamp_of
+from vehest.run.run_cache import Ran, RunCache
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
@@ -139,7 +140,7 @@ def run_study(
         for part in study.parts:
             used += runner.datasets_of(_first(jobs[part]))
         raw = {
-            path: stamp_of(path)
+            path: stamp_of(Path(path).expanduser())
             for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)
         }
         datasets: list[StoredDataset | AbsentDataset] = []
