@@ -107,6 +107,7 @@ class Paper:
     study: str
     recommendation: str
     parts: Mapping[str, Origin]
+    test_sets: Mapping[str, str]  # what each is, in a few words
     candidates: Mapping[str, Candidate]
     claims: list[Claim]
     tables: list[Table]
@@ -213,10 +214,12 @@ def _check_names(paper: Paper, where: str) -> None:
             _check_declared(paper.candidates, claim.names, "candidates", here)
             parts = [claim.part, *([claim.other_part] if claim.other_part else [])]
             _check_declared(paper.parts, parts, "parts", here)
+            _check_declared(paper.test_sets, [claim.test_set], "test_sets", here)
     for table in paper.tables:
         here = f"{where}, table {table.table!r}"
         _check_declared(paper.candidates, [row.candidate for row in table.rows], "candidates", here)
         _check_declared(paper.parts, [table.part], "parts", here)
+        _check_declared(paper.test_sets, [table.test_set], "test_sets", here)
 
 
 def _check_declared(
