@@ -115,7 +115,9 @@ def read_study(name: str, results: Path, claims_folder: Path = CLAIMS_FOLDER) ->
     if (tables / "training.csv").exists():
         training = read_training(tables / "training.csv")
     rows = [
-        (table, row, judge_row(row, table, blocks)) for table in paper.tables for row in table.rows
+        (table, row, judge_row(row, table, blocks, training))
+        for table in paper.tables
+        for row in table.rows
     ]
     return Study(paper, training, judge_paper(paper, blocks, training), rows, blocks is not None)
 
@@ -210,7 +212,7 @@ def _page(studies: Sequence[Study], results: Path) -> str:
     ]
     for study in studies:
         lines += _section(study, results)
-    return "\n".join(lines)
+    return "\n".join([*lines, *_section_of_planted_truth(results)])
 
 
 def _section(study: Study, results: Path) -> list[str]:
@@ -275,6 +277,38 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
             ),
             cells,
         ),
+        "",
+    ]
+
+
+def _section_of_planted_truth(results: Path) -> list[str]:
+    """Rates of verdicts on simulated studies, as `vehest_papers.planted_truth` found them."""
+    path = results / "scorecard" / "planted_truth.csv"
+    headings = {
+        "design": "blocks",
+        "seeds": "seeds",
+        "truth": "truth",
+        "wrong": "wrong",
+        "reproduced": "reproduced",
+        "direction only": "direction only",
+        "contradicted": "contradicted",
+        "no significant difference": "no significant difference",
+        "size_covered": "size in interval",
+        "wrong_equality": "wrong of equality",
+    }
+    rows = read_rows(path, tuple(headings))
+    cells = [[_text(row[name]) for name in headings] for row in rows]
+    return [
+        "## How often these verdicts are right",
+        "",
+        f"Per cent of {rows[0]['studies']} simulated studies each, made of real errors",
+        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant difference where there",
+        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where it is true or",
+        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in their interval. The",
+        "rows with one seed show why a candidate that was trained once gets no verdict. *Reproduced* excludes that there",
+        "is no effect, not that the effect is half the paper's: the interval of the size shows what is excluded.",
+        "",
+        *_table(list(headings.values()), cells, n_text=3),
         "",
     ]
 

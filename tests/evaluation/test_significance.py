@@ -197,9 +197,9 @@ def test_log_ratio_of_pooled_sums_has_the_error_of_the_delta_method():
 
 
 def test_power_is_that_of_the_noncentral_t_and_grows_with_blocks():
-    contrast = Contrast(0.3, ((0.04, 11.0), (0.01, 2.0)), 12)
-    assert contrast.dof == pytest.approx(0.05**2 / (0.04**2 / 11.0 + 0.01**2 / 2.0))
-    expected = stats.nct.sf(stats.t.ppf(0.975, contrast.dof), contrast.dof, 0.5 / math.sqrt(0.05))
+    contrast = Contrast(0.3, ((0.04, 11.0), (0.004, 2.0)), 12)
+    assert contrast.dof == pytest.approx(0.044**2 / (0.04**2 / 11.0 + 0.004**2 / 2.0))
+    expected = stats.nct.sf(stats.t.ppf(0.975, contrast.dof), contrast.dof, 0.5 / math.sqrt(0.044))
     assert contrast.power(-0.5) == pytest.approx(expected)
     needed = contrast.blocks_needed(0.5, 0.8)
     assert contrast.with_blocks(needed).power(0.5) >= 0.8

@@ -201,8 +201,8 @@ def test_equality_to_a_value_and_value_of_a_table():
     assert judged(claim, blocks).verdict == "reproduced"
     table = Table("Table I", "real", "test", [])
     for published, verdict in ((1.0, "reproduced"), (2.0, "contradicted"), (1.105, "inconclusive")):
-        assert judge_row(Row("a", "mse", published, "1"), table, blocks).verdict == verdict
-    assert judge_row(Row("a", "mse", 1.0, "1"), table, None).verdict == "not assessed"
+        assert judge_row(Row("a", "mse", published, "1"), table, blocks, {}).verdict == verdict
+    assert judge_row(Row("a", "mse", 1.0, "1"), table, None, {}).verdict == "not assessed"
 
 
 def test_measured_values_are_judged_by_student_s_interval_of_their_mean():
@@ -228,7 +228,7 @@ def test_diverged_blocks_are_left_out_and_counted():
     assert found.verdict == "reproduced"
     assert found.n_blocks == N - 1
     assert found.diverged == {"a": 0, "b": 1}
-    assert "b diverged in 1 pair" in found.reason
+    assert "b diverged in 1 of the pairs" in found.reason
     # whoever wins where it survives, but diverges more often, has not won
     first[0, :2] = np.nan
     found = judged(claim_of(), studied(a=first, b=second))
@@ -247,17 +247,28 @@ def test_one_block_gives_values_and_no_test():
     assert judged(limit, blocks).verdict == "inconclusive"
 
 
-def test_candidate_that_was_trained_once_is_pointed_out():
-    blocks = studied(a=ratio(0.5), b=LEVELS)
+def test_candidate_that_was_trained_once_gets_no_verdict():
     trained = {
         "a": Training("10", "1000", "insufficient", ""),
         "b": Training("", "", "not applicable", ""),
     }
-    found = judged(claim_of(), blocks, trained)
-    assert "a was trained once" in found.reason
-    assert "b was trained" not in found.reason
-    assert least_training(claim_of(), trained)[1].state == "insufficient"
-    assert least_training(claim_of(), {})[1].state == "not checked"
+    found = judged(claim_of(), studied(a=ratio(0.5), b=LEVELS), trained)
+    assert found.verdict == "no significant difference"
+    assert "a trained once" in found.reason
+    twice = studied(a=[ratio(0.5), ratio(0.5)], b=LEVELS)
+    assert judged(claim_of(), twice, trained).verdict == "reproduced"
+    limit = claim_of("limit", direction="lower", limit=1.0)
+    assert judged(limit, studied(a=LEVELS), trained).verdict == "inconclusive"
+    assert judged(limit, studied(a=LEVELS), {}).verdict == "reproduced"
+
+
+def test_a_claim_has_the_training_of_its_least_trained_candidate():
+    trained = {
+        "a": Training("10", "1000", "insufficient", ""),
+        "b": Training("1000", "1000", "sufficient", ""),
+    }
+    assert least_training(claim_of(), trained) == ("a", trained["a"])
+    assert least_training(claim_of(), {"b": trained["b"]})[1].state == "not checked"
 
 
 def test_same_trainings_are_compared_seed_by_seed():

@@ -238,10 +238,13 @@ class Contrast:
         def suffices(n_blocks: int) -> bool:
             return self.with_blocks(n_blocks).power(true_value, level) >= power
 
-        if not suffices(MAX_BLOCKS):
-            return None
-        too_few = 1
-        enough = MAX_BLOCKS
+        # by doubling, since with many blocks the seeds' few degrees of freedom can lower the power
+        enough = 2
+        while not suffices(enough):
+            enough *= 2
+            if enough > MAX_BLOCKS:
+                return None
+        too_few = enough // 2
         while enough - too_few > 1:
             middle = (too_few + enough) // 2
             too_few, enough = (too_few, middle) if suffices(middle) else (middle, enough)
