@@ -41,8 +41,8 @@ PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
 TITLES = {
     "ksnn": "KS-NN",
     "learned_ukf": "Learned UKF",
-    "heavy_ekf": "Adaptive EKF of a heavy vehicle",
-    "cnn_ukf": "UKF-informed network",
+    "heavy_ekf": "Heavy-vehicle EKF",
+    "cnn_ukf": "CNN-UKF",
 }
 CLAIMS_FOLDER = Path(__file__).parent
 CSV_COLUMNS = (
@@ -177,42 +177,32 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         "## Verdicts on the papers' claims",
         "",
-        *_table(
-            ("paper", "claims", *VERDICTS),
-            [
-                (
-                    _linked(study),
-                    str(study.counts().total()),
-                    *(str(study.counts()[verdict] or MISSING) for verdict in VERDICTS),
-                )
-                for study in studies
-            ],
-            n_text=1,
-        ),
+        *_table_of_counts(studies, "verdict", VERDICTS, [study.counts() for study in studies]),
         "",
         f"*Not assessed*: {NOT_PUBLISHED}, or not of this candidate.",
         "",
         "Training of the least trained candidate of each claim that was assessed:",
         "",
-        *_table(
-            ("paper", *TRAINING_STATES[::-1]),
-            [
-                (
-                    _linked(study),
-                    *(
-                        str(study.counts_of_training()[state] or MISSING)
-                        for state in TRAINING_STATES[::-1]
-                    ),
-                )
-                for study in studies
-            ],
-            n_text=1,
+        *_table_of_counts(
+            studies,
+            "training",
+            TRAINING_STATES[::-1],
+            [study.counts_of_training() for study in studies],
         ),
         "",
     ]
     for study in studies:
         lines += _section(study, results)
     return "\n".join([*lines, *_section_of_planted_truth(results)])
+
+
+def _table_of_counts(
+    studies: Sequence[Study], heading: str, words: Sequence[str], counts: Sequence[Counter[str]]
+) -> list[str]:
+    """Number of claims of each paper, a row a word, with their sum."""
+    rows = [(word, *(str(number[word] or MISSING) for number in counts)) for word in words]
+    rows.append(("all", *(str(number.total()) for number in counts)))
+    return _table((heading, *(_linked(study) for study in studies)), rows, n_text=1)
 
 
 def _section(study: Study, results: Path) -> list[str]:
