@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vehest_papers import planted_truth, scorecard
+from vehest_papers.kit.verdicts import VERDICTS
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -29,14 +30,15 @@ def test_every_old_claim_is_mapped_and_every_paper_is_counted(files):
     before = (scorecard.CLAIMS_FOLDER / "claims_before.csv").read_text(encoding="utf-8")
     assert len(changed) == len(list(csv.DictReader(before.splitlines())))
     rows = list(csv.DictReader(files["scorecard.csv"].splitlines()))
-    counts = [
-        line for line in files["scorecard.md"].splitlines() if re.match(r"\| \[.*\) \| \d", line)
+    page = files["scorecard.md"].split("## Verdicts on the papers' claims")[1]
+    table = [line.strip("|").split("|") for line in page.splitlines() if line.startswith("|")]
+    cells = [row[1:] for row in table[2 : 3 + len(VERDICTS)]]
+    counts = np.array([[int(cell.replace("–", "0")) for cell in row] for row in cells])
+    of_papers = [
+        sum(row["paper"] == paper and row["row"] == "claim" for row in rows)
+        for paper in scorecard.PAPERS
     ]
-    for paper, line in zip(scorecard.PAPERS, counts[: len(scorecard.PAPERS)], strict=True):
-        number = sum(row["paper"] == paper and row["row"] == "claim" for row in rows)
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        assert int(cells[1]) == number
-        assert sum(int(cell) for cell in cells[2:] if cell != "–") == number
+    assert counts[-1].tolist() == counts[:-1].sum(axis=0).tolist() == of_papers
 
 
 def test_readme_names_and_links_the_four_papers(files):
