@@ -140,12 +140,12 @@ def test_blocks_are_read(tmp_path):
     path = tmp_path / "blocks.csv"
     path.write_text(
         HEADER
-        + "real,a,0,test,mse,x,1.5,10\nreal,a,0,test,mse,y,inf,20\n"
+        + "real,a,0,test,mse,x,1.5,10\nreal,a,0,test,mse,y,,20\n"
         + "real,a,1,test,mse,y,4,20\nreal,a,1,test,mse,x,3,10\n"
     )
     errors = read_blocks(path)[Key("real", "a", "test", "mse")]
     assert errors.blocks == ("x", "y")
-    np.testing.assert_array_equal(errors.sums, [[1.5, np.inf], [3.0, 4.0]])
+    np.testing.assert_array_equal(errors.sums, [[1.5, np.nan], [3.0, 4.0]])
     np.testing.assert_array_equal(errors.sizes, [10.0, 20.0])
 
 

@@ -106,3 +106,15 @@ def test_published_rates_are_nominal_with_three_seeds():
             assert float(row["size_covered"]) >= 93.0
             if row["truth"] == "no effect":
                 assert float(row["wrong"]) <= 7.0
+
+
+@pytest.mark.slow
+def test_published_rates_are_made_of_the_committed_errors():
+    traces = planted_truth.read_traces(RESULTS / "scorecard" / "error_traces.csv")
+    with open(RESULTS / "scorecard" / "planted_truth.csv", encoding="utf-8") as stream:
+        published = {
+            (row["design"], row["seeds"], row["truth"]): row for row in csv.DictReader(stream)
+        }
+    for design in planted_truth.DESIGNS:
+        row = planted_truth.rates(traces, design, 3, "no effect", planted_truth.N_STUDIES)
+        assert row == published[design.name, "3", "no effect"]

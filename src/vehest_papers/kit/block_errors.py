@@ -60,7 +60,7 @@ class Training:
 
 
 def read_blocks(path: Path) -> dict[Key, BlockErrors]:
-    """Read blocks.csv, a row for each block and seed.
+    """Read blocks.csv, a row for each block and seed; an empty value is one that is not finite.
 
     Raises
     ------
@@ -82,7 +82,8 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
             raise DataError(
                 f"'{path}': {_named(key, *cell)} has size {row['size']}; write its samples"
             )
-        of_key[cell] = (number_in(row, "value", path), size)
+        value = number_in(row, "value", path) if row["value"] else np.nan
+        of_key[cell] = (value, size)
     return {key: _arranged(key, of_key, path) for key, of_key in cells.items()}
 
 
