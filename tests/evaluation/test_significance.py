@@ -205,3 +205,12 @@ def test_power_is_that_of_the_noncentral_t_and_grows_with_blocks():
     assert contrast.with_blocks(needed).power(0.5) >= 0.8
     assert contrast.with_blocks(needed - 1).power(0.5) < 0.8
     assert contrast.blocks_needed(0.1, 0.8) is None  # the seeds' variance alone is too large
+
+
+def test_degrees_of_freedom_are_at_least_those_of_two_seeds():
+    """Seeds that add nothing beyond chance must not make the interval endless."""
+    rng = np.random.default_rng(0)
+    contrasts = [mean_contrast(rng.normal(size=(3, 14))) for _ in range(300)]
+    assert min(contrast.dof for contrast in contrasts) == 1.0
+    covered = [low <= 0.0 <= high for low, high in (own.interval() for own in contrasts)]
+    assert 0.93 < np.mean(covered) <= 1.0

@@ -192,7 +192,10 @@ class Contrast:
         """Degrees of freedom of Student's t."""
         spread = sum(variance**2 / free for variance, free in self.parts)
         total = sum(variance for variance, _ in self.parts)
-        return total**2 / spread if spread > 0 else float(self.parts[0][1])
+        if spread == 0:
+            return float(self.parts[0][1])
+        # below 1 by chance where the seeds' variance is small: two seeds alone have 1
+        return max(total**2 / spread, 1.0)
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Both ends of the interval."""
