@@ -1,9 +1,11 @@
 """Every trained model in C against Python, over whole drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
-Models are those in the output root's train/ that learnt on the real Ferrari, the F1TENTH or, if on neither, the SIMULATED BMW, one a
-variant, and the self-calibrating filter that comes with vehest; drives are the Ferrari's test range, 550 to 700 s, a test run of the F1TENTH and a test drive of the BMW. All run under the
-contract with limits, health and bands. Python computes the same in float64 for the differences; its time is that of the model as it is.
-One core, the least of some passes over the whole drive in C, one pass in Python and in onnxruntime, all in the same run.
+Models are those in the output root's train/ that learnt on the real Ferrari, the F1TENTH or, if on
+neither, the SIMULATED BMW, one a variant, and the self-calibrating filter that comes with vehest;
+drives are the Ferrari's test range, 550 to 700 s, a test run of the F1TENTH and a test drive of the
+BMW. All run under the contract with limits, health and bands. Python computes the same in float64
+for the differences; its time is that of the model as it is. One core, the least of some passes over
+the whole drive in C, one pass in Python and in onnxruntime, all in the same run.
 """
 
 from __future__ import annotations

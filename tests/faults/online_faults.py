@@ -30,8 +30,8 @@ import torch
 import vehest
 from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
-from vehest.sources.base import open_source
 from vehest.run.table_records import record_tables
+from vehest.sources.base import open_source
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.watch import STARTED
