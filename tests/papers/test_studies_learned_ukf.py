@@ -345,7 +345,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     }
     assert "Tyre sets: SIMULATED data" in text
     assert "Not in this report, since the recordings are missing: Curved tyres" in text
-    assert "authors' public code" not in text
+    assert "authors' public code" in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
     assert f"P{remark[1:]}." in text
