@@ -30,6 +30,7 @@ from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.table_records import changes_of_tables
 from vehest.run.train import estimator_rate, training_options
 from vehest.run.versions import code_of, is_of_other_stages
 
@@ -238,6 +239,12 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
     if published is None:
         changes = []
         note = f"there is nothing in '{RESULTS / study}' that vehest published"
+    elif published.tables:
+        changes, note = changes_of_tables(
+            published.tables, published.keys, RESULTS / study, overrides
+        )
+        complete = not any(record.without_keys for record in published.tables.values())
+        state = "stale" if changes else "up to date" if complete else "not known"
     elif not published.keys:
         changes = []
         note = "published before keys were recorded; run it again"

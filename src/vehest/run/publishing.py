@@ -44,6 +44,16 @@ class Publication:
 
 
 @dataclass(frozen=True)
+class TableRecord:
+    """How a table that no pipeline publishes was made (`vehest.run.table_records`)."""
+
+    __pydantic_config__ = FURTHER_KEYS
+    command: str
+    commit: str
+    without_keys: str = ""  # what of the table was made before keys were recorded; empty: nothing
+
+
+@dataclass(frozen=True)
 class Published:
     """The part of a published study's provenance.json that later runs compare."""
 
@@ -52,6 +62,7 @@ class Published:
     parts: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
     keys: Keys = field(default_factory=dict)  # empty where they were not recorded yet
+    tables: dict[str, TableRecord] = field(default_factory=dict)  # of a folder without a pipeline
 
 
 def published_in(folder: Path) -> Published | None:
