@@ -127,7 +127,7 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 ksnn: $(INSTALLED) ## every statement of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on real ones: hours
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
-learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and an hour and a half on one core
+learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about a day on two cores
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
 learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with fewer candidates, in minutes
