@@ -141,12 +141,10 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
         ]
         if paper.NN in groups and groups[paper.NN][0].training:
             words.append(
-                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it"
+                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step"
             )
         if words:
-            sentences.append(
-                f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md."
-            )
+            sentences.append(f"Epochs ({words_of_kinds(part)}): {', '.join(words)}.")
     return " ".join(sentences)
 
 
