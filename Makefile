@@ -128,7 +128,7 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 ksnn: $(INSTALLED) ## every statement of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on real ones: hours
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
-learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and an hour and a half on one core
+learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about a day on two cores
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
 heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
