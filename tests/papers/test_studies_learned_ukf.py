@@ -368,7 +368,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert blocks.columns.tolist() == list(BlockRow.__dataclass_fields__)
     assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
     keys = ["candidate", "seed", "metric"]
-    ours = blocks[(blocks["part"] == "simulated") & (blocks["test_set"] == "tyre_a")]
+    ours = blocks[(blocks["part"] == "real") & (blocks["test_set"] == "tyre_a")]
     ours = ours.groupby(keys)[["value", "size"]].sum()
     known = metric_values(part)
     for candidate, models in models_by_candidate(part).items():
@@ -377,13 +377,13 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
                 value, size = ours.loc[(candidate, own.seed, metric)]
                 figure = known[own.estimator, own.variant, own.seed, "tyre_a", metric]
                 assert (value / size) ** power == pytest.approx(figure, rel=1e-9)
-    swaps = document.data["figure_6_simulated"].set_index(
+    swaps = document.data["figure_6_real"].set_index(
         ["test_set", "seed", "predicts", "observes"]
     )["mse"]
     value, size = ours.loc[("NNTF_U predicting, NNTF observing", 1, "mse_weighted")]
     assert value / size == pytest.approx(swaps["tyre_a", 1, "NNTF_U", "NNTF"])
     assert size == ours.loc[("NNTF", 1, "mse_weighted"), "size"]
-    one_step = document.data["figure_5_simulated"].set_index(["test_set", "seed", "task", "state"])
+    one_step = document.data["figure_5_real"].set_index(["test_set", "seed", "task", "state"])
     value, size = ours.loc[("NNTF", 0, "one_step_rmse_wheel_speed")]
     assert value / size == pytest.approx(
         one_step.loc[("tyre_a", 0, "one_step", "rim_speed"), "before"]
