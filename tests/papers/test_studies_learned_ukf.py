@@ -377,9 +377,9 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
                 value, size = ours.loc[(candidate, own.seed, metric)]
                 figure = known[own.estimator, own.variant, own.seed, "tyre_a", metric]
                 assert (value / size) ** power == pytest.approx(figure, rel=1e-9)
-    swaps = document.data["figure_6_real"].set_index(
-        ["test_set", "seed", "predicts", "observes"]
-    )["mse"]
+    swaps = document.data["figure_6_real"].set_index(["test_set", "seed", "predicts", "observes"])[
+        "mse"
+    ]
     value, size = ours.loc[("NNTF_U predicting, NNTF observing", 1, "mse_weighted")]
     assert value / size == pytest.approx(swaps["tyre_a", 1, "NNTF_U", "NNTF"])
     assert size == ours.loc[("NNTF", 1, "mse_weighted"), "size"]
