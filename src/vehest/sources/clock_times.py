@@ -49,7 +49,8 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
 def past_midnight(times: FloatArray) -> FloatArray:
     """Times since midnight that go on past the next [s], (N,), of times of day.
 
-    Midnight passes from the last hour of a day to the first of the next; any other step back, as after a stray 23:59:59, is one.
+    Midnight is a step from the last hour of a day to the first of the next. Any other step back, such as that after a stray 23:59:59,
+    stays a step back.
     """
     is_midnight = (times[:-1] > DAY - HOUR) & (times[1:] < HOUR)
     return np.asarray(

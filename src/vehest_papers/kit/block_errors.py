@@ -5,24 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.text_files import number_in, read_rows
+from vehest_papers.kit.block_rows import BlockRow, TrainingRow, TrainingState, columns_of
 
-BLOCK_COLUMNS = ("part", "candidate", "seed", "test_set", "metric", "block", "value", "size")
-TRAINING_COLUMNS = ("candidate", "epochs", "epochs_paper", "training", "reason")
-
-TrainingState = Literal["insufficient", "not checked", "sufficient", "not applicable"]
-TRAINING_STATES: tuple[TrainingState, ...] = (
-    "insufficient",
-    "not checked",
-    "sufficient",
-    "not applicable",
-)  # from the least to the best trained
+TRAINING_STATES: tuple[TrainingState, ...] = get_args(TrainingState)  # from the least trained on
 
 
 class Key(NamedTuple):
@@ -71,7 +63,7 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
         block differs between seeds.
     """
     cells: dict[Key, dict[tuple[str, str], tuple[float, float]]] = {}
-    for row in read_rows(path, BLOCK_COLUMNS):
+    for row in read_rows(path, columns_of(BlockRow)):
         key = Key(row["part"], row["candidate"], row["test_set"], row["metric"])
         cell = (row["seed"], row["block"])
         of_key = cells.setdefault(key, {})
@@ -90,7 +82,7 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
 def read_training(path: Path) -> dict[str, Training]:
     """Read training.csv: candidate -> epochs, the paper's, whether they suffice."""
     trained = {}
-    for row in read_rows(path, TRAINING_COLUMNS):
+    for row in read_rows(path, columns_of(TrainingRow)):
         state = row["training"]
         if state not in TRAINING_STATES:
             raise DataError(
