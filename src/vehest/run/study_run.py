@@ -217,7 +217,7 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
             f"--publish-weights publishes what '{study.file}' says, unchanged; {why}"
         )
     if changes_of_tree := uncommitted_changes():
-        raise ConfigurationError(f"--publish-weights: {changes_of_tree}; commit them first")
+        raise ConfigurationError(f"--publish-weights: {changes_of_tree}")
     folder = RESULTS / study.study
     check_results_folder(folder)
     return PublishedWeights(folder / PUBLISHED_WEIGHTS)
