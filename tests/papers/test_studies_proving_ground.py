@@ -345,7 +345,7 @@ def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
 
     made = place.files()
     code, again, err = place("run", "ground", "--jobs", "1")
-    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert {status for status, _ in _statuses(err)} == {"reused"}
     assert (again, place.files()) == (out, made)
     assert place("report", "ground")[0] == 0
 
