@@ -651,7 +651,7 @@ def compare(
         list[str] | None,
         typer.Argument(
             metavar="[ESTIMATE]... [OVERRIDES]...",
-            help="Tables with time and v [m/s] or β [rad], made by any tool, or by `vehest estimate`; then key=value …",
+            help="Tables with time and v [m/s] or β [rad or deg], made by any tool, or by `vehest estimate`; then key=value …",
             show_default=False,
         ),
     ] = None,
@@ -664,16 +664,35 @@ def compare(
             autocompletion=MODELS,
         ),
     ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--column",
+            metavar="QUANTITY=COLUMN",
+            help="Column of time, vy or sideslip in a table of another tool, such as sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
+            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    shift: Annotated[
+        str,
+        typer.Option(
+            "--shift",
+            metavar="SECONDS|auto",
+            help="Added to the times of other tools' tables; auto: by correlation with the reference.",
+        ),
+    ] = "0",
     as_json: AsJson = False,
 ) -> None:
     """Score estimates of any tool on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
 
-    v = 0 and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all estimates have, with 95 %
-    intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
+    The zero-sideslip baseline and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all
+    estimates have, with 95 % intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
+    A model that was trained on the recording is listed and left out of the verdict.
     """
     from vehest.run.compare_files import compare_files
 
-    emit(as_json, *compare_files(recording, words or [], models or []))
+    emit(as_json, *compare_files(recording, words or [], models or [], columns or [], shift))
 
 
 @app.command()
