@@ -17,7 +17,6 @@ from vehest.constants import FloatArray
 from vehest.data.errors import printable
 from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.data.store import read_recording
-from vehest.evaluation.metrics import Scored
 from vehest.report import figures
 from vehest.report.document import (
     PATENT_NOTE,
@@ -31,10 +30,19 @@ from vehest.report.document import (
     as_code,
     as_text,
 )
-from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of, listed
+from vehest.report.style import Line, decimals_for, fixed, lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.drawings import (
+    MIN_UNIX_SECONDS,
+    DriveSignals,
+    error_over_ay_block,
+    histogram_block,
+    is_scored_somewhere,
+    signals_of,
+    traces_block,
+    zoom_block,
+)
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
-from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import (
     interval_in_words,
@@ -45,9 +53,7 @@ from vehest.studies.kit.standing import (
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
-ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
-EARLIEST_UNIX = 1e8  # s, from which on times count from 1970
 
 VERSION = "4"
 _ACCURACY = (
@@ -325,7 +331,7 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     file = artefacts.references.get((span.dataset, span.recording))
     begin = 0.0
     bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
-    if file is not None and bounds and min(bounds) >= EARLIEST_UNIX:
+    if file is not None and bounds and min(bounds) >= MIN_UNIX_SECONDS:
         begin = read_recording(file, ["vx"]).start_time
     start = span.start - begin
     stop = span.stop - begin
@@ -391,7 +397,19 @@ def _test_set(
     return [
         *blocks,
         *band_blocks(artefacts, test_set, in_bands, lines, file),
-        *_figures_of(artefacts, shown, test_set, lines, file),
+        *_figures_of(signals_of(artefacts, shown, test_set, lines), file),
+    ]
+
+
+def _figures_of(signals: DriveSignals, file: str) -> list[Block]:
+    """Traces and errors of the estimators of a test set; nothing where sideslip is scored nowhere."""
+    if not is_scored_somewhere(signals):
+        return []
+    return [
+        traces_block(signals, file),
+        zoom_block(signals, file),
+        histogram_block(signals, file),
+        *([error_over_ay_block(signals, file)] if signals.has_ay else []),
     ]
 
 
@@ -496,134 +514,6 @@ def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
         .index[:MOST_SHOWN]
     )
     return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
-
-
-def _joined(parts: Sequence[Scored], step: float) -> Scored:
-    """Ranges one after another; a single one keeps its times."""
-    if len(parts) == 1:
-        return parts[0]
-    gap = _gap_of(parts)
-
-    def over(name: str) -> FloatArray:
-        return chained([getattr(part, name) for part in parts], gap)
-
-    vy = over("vy")
-    time: FloatArray = np.arange(len(vy), dtype=np.float64) * step
-    is_scored = np.nan_to_num(over("is_sideslip_scored")).astype(np.bool_)
-    return Scored(
-        time, vy, over("vy_ref"), over("sideslip"), over("sideslip_ref"), over("ay"), is_scored
-    )
-
-
-def _drawn(part: Scored, sideslip: FloatArray) -> FloatArray:
-    """Sideslip where it is scored, else NaN, (K,) [deg]."""
-    return np.where(part.is_sideslip_scored, np.degrees(sideslip), np.nan)
-
-
-def _gap_of(parts: Sequence[Scored]) -> int:
-    """Samples between two ranges, enough to be seen."""
-    return max(sum(len(part.time) for part in parts) // 60, 1)
-
-
-def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[float, float]:
-    """Times between which the mean square of the reference sideslip is largest, within one range."""
-    best = -math.inf
-    first = 0
-    length = 1
-    offset = 0
-    for part in parts:
-        n = min(round(ZOOM_SECONDS / step), len(part.time))
-        sideslip = np.where(part.is_sideslip_scored, part.sideslip_ref, 0.0)
-        power = np.convolve(np.square(sideslip), np.full(n, 1.0 / n), mode="valid")
-        if power.max() > best:
-            best = float(power.max())
-            first = offset + int(power.argmax())
-            length = n
-        offset += len(part.time) + _gap_of(parts)
-    return float(time[first]), float(time[first + length - 1])
-
-
-def _figures_of(
-    artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], file: str
-) -> list[Block]:
-    """Traces and errors of the board's rows over all scored ranges of a test set, on one time axis with a gap of NaN between two ranges."""
-    models = {(*model.name, model.seed): model for model in artefacts.models}
-    rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
-    shown = {
-        name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()
-    }
-    parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
-    if not any(part.is_sideslip_scored.any() for part in next(iter(parts.values()))):
-        return []
-    step = 1.0 / artefacts.protocol.rate_hz
-    drives = {name: _joined(own, step) for name, own in parts.items()}
-    first = next(iter(parts.values()))
-    drive = next(iter(drives.values()))
-    label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
-    zoom = _busiest(first, drive.time, step)
-    start = float(drive.time[0])
-    begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
-    axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
-    reference = figures.Traces(
-        "measured", REFERENCE, drive.vy_ref, _drawn(drive, drive.sideslip_ref)
-    )
-    traces = [
-        figures.Traces(rows[name]["title"], lines[name], own.vy, _drawn(own, own.sideslip))
-        for name, own in drives.items()
-    ]
-    inside = (drive.time >= zoom[0]) & (drive.time <= zoom[1])
-    zoomed = [
-        figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside])
-        for t in (reference, *traces)
-    ]
-    errors = [
-        (
-            str(rows[name]["title"]),
-            lines[name],
-            np.degrees(own.sideslip - own.sideslip_ref)[own.is_sideslip_scored],
-        )
-        for name, own in drives.items()
-    ]
-    has_ay = bool(np.isfinite(drive.ay[~np.isnan(drive.vy_ref)]).all())  # at samples, not in gaps
-    found: list[Block] = [
-        Figure(
-            f"traces_{file}",
-            "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated "
-            "(coloured), of each estimator the seed chosen on validation.",
-            figures.traces_figure(drive.time, reference, traces, label),
-            explorer_of(artefacts, test_set, shown, parts, axis),
-        ),
-        Figure(
-            f"zoom_{file}",
-            f"The {zoom[1] - zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
-            f"its error (estimate − measured){', and the measured lateral acceleration' * has_ay}.",
-            figures.zoom_figure(
-                drive.time[inside],
-                drive.ay[inside] if has_ay else None,
-                zoomed[0],
-                zoomed[1:],
-                label,
-            ),
-        ),
-        Figure(
-            f"errors_{file}",
-            "Distribution of the sideslip error; the few errors beyond the axis are counted in its outermost bins.",
-            figures.error_histogram(errors),
-        ),
-    ]
-    if has_ay:
-        caption = (
-            "Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
-            f"{figures.LEAST_SAMPLES} samples show no error."
-        )
-        found.append(
-            Figure(
-                f"errors_over_ay_{file}",
-                caption,
-                figures.error_over_ay(drive.ay[drive.is_sideslip_scored], errors),
-            )
-        )
-    return found
 
 
 # The training
