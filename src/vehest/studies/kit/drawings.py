@@ -10,15 +10,18 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.evaluation.metrics import Scored
+from vehest.evaluation.metrics import BoolArray, Scored
 from vehest.report import figures
+from vehest.report.comparison_figures import Cloud, agreement_figure, clouds_figure
 from vehest.report.document import Figure
-from vehest.report.style import REFERENCE, Line
+from vehest.report.style import REFERENCE, REFERENCE_GREY, Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name
 
 ZOOM_SECONDS = 20.0
+MAX_IN_ZOOM = 4  # estimates in the figure of the busiest seconds
+TEST_COLOUR = "#0b4f9c"
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 
 
@@ -89,40 +92,117 @@ def is_scored_somewhere(signals: DriveSignals) -> bool:
 
 
 def traces_block(signals: DriveSignals, file: str) -> Figure:
-    """Figure ``traces_FILE``: every estimate beside the reference over the whole test set."""
+    """Figure ``traces_FILE``: every estimate with the reference over the whole test set."""
     drive = signals.reference
     return Figure(
         f"traces_{file}",
-        "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated "
-        "(coloured), of each estimator the seed chosen on validation.",
+        "Lateral velocity and sideslip over the whole test set: measured (grey) and estimated (coloured), of each "
+        "estimator the seed chosen on validation.",
         figures.traces_figure(
             drive.time, _reference_trace(signals), _estimate_traces(signals), signals.time_label
         ),
-        _explorer(signals),
     )
 
 
-def zoom_block(signals: DriveSignals, file: str) -> Figure:
-    """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`."""
+def busiest_block(signals: DriveSignals, file: str) -> Figure:
+    """Figure ``busiest_FILE``: the busiest `ZOOM_SECONDS`; on the page, all traces of the test set, which begin there."""
     drive = signals.reference
     start, stop = signals.busiest
     inside = (drive.time >= start) & (drive.time <= stop)
     reference, *estimates = (
         figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside])
-        for t in (_reference_trace(signals), *_estimate_traces(signals))
+        for t in (_reference_trace(signals), *_estimate_traces(signals)[:MAX_IN_ZOOM])
     )
+    band = _band_of_first(signals, estimates[0], inside)
     return Figure(
-        f"zoom_{file}",
-        f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
-        f"its error (estimate − measured){', and the measured lateral acceleration' * signals.has_ay}.",
+        f"busiest_{file}",
+        f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
+        f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error (estimate − measured), "
+        f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}.",
         figures.zoom_figure(
             drive.time[inside],
             drive.ay[inside] if signals.has_ay else None,
             reference,
             estimates,
             signals.time_label,
+            band,
         ),
+        _explorer(signals),
     )
+
+
+def _band_of_first(
+    signals: DriveSignals, estimate: figures.Traces, inside: BoolArray
+) -> figures.Band | None:
+    """Bands of the first candidate at some samples; None where it has none."""
+    parts = next(iter(signals.ranges.values()))
+    if not all("vy" in part.bands and "sideslip" in part.bands for part in parts):
+        return None
+    gap = _gap_of(parts)
+    half_vy = chained([part.bands["vy"] for part in parts], gap)
+    half_sideslip = chained([part.bands["sideslip"] for part in parts], gap)
+    return figures.Band(estimate, half_vy[inside], np.degrees(half_sideslip[inside]))
+
+
+def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
+    """Figures ``agreement_FILE`` and, with lateral acceleration, ``over_ay_FILE``: estimate over reference, β over ay, g-g."""
+    drive = signals.reference
+    scored = drive.is_sideslip_scored
+    reference = np.degrees(drive.sideslip_ref)[scored]
+    clouds = [
+        Cloud(title, line.colour, reference, np.degrees(own.sideslip)[scored])
+        for (_, title, line), own in zip(
+            signals.candidates.values(), signals.joined.values(), strict=True
+        )
+    ]
+    agreement = Figure(
+        f"agreement_{file}",
+        "Estimated over measured sideslip of every sample of the test set; on the line both are equal.",
+        agreement_figure(reference, clouds),
+    )
+    if not signals.has_ay:
+        return [agreement]
+    ay = drive.ay[scored]
+    first = clouds[0]
+    panels: list[tuple[list[Cloud], str, str, bool]] = [
+        (
+            [
+                Cloud("measured", REFERENCE_GREY, ay, reference),
+                Cloud(first.label, first.colour, ay, first.y),
+            ],
+            "$a_y$ [m/s²]",
+            "sideslip [deg]",
+            False,
+        )
+    ]
+    accelerations = _accelerations(signals)
+    if accelerations:
+        panels.append((accelerations, "$a_y$ [m/s²]", "$a_x$ [m/s²]", True))
+    caption = "Sideslip over lateral acceleration on the test set, measured and estimated"
+    if accelerations:
+        caption += "; g-g diagram: longitudinal over lateral acceleration of training and test"
+    return [agreement, Figure(f"over_ay_{file}", f"{caption}.", clouds_figure(panels))]
+
+
+def _accelerations(signals: DriveSignals) -> list[Cloud]:
+    """Longitudinal over lateral acceleration of the training ranges and the test set; empty where either was not measured."""
+    part = signals.artefacts
+    roles = {"training": part.split.train, "test": part.split.tests[signals.test_set]}
+    colours = {"training": REFERENCE_GREY, "test": TEST_COLOUR}
+    clouds = []
+    for role, spans in roles.items():
+        recordings = [
+            part.reference(span).cut(span.start, span.stop)
+            for span in spans
+            if (span.dataset, span.recording) in part.references
+        ]
+        if not recordings:
+            continue
+        if not all("ax" in own and "ay" in own for own in recordings):
+            return []
+        ay, ax = (np.concatenate([own[name] for own in recordings]) for name in ("ay", "ax"))
+        clouds.append(Cloud(role, colours[role], ay, ax))
+    return clouds
 
 
 def histogram_block(signals: DriveSignals, file: str) -> Figure:
@@ -139,7 +219,7 @@ def error_over_ay_block(signals: DriveSignals, file: str) -> Figure:
     drive = signals.reference
     return Figure(
         f"errors_over_ay_{file}",
-        "Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
+        "RMSE of sideslip over the magnitude of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
         f"{figures.LEAST_SAMPLES} samples show no error.",
         figures.error_over_ay(drive.ay[drive.is_sideslip_scored], _errors(signals)),
     )
