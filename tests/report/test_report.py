@@ -262,7 +262,7 @@ def test_leaderboard_is_sorted_by_the_sideslip_error_over_all_seeds_within_each_
         "traces_early",
         "forest_late",
         "forest_early",
-        "busiest_early",
+        "zoom_early",
         "agreement_late",
     } <= set(names)
 
@@ -405,7 +405,7 @@ def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_al
         line for line in warnings_of(artefacts) if "lateral acceleration" not in line
     ]
     names = [block.name for block in comparison(without).blocks if isinstance(block, Figure)]
-    assert "busiest_test" in names
+    assert "zoom_test" in names
     assert "over_ay_test" not in names
     assert "errors_over_ay_test" not in names
 
@@ -470,7 +470,7 @@ def test_report_says_how_it_was_made_and_on_its_first_page_whether_data_are_real
     for kind, words in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         verdict, forest, _, busiest = comparison(replace(artefacts, kinds={"toy": kind})).blocks[:4]
         assert f"on test set `test` ({kind}; " in forest.caption
-        assert (forest.name, busiest.name) == ("forest_test", "busiest_test")
+        assert (forest.name, busiest.name) == ("forest_test", "zoom_test")
         assert words in verdict
     text = (written / "report.md").read_text(encoding="utf-8")
     for words in (

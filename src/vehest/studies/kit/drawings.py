@@ -105,7 +105,7 @@ def traces_block(signals: DriveSignals, file: str) -> Figure:
 
 
 def busiest_block(signals: DriveSignals, file: str) -> Figure:
-    """Figure ``busiest_FILE``: the busiest `ZOOM_SECONDS`; on the page, all traces of the test set, which begin there."""
+    """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`; on the page, all traces of the test set, which begin there."""
     drive = signals.reference
     start, stop = signals.busiest
     inside = (drive.time >= start) & (drive.time <= stop)
@@ -115,7 +115,7 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
     )
     band = _band_of_first(signals, estimates[0], inside)
     return Figure(
-        f"busiest_{file}",
+        f"zoom_{file}",
         f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
         f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error (estimate − measured), "
         f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}.",
