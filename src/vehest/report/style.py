@@ -132,7 +132,7 @@ def paper_style() -> Iterator[None]:
 
 @contextmanager
 def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
-    """An empty figure of a width and height [in] that no global state knows of, drawn inside the ``with`` block in `paper_style`."""
+    """An empty figure of a width and height [in] without global state, drawn inside the ``with`` block in `paper_style`."""
     from matplotlib.figure import Figure
 
     with paper_style():

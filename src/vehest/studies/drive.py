@@ -163,9 +163,11 @@ def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> 
 
 def _additions(artefacts: PartArtefacts) -> Additions:
     recommendations = {name: recommendation_of(artefacts, name) for name in artefacts.split.tests}
-    sentences = {name: own.describe() for name, own in recommendations.items()}
+    sentences = {name: outcome.describe() for name, outcome in recommendations.items()}
     models = {
-        name: own.model.name for name, own in recommendations.items() if own.model is not None
+        name: outcome.model.name
+        for name, outcome in recommendations.items()
+        if outcome.model is not None
     }
     return Additions(sentences, models)
 
@@ -434,7 +436,7 @@ class DrawnTest:
     opening: Sequence[Block]  # after the forest plot
     traces: Sequence[Block]  # of the whole test set
     remark: str  # a sentence, after a space, where not all estimators are in them
-    shown: Mapping[Name, tuple[str, int]]  # estimators in them -> title and seed
+    estimators: Mapping[Name, tuple[str, int]]  # in them -> title and seed
 
 
 def _figures_of(
@@ -452,9 +454,11 @@ def _figures_of(
     rows = _shown(finite, recommended)
     forest = _forest(artefacts, finite, test_set, lines)
     signals = signals_of(artefacts, rows, test_set, lines)
-    shown = {name: (title, model.seed) for name, (model, title, _) in signals.candidates.items()}
+    estimators = {
+        name: (title, model.seed) for name, (model, title, _) in signals.candidates.items()
+    }
     if not is_scored_somewhere(signals):
-        return DrawnTest([forest], [], [], "", shown)
+        return DrawnTest([forest], [], [], "", estimators)
     remark = ""
     if len(rows) < len(finite):
         remark = (
@@ -466,7 +470,7 @@ def _figures_of(
         opening.append(error_over_ay_block(signals, file))
     opening += behaviour_blocks(signals, file)
     traces = [traces_block(signals, file), histogram_block(signals, file)]
-    return DrawnTest([forest], opening, traces, remark, shown)
+    return DrawnTest([forest], opening, traces, remark, estimators)
 
 
 def _sections_of_test(
@@ -498,7 +502,7 @@ def _sections_of_test(
     by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}") if chosen else None
     if by_regime is not None:
         blocks += [f"## Errors by regime{of_test}", by_regime]
-    bands = band_blocks(artefacts, test_set, drawn.shown, lines, file)
+    bands = band_blocks(artefacts, test_set, drawn.estimators, lines, file)
     if bands:
         blocks += [f"## Calibrated bands{of_test}", *bands]
     if drawn.traces:
@@ -523,14 +527,16 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
         ]
         if not recordings:
             continue
-        sideslip = np.concatenate([np.arctan2(own["vy_ref"], own["vx"]) for own in recordings])
+        sideslip = np.concatenate(
+            [np.arctan2(recording["vy_ref"], recording["vx"]) for recording in recordings]
+        )
         row = {
             "role": role,
-            "minutes": sum(len(own) / own.rate_hz for own in recordings) / 60.0,
+            "minutes": sum(len(recording) / recording.rate_hz for recording in recordings) / 60.0,
             "sideslip_99": float(np.nanquantile(np.degrees(np.abs(sideslip)), 0.99)),
         }
-        if all("ay" in own for own in recordings):
-            ay = np.concatenate([own["ay"] for own in recordings])
+        if all("ay" in recording for recording in recordings):
+            ay = np.concatenate([recording["ay"] for recording in recordings])
             row["ay_99"] = float(np.nanquantile(np.abs(ay), 0.99))
         rows.append(row)
     if not rows:
@@ -543,8 +549,8 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
     }
     frame = pd.DataFrame(rows)
     caption = "Minutes of recording with a reference of v, and 99th percentiles of lateral acceleration and sideslip in them."
-    shown = {name: column for name, column in columns.items() if name in frame}
-    return ["## Minutes of reference", Table("minutes", caption, frame, shown)]
+    columns = {name: column for name, column in columns.items() if name in frame}
+    return ["## Minutes of reference", Table("minutes", caption, frame, columns)]
 
 
 _INTERVAL = Column(

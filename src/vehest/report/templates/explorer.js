@@ -275,10 +275,10 @@ class Explorer {
       swatch.style.borderTopStyle = { solid: "solid", dotted: "dotted" }[dash] || "dashed";
       return element("span", {}, swatch, label);
     };
-    const colour = (own) => (isDark() ? own.dark : own.colour);
+    const colour = (candidate) => (isDark() ? candidate.dark : candidate.colour);
     const entries = [entry(reference.label, reference.colour, "solid")];
     entries[0].firstChild.style.borderTopWidth = "4px";
-    entries.push(...drawn.map((own) => entry(own.label, colour(own), own.dash)));
+    entries.push(...drawn.map((candidate) => entry(candidate.label, colour(candidate), candidate.dash)));
     if (this.bandOf("sideslip")) entries.push(entry(`90 % band of ${this.detail.label}`, colour(this.detail), "solid", "band"));
     this.legend.replaceChildren(...entries);
   }
@@ -366,10 +366,10 @@ class Explorer {
     const y = { values: () => [], grid: { show: false }, ticks: { show: false } };
     const keys = HEALTH.map((word) => element("span", { className: `key ${word}`, textContent: word }));
     keys.push(element("span", { textContent: known.length > 1 ? "from top:" : "of" }));
-    for (const own of known) {
-      const lane = element("span", { className: "lane", textContent: own.label });
-      lane.style.setProperty("--lane", isDark() ? own.dark : own.colour);
-      keys.push(lane);
+    for (const candidate of known) {
+      const laneKey = element("span", { className: "lane", textContent: candidate.label });
+      laneKey.style.setProperty("--lane", isDark() ? candidate.dark : candidate.colour);
+      keys.push(laneKey);
     }
     const options = { draw: [draw], scales: { y: { range: [-1, 3] } }, y, keys };
     return [{ title: "sensor health", height: lane * known.length + 12, lines, options }];

@@ -44,7 +44,7 @@ for (const node of document.querySelectorAll("#appendices ~ *")) {
 }
 window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((section) => (section.open = true)));
 
-// Contents: the headings above the appendices, whose own list is their contents.
+// Contents: the headings above the appendices, whose list is their contents.
 {
   const nav = document.querySelector("nav");
   [...document.querySelectorAll("h2")].filter((heading) => !heading.closest("details")).forEach((heading, i) => {

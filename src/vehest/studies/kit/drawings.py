@@ -150,8 +150,8 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     scored = drive.is_sideslip_scored
     reference = np.degrees(drive.sideslip_ref)[scored]
     clouds = [
-        Cloud(title, line.colour, reference, np.degrees(own.sideslip)[scored])
-        for (_, title, line), own in zip(
+        Cloud(title, line.colour, reference, np.degrees(estimate.sideslip)[scored])
+        for (_, title, line), estimate in zip(
             signals.candidates.values(), signals.joined.values(), strict=True
         )
     ]
@@ -198,9 +198,11 @@ def _accelerations(signals: DriveSignals) -> list[Cloud]:
         ]
         if not recordings:
             continue
-        if not all("ax" in own and "ay" in own for own in recordings):
+        if not all("ax" in recording and "ay" in recording for recording in recordings):
             return []
-        ay, ax = (np.concatenate([own[name] for own in recordings]) for name in ("ay", "ax"))
+        ay, ax = (
+            np.concatenate([recording[name] for recording in recordings]) for name in ("ay", "ax")
+        )
         clouds.append(Cloud(role, colours[role], ay, ax))
     return clouds
 

@@ -72,7 +72,7 @@ class Recommendation:
         if len(ranking.recommendable) == 1:
             return f"**Recommended: {title}**, expected {expected}: of these it alone is significantly better than {baselines}."
         return (
-            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} of these that are "
+            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} estimators among these that are "
             f"significantly better than {baselines}, it has the lowest RMSE(v) on validation."
         )
 
