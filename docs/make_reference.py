@@ -371,8 +371,8 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         "parameters",
         "RMSE(β) [deg]",
         "95 % interval [deg]",
-        "to the lowest [deg]",
-        "beats v = 0",
+        "difference to best [deg]",
+        "beats zero",
         "beats static map",
         "FVU",
     )

@@ -224,7 +224,7 @@ def compare_estimates(
         if ranking.order
         else f"Sideslip is not scored: the car is slower than {min_speed:.3g} m/s throughout."
     )
-    for words in ("**", " over its seeds", " and over seeds"):
+    for words in ("**", " over all seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
     if trained_here:
         verdict = _with_exclusions(
