@@ -1,11 +1,13 @@
 """Records of tables that commands outside pipelines write, and `vehest report --check` on them."""
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from vehest.run import table_records
+from vehest.data.errors import MissingError
+from vehest.run import artefacts, table_records
 from vehest.run.publishing import PROVENANCE, RESULTS
 from vehest.run.table_records import record_tables
 from vehest.run.versions import VERSIONS, code_of
@@ -79,6 +81,36 @@ def test_a_trial_outside_results_is_not_recorded(tmp_path):
     file.write_text("rmse\n")
     record_tables([file], "make a", [])
     assert not (tmp_path / PROVENANCE).exists()
+
+
+def test_a_record_without_the_raw_files_is_refused_and_the_former_one_stays(place, table):
+    file = table.parent / PROVENANCE
+    former = file.read_text()
+    assert set(json.loads(former)["keys"]["a.csv: data mine"]) == {"code", "data"}
+    (place.folder / "raw").rename(place.folder / "elsewhere")
+    with pytest.raises(MissingError, match=r"cannot record 'a\.csv': raw files of data mine"):
+        record_tables([table], "make a", ["data mine"])
+    assert file.read_text() == former
+
+
+def test_the_commit_of_a_record_has_no_changes_but_those_in_results(place, monkeypatch):
+    author = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    monkeypatch.setattr(artefacts, "CHECKOUT", place.folder)
+    monkeypatch.chdir(place.folder)
+    table = place.folder / "results" / "tables" / "a.csv"
+    script = place.folder / "script.py"
+    table.parent.mkdir(parents=True)
+    for file in (table, script):
+        file.write_text("1\n")
+    for words in (["init", "-q"], ["add", "-A"], [*author, "commit", "-qm", "a"]):
+        subprocess.run(["git", *words], check=True)
+    commit = artefacts.commit.__wrapped__
+    clean = commit()
+    assert len(clean) == 12
+    table.write_text("2\n")
+    assert commit() == clean
+    script.write_text("2\n")
+    assert commit() == f"{clean}-dirty"
 
 
 def test_every_folder_of_results_has_a_provenance():

@@ -39,6 +39,10 @@ def record_tables(
         command: what makes them again.
         determined_by: what else their numbers follow from, as in the names of keys.
         without_keys: what of them was made before keys were recorded.
+
+    Raises:
+        MissingError: raw files that the numbers follow from are not here, as where a record is written
+            after the tables; without their digest the tables would be stale wherever the files are.
     """
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
@@ -56,7 +60,11 @@ def record_tables(
     }
     for name in names:
         for what in ("content", *determined_by):
-            keys[f"{name}: {what}"] = today_of(f"{name}: {what}", file.parent)
+            keys[f"{name}: {what}"] = key = today_of(f"{name}: {what}", file.parent)
+            if what.startswith("data ") and "data" not in key:
+                raise MissingError(
+                    f"'{file}' cannot record '{name}': raw files of {what} are not here"
+                )
     records = former.get("tables", {}) | dict.fromkeys(names, record)
     with written_aside(file) as aside:
         aside.write_text(
