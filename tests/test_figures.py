@@ -188,14 +188,24 @@ def values_of_table(source, rows, columns, statistics):
     raise LookupError("; ".join(dict.fromkeys(reasons)) or "no table")
 
 
-def text_of_test(source, name):
-    """The source of a function, or of the assignment of a constant."""
+def node_of(source, name):
+    """The text of a function, or of the assignment of a constant, and the numbers in it."""
     text = (ROOT / source).read_text(encoding="utf-8")
     for node in ast.walk(ast.parse(text)):
-        targets = node.targets if isinstance(node, ast.Assign) else [node]
-        names = [getattr(target, "name", getattr(target, "id", None)) for target in targets]
-        if name in names and isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Assign):
-            return ast.get_source_segment(text, node)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign):
+            names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+        else:
+            continue
+        if name in names:
+            constants = (part.value for part in ast.walk(node) if isinstance(part, ast.Constant))
+            numbers = [
+                Decimal(repr(value))
+                for value in constants
+                if isinstance(value, int | float) and not isinstance(value, bool)
+            ]
+            return ast.get_source_segment(text, node), numbers
     raise LookupError(f"nothing is called '{name}' there")
 
 
@@ -211,12 +221,10 @@ def disagreement(row):
     if source == NOT_A_RESULT:
         return "" if rows else f"{LIST}: '{stated}' of {page} needs a reason in the column 'rows'"
     try:
-        if source.endswith(".py") and row["column"] == READS_THE_PAGE:
-            reads = Path(page).name in text_of_test(source, rows)
-            values = numbers if reads else []
-        elif source.endswith(".py"):
-            asserted = numbers_in(text_of_test(source, rows))
-            values = numbers if set(numbers) <= set(asserted) else asserted
+        if source.endswith(".py"):
+            code, asserted = node_of(source, rows)
+            reads = row["column"] == READS_THE_PAGE and Path(page).name in code
+            values = numbers if reads or set(numbers) <= set(asserted) else asserted
         elif row["column"]:
             values = values_of_table(source, rows, row["column"], row["statistic"])
         else:
