@@ -151,7 +151,9 @@ def judged(parts):
     chosen = [
         claim
         for claim in claimed.claims
-        if claim.measure and claim.measure.rpartition(":")[2] in of_errors
+        if claim.measure
+        and claim.measure.rpartition(":")[2] in of_errors
+        and (claim.part in parts or "scheme_1" in parts)
     ]
     rows += block_errors.measured_rows(replace(claimed, claims=chosen), parts)
     training = block_errors.training_rows(claimed, parts)

@@ -106,7 +106,8 @@ def common_labels(every: Sequence[Segments]) -> NDArray[np.int64]:
     """Number of each segment's block, (K,): the longest blocks that the finite errors of any of them ask for."""
     counted = np.maximum(every[0].samples, 1.0)
     losses = np.stack([part.squared_error_vy / counted for part in every])
-    return block_labels(every[0], losses[np.isfinite(losses).all(axis=1)])
+    finite = losses[np.isfinite(losses).all(axis=1)]
+    return block_labels(every[0], finite if len(finite) else np.zeros_like(losses[:1]))
 
 
 def _about_mean(squares: FloatArray, sums: FloatArray, samples: FloatArray) -> FloatArray:
