@@ -14,6 +14,7 @@ from vehest.data.text_files import read_yaml
 
 ADDED_SOURCE = "Not in the paper"  # `source` of comparisons that the paper does not make
 BASELINES = ("zero", "static_map")
+CLAIMS_FOLDER = Path(__file__).parents[1]  # a folder each paper
 
 Kind = Literal["order", "equal", "limit", "measured"]
 Origin = Literal["real", "simulated", "computed"]
@@ -126,6 +127,11 @@ _USELESS: Mapping[Kind, Sequence[str]] = {
     "measured": ("metric",),
 }
 _ID = re.compile(r"[a-z0-9_]+")
+
+
+def claims_of(name: str) -> Paper:
+    """Claims and tables of one of the papers that are re-created here."""
+    return read_paper(CLAIMS_FOLDER / name / "claims.yaml")
 
 
 def read_paper(path: Path) -> Paper:
