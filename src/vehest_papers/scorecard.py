@@ -26,7 +26,16 @@ from vehest_papers.kit.block_errors import (
     read_blocks,
     read_training,
 )
-from vehest_papers.kit.claim_files import Claim, Paper, Row, Table, read_paper
+from vehest_papers.kit.claim_files import CLAIMS_FOLDER, Claim, Paper, Row, Table, read_paper
+from vehest_papers.kit.judged_claims import (
+    figure_text,
+    figures_text,
+    one_line,
+    origin_of,
+    published_text,
+    training_text,
+    unit_of,
+)
 from vehest_papers.kit.verdicts import (
     NOT_PUBLISHED,
     VERDICTS,
@@ -44,7 +53,6 @@ TITLES = {
     "heavy_ekf": "Heavy-vehicle EKF",
     "cnn_ukf": "CNN-UKF",
 }
-CLAIMS_FOLDER = Path(__file__).parent
 CSV_COLUMNS = (
     "paper",
     "row",
@@ -172,7 +180,7 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         *_table(
             ("paper", "answer"),
-            [(_linked(study), _line(study.paper.recommendation)) for study in studies],
+            [(_linked(study), one_line(study.paper.recommendation)) for study in studies],
         ),
         "",
         "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
@@ -215,9 +223,9 @@ def _section(study: Study, results: Path) -> list[str]:
     lines = [
         f"## {TITLES[paper.paper]}",
         "",
-        f"{_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
+        f"{one_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
         "",
-        f"**{_line(paper.recommendation)}**",
+        f"**{one_line(paper.recommendation)}**",
         "",
     ]
     if not study.is_published:
@@ -247,13 +255,13 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 _text(row.candidate + structure),
                 f"`{row.metric}`",
                 f"{significant(row.published)}{unit}",
-                _figures(judgement, unit),
-                _epochs(study, row.candidate, state),
+                _cell(figures_text(judgement, unit)),
+                training_text(study.paper, row.candidate, state),
                 _verdict(judgement, state),
             )
         )
-    about = _line(study.paper.test_sets[table.test_set])
-    note = f" {_line(table.note)}" if table.note else ""
+    about = one_line(study.paper.test_sets[table.test_set])
+    note = f" {one_line(table.note)}" if table.note else ""
     return [
         f"### {table.table}, {TITLES[study.paper.paper]}: {table.test_set} ({table.part})",
         "",
@@ -311,15 +319,14 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
     for claim in claims:
         judgement = study.claims[claim.id]
         name, state = least_training(claim, study.training)
-        origin = study.paper.parts.get(claim.part, "") if claim.not_testable is None else ""
         reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
         cells.append(
             (
-                f"{_text(_line(claim.claim))} ({_text(claim.source)})",
-                _published(claim),
-                _figures(judgement, _unit(claim)),
-                f"{origin}, {claim.test_set}" if origin else MISSING,
-                _epochs(study, name, state),
+                f"{_text(one_line(claim.claim))} ({_text(claim.source)})",
+                _cell(published_text(claim)),
+                _cell(figures_text(judgement, unit_of(claim))),
+                origin_of(claim, study.paper) or MISSING,
+                training_text(study.paper, name, state),
                 _verdict(judgement, state),
                 reason or MISSING,
             )
@@ -341,51 +348,6 @@ def _verdict(judgement: Judgement, training: Training | None) -> str:
     is_assessed = judgement.n_blocks > 0
     is_sufficient = training is None or training.state in ("sufficient", "not applicable")
     return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
-
-
-def _epochs(study: Study, candidate: str, training: Training | None) -> str:
-    """Epochs of the least trained candidate, the paper's, and what is known of the training."""
-    declared = study.paper.candidates.get(candidate)
-    of_paper = declared.epochs_paper if declared is not None else None
-    if training is None or training.state == "not applicable":
-        return MISSING if of_paper is None else f"{MISSING} / {of_paper}"
-    ours = training.epochs or MISSING
-    paper = training.epochs_paper or (MISSING if of_paper is None else str(of_paper))
-    return f"{ours} / {paper}, {training.state}"
-
-
-def _unit(claim: Claim) -> str:
-    return f" {claim.unit}" if claim.unit not in (None, "1") else ""
-
-
-def _figures(judgement: Judgement, unit: str) -> str:
-    """Errors and both ratios with their intervals."""
-    words = []
-    for name, figure in judgement.values.items():
-        label = f"{_text(name)} " if len(judgement.values) > 1 else ""
-        words.append(f"{label}{_figure(figure)}{unit}")
-    if judgement.size is not None:
-        words.append(f"ratio {_figure(judgement.size)}")
-    if judgement.order is not None:
-        words.append(f"mean of blocks' ratios {_figure(judgement.order)}")
-    return "; ".join(words) or MISSING
-
-
-def _figure(figure: Figure) -> str:
-    if not math.isfinite(figure.low):
-        return significant(figure.value)
-    return f"{significant(figure.value)} [{significant(figure.low)}, {significant(figure.high)}]"
-
-
-def _published(claim: Claim) -> str:
-    words = [
-        f"{_text(name)} {significant(value) if isinstance(value, float) else _text(value)}"
-        for name, value in claim.published.items()
-    ]
-    ratio = claim.published_ratio
-    if ratio is not None:
-        words.append(f"ratio {significant(ratio)}")
-    return "; ".join(words) or MISSING
 
 
 def _csv_rows(study: Study) -> list[dict[str, str]]:
@@ -416,14 +378,16 @@ def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dic
         "paper": study.paper.paper,
         "row": kind,
         "id": claim.id,
-        "text": _line(claim.claim),
+        "text": one_line(claim.claim),
         "source": claim.source,
         "data": study.paper.parts.get(claim.part, ""),
         "part": claim.part,
         "test_set": claim.test_set,
         "metric": claim.metric,
         "published": "; ".join(f"{name} {value}" for name, value in claim.published.items()),
-        "ours": "; ".join(f"{name} {_figure(figure)}" for name, figure in judgement.values.items()),
+        "ours": "; ".join(
+            f"{name} {figure_text(figure)}" for name, figure in judgement.values.items()
+        ),
         "published_ratio": _number(claim.published_ratio),
         **_ends("size", judgement.size),
         **_ends("order", judgement.order),
@@ -505,13 +469,14 @@ def _linked(study: Study) -> str:
     return f"[{title}](#{title.lower().replace(' ', '-')})"
 
 
-def _line(text: str) -> str:
-    return " ".join(text.split())
-
-
 def _text(text: str) -> str:
     """Text of a cell: characters that Markdown would take for markup are escaped."""
-    for character in "\\|*_<[":
+    return _cell(text).replace("[", "\\[")
+
+
+def _cell(text: str) -> str:
+    """The same of text with intervals, whose brackets stay as they are."""
+    for character in "\\|*_<":
         text = text.replace(character, f"\\{character}")
     return text
 

@@ -29,7 +29,7 @@ class BlockRow:
 
     part: str  # of the study's pipeline
     candidate: str
-    seed: int
+    seed: int | str
     test_set: str
     metric: str
     block: str  # a name that is unique within the test set

@@ -14,6 +14,7 @@ from vehest.data.text_files import read_yaml
 
 ADDED_SOURCE = "Not in the paper"  # `source` of comparisons that the paper does not make
 BASELINES = ("zero", "static_map")
+CLAIMS_FOLDER = Path(__file__).parents[1]  # has a folder with claims.yaml for each paper
 
 Kind = Literal["order", "equal", "limit", "measured"]
 Origin = Literal["real", "simulated", "computed"]
