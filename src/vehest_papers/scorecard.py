@@ -26,14 +26,20 @@ from vehest_papers.kit.block_errors import (
     read_blocks,
     read_training,
 )
-from vehest_papers.kit.claim_files import CLAIMS_FOLDER, Claim, Paper, Row, Table, read_paper
-from vehest_papers.kit.judged_claims import (
-    figure_text,
-    figures_text,
+from vehest_papers.kit.claim_files import (
+    CLAIMS_FOLDER,
+    Claim,
+    Paper,
+    Row,
+    Table,
+    read_paper,
+)
+from vehest_papers.kit.verdict_table import (
+    epochs_in_words,
+    figure_in_words,
+    figures_in_words,
     one_line,
-    origin_of,
-    published_text,
-    training_text,
+    published_in_words,
     unit_of,
 )
 from vehest_papers.kit.verdicts import (
@@ -255,8 +261,8 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 _text(row.candidate + structure),
                 f"`{row.metric}`",
                 f"{significant(row.published)}{unit}",
-                _cell(figures_text(judgement, unit)),
-                training_text(study.paper, row.candidate, state),
+                figures_in_words(judgement, unit, _text),
+                epochs_in_words(study.paper, row.candidate, state),
                 _verdict(judgement, state),
             )
         )
@@ -319,14 +325,15 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
     for claim in claims:
         judgement = study.claims[claim.id]
         name, state = least_training(claim, study.training)
+        origin = study.paper.parts.get(claim.part, "") if claim.not_testable is None else ""
         reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
         cells.append(
             (
                 f"{_text(one_line(claim.claim))} ({_text(claim.source)})",
-                _cell(published_text(claim)),
-                _cell(figures_text(judgement, unit_of(claim))),
-                origin_of(claim, study.paper) or MISSING,
-                training_text(study.paper, name, state),
+                published_in_words(claim, _text),
+                figures_in_words(judgement, unit_of(claim), _text),
+                f"{origin}, {claim.test_set}" if origin else MISSING,
+                epochs_in_words(study.paper, name, state),
                 _verdict(judgement, state),
                 reason or MISSING,
             )
@@ -386,7 +393,7 @@ def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dic
         "metric": claim.metric,
         "published": "; ".join(f"{name} {value}" for name, value in claim.published.items()),
         "ours": "; ".join(
-            f"{name} {figure_text(figure)}" for name, figure in judgement.values.items()
+            f"{name} {figure_in_words(figure)}" for name, figure in judgement.values.items()
         ),
         "published_ratio": _number(claim.published_ratio),
         **_ends("size", judgement.size),
@@ -471,12 +478,7 @@ def _linked(study: Study) -> str:
 
 def _text(text: str) -> str:
     """Text of a cell: characters that Markdown would take for markup are escaped."""
-    return _cell(text).replace("[", "\\[")
-
-
-def _cell(text: str) -> str:
-    """The same of text with intervals, whose brackets stay as they are."""
-    for character in "\\|*_<":
+    for character in "\\|*_<[":
         text = text.replace(character, f"\\{character}")
     return text
 

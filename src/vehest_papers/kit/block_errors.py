@@ -59,41 +59,37 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
     MissingError
         There is no such file.
     DataError
-        A value is not a number, a block of a seed occurs twice or is missing, or the size of a
-        block differs between seeds.
+        As `blocks_of`, or a value is not a number.
     """
-    return errors_of(
-        (
-            BlockRow(
-                row["part"],
-                row["candidate"],
-                row["seed"],
-                row["test_set"],
-                row["metric"],
-                row["block"],
-                number_in(row, "value", path) if row["value"] else np.nan,
-                number_in(row, "size", path),
-            )
-            for row in read_rows(path, columns_of(BlockRow))
-        ),
-        f"'{path}'",
+    rows = (
+        BlockRow(
+            row["part"],
+            row["candidate"],
+            int(number_in(row, "seed", path)),
+            row["test_set"],
+            row["metric"],
+            row["block"],
+            number_in(row, "value", path) if row["value"] else np.nan,
+            number_in(row, "size", path),
+        )
+        for row in read_rows(path, columns_of(BlockRow))
     )
+    return blocks_of(rows, f"'{path}'")
 
 
-def errors_of(rows: Iterable[BlockRow], where: str) -> dict[Key, BlockErrors]:
-    """Errors by block and seed, arranged by candidate, test set and metric.
+def blocks_of(rows: Iterable[BlockRow], where: str = "errors by block") -> dict[Key, BlockErrors]:
+    """Arrange rows by part, candidate, test set and metric.
 
     Parameters
     ----------
-    rows
-        One for each block and seed, in any order.
-    where : str
-        What the rows are of, for messages.
+    where
+        What an error names: the file that the rows are from.
 
     Raises
     ------
     DataError
-        As `read_blocks`.
+        A block of a seed occurs twice or is missing, a size is not a number of samples, or the
+        size of a block differs between seeds.
     """
     cells: dict[Key, dict[tuple[str, str], tuple[float, float]]] = {}
     for row in rows:
@@ -103,14 +99,16 @@ def errors_of(rows: Iterable[BlockRow], where: str) -> dict[Key, BlockErrors]:
         if cell in of_key:
             raise DataError(f"{where}: {_named(key, *cell)} occurs twice; write one row for it")
         if not (np.isfinite(row.size) and row.size >= 0):
-            raise DataError(f"{where}: {_named(key, *cell)} has size {row.size}; write its samples")
+            raise DataError(
+                f"{where}: {_named(key, *cell)} has size {row.size:g}; write its samples"
+            )
         of_key[cell] = (row.value, row.size)
     return {key: _arranged(key, of_key, where) for key, of_key in cells.items()}
 
 
 def read_training(path: Path) -> dict[str, Training]:
     """Read training.csv: candidate -> epochs, the paper's, whether they suffice."""
-    rows = []
+    trained = {}
     for row in read_rows(path, columns_of(TrainingRow)):
         state = row["training"]
         if state not in TRAINING_STATES:
@@ -118,10 +116,10 @@ def read_training(path: Path) -> dict[str, Training]:
                 f"'{path}': candidate {row['candidate']!r} has training {state!r}, "
                 f"which is not one of: {', '.join(TRAINING_STATES)}"
             )
-        rows.append(
-            TrainingRow(row["candidate"], row["epochs"], row["epochs_paper"], state, row["reason"])
+        trained[row["candidate"]] = Training(
+            row["epochs"], row["epochs_paper"], state, row["reason"]
         )
-    return training_of(rows)
+    return trained
 
 
 def training_of(rows: Iterable[TrainingRow]) -> dict[str, Training]:
