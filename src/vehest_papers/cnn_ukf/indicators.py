@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +14,7 @@ from vehest_papers.cnn_ukf.subjects import Manoeuvres, Runs
 from vehest_papers.kit.block_errors import BlockErrors
 from vehest_papers.kit.reading import sideslip_error
 from vehest_papers.kit.verdict_table import figure_in_words
-from vehest_papers.kit.verdicts import Figure, paired_errors, value_of
+from vehest_papers.kit.verdicts import Figure, paired_errors, ratio_of, value_of
 
 MSE = "mse"
 MSE_NL = "mse_nonlinear"
@@ -123,15 +122,11 @@ class ManoeuvreErrors:
 
     def ratio(self, first: str, second: str, indicator: str) -> Figure:
         """An indicator of the first candidate over that of the second."""
-        pair = paired_errors(
-            self.errors(first, indicator), self.errors(second, indicator), indicator, "test"
+        return ratio_of(
+            paired_errors(
+                self.errors(first, indicator), self.errors(second, indicator), indicator, "test"
+            )
         )
-        if not pair.is_testable:
-            value = pair.first.mean(axis=0).sum() / pair.second.mean(axis=0).sum()
-            return Figure(float(value), math.nan, math.nan)
-        size = pair.size()
-        low, high = size.interval()
-        return Figure(math.exp(size.value), math.exp(low), math.exp(high))
 
     def text(self, candidate: str, indicator: str) -> str:
         """The value with its interval."""

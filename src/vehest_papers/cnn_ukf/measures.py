@@ -1,8 +1,7 @@
 """Values by block and seed for those claims that are not comparisons of errors (``measure`` in claims.yaml).
 
 Each function returns an array of shape (S, B), S seeds by B manoeuvres unless it says otherwise; NaN where a
-manoeuvre has no samples of what is measured. Two candidates have their seeds paired in order; one with
-a single seed is compared with all seeds of the other.
+manoeuvre has no samples of what is measured. Two candidates have their seeds paired in order.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from vehest_papers.cnn_ukf.indicators import (
 from vehest_papers.cnn_ukf.manoeuvres import GROUPS
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.observability import PAPER_MEASUREMENTS
+from vehest_papers.kit.measured import paired_seeds
 
 HIGH_SIDESLIP = 5.0  # deg
 LOW_SIDESLIP = 1.0  # deg
@@ -42,7 +42,7 @@ def mean_error_over_least_of_others(
     """
     magnitudes = [_magnitude_parts(main, name) for name in others]
     least = min(magnitudes, key=lambda parts: float(parts.mean()))
-    return paired_seeds(_magnitude_parts(main, candidate), least, np.subtract)
+    return np.subtract(*paired_seeds(_magnitude_parts(main, candidate), least))
 
 
 def _magnitude_parts(main: ManoeuvreErrors, candidate: str) -> FloatArray:
@@ -88,7 +88,7 @@ def distrust_correlations(outputs: Seeds) -> FloatArray:
 
 def distrust_decades_ratios(first: Seeds, second: Seeds) -> FloatArray:
     """Decades that the deviation of one network spans over those of another, from the 1st to the 99th percentile."""
-    return paired_seeds(_decades(first), _decades(second), np.divide)
+    return np.divide(*paired_seeds(_decades(first), _decades(second)))
 
 
 def _decades(outputs: Seeds) -> FloatArray:
@@ -136,10 +136,10 @@ def stiffness_rise_differences(
 
     Each has its own worst combination of stiffnesses, by the MSE over all manoeuvres.
     """
-    return paired_seeds(
-        _worst_rise(conditions, nominal, candidate),
-        _worst_rise(conditions, nominal, other),
-        np.subtract,
+    return np.subtract(
+        *paired_seeds(
+            _worst_rise(conditions, nominal, candidate), _worst_rise(conditions, nominal, other)
+        )
     )
 
 
@@ -160,7 +160,7 @@ def largest_ratios_over_stiffnesses(
     for own in conditions:
         first, second = (own.errors(name, MSE_NL) for name in (candidate, other))
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratios.append(paired_seeds(first.sums, second.sums, np.divide))
+            ratios.append(np.divide(*paired_seeds(first.sums, second.sums)))
     return max(ratios, key=lambda own: float(np.nanmean(np.log(own))))
 
 
@@ -171,11 +171,3 @@ def ranks(table: pd.DataFrame, is_straight: bool) -> tuple[list[str], FloatArray
     ]
     names = [f"{row.speed:g} m/s, {row.steer:g}°" for row in rows.itertuples()]
     return names, rows["rank"].to_numpy(dtype=np.float64)[None]
-
-
-def paired_seeds(first: FloatArray, second: FloatArray, operation: np.ufunc) -> FloatArray:
-    """An operation on two candidates seed by seed, (S, B) and (S', B); a single seed goes with all of the other."""
-    if len(first) > 1 and len(second) > 1:
-        count = min(len(first), len(second))
-        first, second = first[:count], second[:count]
-    return np.asarray(operation(first, second), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The appendices: orders, errors by state, consistency, slip angles, budgets, trials, departures, and what was used for what."""
+"""The appendices: errors by state, consistency, slip angles, budgets, trials, departures, and what was used for what."""
 
 from __future__ import annotations
 
@@ -16,41 +16,19 @@ from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words,
 from vehest_papers.learned_ukf import paper, slips, tables
 from vehest_papers.learned_ukf.candidates import SETS
 from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import loaded
-from vehest_papers.learned_ukf.order import differences, order_in_words, pairs_table
 from vehest_papers.learned_ukf.trials import trials_table
 
 
 def appendix_of_part(
-    title: str,
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    errors: Mapping[str, Losses],
     where: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Orders of all pairs, errors by state, consistency, slip angles and budgets of a main part."""
+    """Errors by state, consistency, slip angles and budgets of the main part."""
     kind = words_of_kinds(part).upper()
-    blocks: list[Block] = [f"## Appendix: the paper's order\n\n{title}, {kind}."]
-    for test, tyre in SETS.items():
-        published = {candidate: own.mse for candidate, own in paper.TABLES[test].items()}
-        pairs = differences(
-            errors[test].squared, errors[test].sequence, published, part.protocol.rate_hz
-        )
-        data[f"pairs_{test}_{name}"] = pairs
-        if pairs.empty:
-            continue
-        blocks += [
-            order_in_words(pairs, tables.medians(runs, f"mse_weighted.{test}"), f"on {tyre}"),
-            pairs_table(
-                pairs[pairs["neighbours"]],
-                f"neighbours_{test}_{name}",
-                f"Differences of MSE (weighted) between neighbours in the paper's order, {tyre}; negative where the paper's order holds. "
-                f"All pairs: [CSV](tables/pairs_{test}_{name}.csv). Data: {kind}.",
-            ),
-        ]
     state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
         f"Consistency of the filters: normalised estimation errors squared over vx, vy and yaw rate (NEES) and normalised innovations "
@@ -62,8 +40,7 @@ def appendix_of_part(
         f"training. Data: {kind}."
     )
     return [
-        *blocks,
-        "## Appendix: errors by state, and whether filters know them",
+        "## Appendix: errors by state, and consistency of the filters",
         tables.by_state(runs, list(SETS), f"by_state_{name}", state),
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
         *_slips(part, name, where, data),
@@ -87,9 +64,7 @@ def how_it_was_made(
         "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
         "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
-        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing but the "
-        "oracle, which learns from them.",
-        "Intervals: block bootstrap over whole sequences and over seeds, paired by sequence, 95 % by Student's t.",
+        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing.",
         _authors_code(),
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
         "Every setting of every training: [CSV](tables/training_settings.csv).",
