@@ -559,8 +559,8 @@ def test_report_is_drawn_with_one_candidate_alone(part, tmp_path, monkeypatch):
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
-    assert "Not trained yet, so that claims on them are not assessed:** PC, PCR" in text
-    assert "Tyre sets: learned_ukf-nntf_uh-seed0" in text
+    assert "Not trained yet, so that claims on them are not assessed:** PC; PCR" in text
+    assert "Trainings that are there: Tyre sets has 2 of 3." in text
     claims = pd.read_csv(tmp_path / "tables" / "claims.csv")
     assert set(claims["verdict"]) == {"not assessed", "not testable"}
     blocks = pd.read_csv(tmp_path / "tables" / "blocks.csv")

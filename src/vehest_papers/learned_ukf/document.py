@@ -114,18 +114,18 @@ def _not_trained(
     """Candidates of the claims without errors, and how many trainings of the others are missing."""
     scored = {row.candidate for row in rows}
     absent = [name for name in content.candidates if name not in scored]
-    failed = {
-        f"{artefacts.titles.get(name, name)}: {model}"
-        for name, part in artefacts.parts.items()
-        for model in part.failed
-    }
     lines = []
     if absent:
         lines.append(
-            f"**Not trained yet, so that claims on them are not assessed:** {listed(absent)}."
+            f"**Not trained yet, so that claims on them are not assessed:** {'; '.join(absent)}."
         )
-    if failed:
-        lines.append(f"Trainings that are missing in the parts shown: {listed(sorted(failed))}.")
+    unfinished = [
+        f"{artefacts.titles.get(name, name)} has {len(part.models)} of {len(part.models) + len(part.failed)}"
+        for name, part in artefacts.parts.items()
+        if part.failed
+    ]
+    if unfinished:
+        lines.append(f"Trainings that are there: {'; '.join(unfinished)}.")
     return [" ".join(lines)] if lines else []
 
 
