@@ -1,9 +1,10 @@
-"""The appendices: errors by state, consistency, slip angles, budgets, trials, departures, and what was used for what."""
+"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the ranges of the recordings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import pandas as pd
 
@@ -14,8 +15,7 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
-from vehest_papers.learned_ukf.candidates import SETS
-from vehest_papers.learned_ukf.departures import departures, settings_table
+from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.filtering import loaded
 from vehest_papers.learned_ukf.trials import trials_table
 
@@ -54,7 +54,7 @@ def how_it_was_made(
     main: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
+    """Trials, the protocol, and the ranges of the recordings with their minutes."""
     first = next(iter(main.values()))
     trained = {model.estimator for part in artefacts.parts.values() for model in part.models}
     data["training_settings"] = settings_table(main)
@@ -65,9 +65,7 @@ def how_it_was_made(
         "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
         "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing.",
-        _authors_code(),
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
-        "Every setting of every training: [CSV](tables/training_settings.csv).",
     ]
     blocks: list[Block] = []
     if artefacts.trials:
@@ -78,19 +76,26 @@ def how_it_was_made(
         *blocks,
         methods.how_it_was_made(lines),
         _ranges(artefacts, main),
-        methods.bullets("## Appendix: what departs from the paper", departures(main)),
     ]
 
 
-def _authors_code() -> str:
-    """How the authors' code was measured, on the files that it was run on."""
-    values = " and ".join(
-        f"{fixed(value, 4)} on {SETS[test]}" for test, value in paper.AUTHORS_CODE.items()
-    )
-    return (
-        f"Beside this study stands the authors' public code, run once on the same split: {paper.NNTF_UH}, 1000 epochs one-step and 1000 "
-        f"through the filter, one seed, on a CPU, gave {values}. No interval, so no comparison is made."
-    )
+def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
+    """One row a part, candidate and setting of its training."""
+    rows = [
+        {"part": name, "candidate": candidate, "setting": key, "value": value}
+        for name, part in parts.items()
+        for candidate, models in models_by_candidate(part).items()
+        for key, value in _flat(models[0].training)
+    ]
+    return pd.DataFrame(rows, columns=["part", "candidate", "setting", "value"])
+
+
+def _flat(settings: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{head}{key}.")
+        else:
+            yield f"{head}{key}", value
 
 
 def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Table:

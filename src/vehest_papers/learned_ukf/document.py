@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,8 +16,9 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import Paper, claims_of
-from vehest_papers.kit.methods import absent_parts, kinds_of_parts
+from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import claims_table, one_line
 from vehest_papers.learned_ukf import (
     block_errors,
@@ -35,12 +37,14 @@ from vehest_papers.learned_ukf.filtering import drives_of, loaded, lost_sequence
 from vehest_papers.learned_ukf.lengths import figure_7, lengths
 
 NAME = "learned_ukf"  # of the paper's package
+TEMPLATE = Path(__file__).with_name("report.md.j2")
 MAIN = "real"
 LIKELIHOOD = "likelihood"
 SCRATCH = "scratch"
 LENGTH = "length_"
 VARIANTS = ("diagonal", SCRATCH, "curvature")  # parts with a variant of a candidate
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
+SHOWN_FIRST = (paper.NNTF_UH, paper.NNTF, paper.NN_U, paper.PC, paper.GRU, paper.LSTM, "zero")
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 
 
@@ -48,7 +52,6 @@ SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 class Outcome:
     """What the main part gives to the report."""
 
-    picture: list[Block] = field(default_factory=list)
     front: list[Block] = field(default_factory=list)
     appendix: list[Block] = field(default_factory=list)
     rows: list[BlockRow] = field(default_factory=list)
@@ -83,13 +86,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     kinds = {
         block_errors.part_name(name): words_of_kinds(own) for name, own in artefacts.parts.items()
     }
-    blocks: list[Block] = [
-        *_summary(artefacts, part, content),
-        *_not_trained(artefacts, content, rows),
-        *outcome.picture,
-        *outcome.front,
-        "## Claims",
-        claims_table(content, rows, trained, kinds),
+    claims = claims_table(content, rows, trained, kinds)
+    values = _values(artefacts, part, content, rows)
+    blocks = [
+        *fill_template(TEMPLATE, values, [*outcome.front, claims]),
         *outcome.appendix,
         *how_it_was_made(artefacts, {MAIN: part}, data),
     ]
@@ -97,36 +97,44 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def _summary(artefacts: StudyArtefacts, part: PartArtefacts, content: Paper) -> list[Block]:
-    trained_on = fixed(minutes(part, part.split.train), 1)
-    return [
-        f"{kinds_of_parts(artefacts, [MAIN])}. The paper's are real.{absent_parts(artefacts)} Trained on: {trained_on} min "
-        f"({words_of_kinds(part)}); in the paper about {fixed(paper.MINUTES_LEARNT, 1)} min of the same tyre. The paper's unseen tyre is C; "
-        "ours is D.",
-        artefacts.about,
-        f"**{one_line(content.recommendation)}**",
+def _values(
+    artefacts: StudyArtefacts, part: PartArtefacts, content: Paper, rows: Sequence[BlockRow]
+) -> dict[str, object]:
+    """Numbers and names that the template has places for."""
+    blocks = blocks_of(rows)
+    main_rows = [
+        {"name": name} | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
+        for name in SHOWN_FIRST
     ]
+    return {
+        "recommendation": one_line(content.recommendation),
+        "kind": words_of_kinds(part).upper(),
+        "minutes": fixed(minutes(part, part.split.train), 1),
+        "minutes_paper": fixed(paper.MINUTES_LEARNT, 1),
+        "main_rows": main_rows,
+        "authors": {test: fixed(value, 4) for test, value in paper.AUTHORS_CODE.items()},
+        "absent_parts": absent_parts(artefacts),
+        "missing": _missing(artefacts, content, rows),
+    }
 
 
-def _not_trained(
-    artefacts: StudyArtefacts, content: Paper, rows: Sequence[BlockRow]
-) -> list[Block]:
-    """Candidates of the claims without errors, and how many trainings of the others are missing."""
+def _missing(artefacts: StudyArtefacts, content: Paper, rows: Sequence[BlockRow]) -> list[str]:
+    """Candidates of the claims that are not trained yet, and trainings of the parts that are there."""
     scored = {row.candidate for row in rows}
     absent = [name for name in content.candidates if name not in scored]
-    lines = []
-    if absent:
-        lines.append(
-            f"**Not trained yet, so that claims on them are not assessed:** {'; '.join(absent)}."
-        )
     unfinished = [
         f"{artefacts.titles.get(name, name)} has {len(part.models)} of {len(part.models) + len(part.failed)}"
         for name, part in artefacts.parts.items()
         if part.failed
     ]
+    lines = []
+    if absent:
+        lines.append(
+            f"**Not trained yet, so that claims on them are not assessed:** {'; '.join(absent)}."
+        )
     if unfinished:
         lines.append(f"Trainings that are there: {'; '.join(unfinished)}.")
-    return [" ".join(lines)] if lines else []
+    return lines
 
 
 def _outcome(
@@ -158,13 +166,13 @@ def _outcome(
     if shown:
         figure, drawn = traces.hard_sequence(part, shown, "tyre_d", name, where)
         data[f"traces_{name}"] = drawn
-        own.picture.append(figure)
+        own.front.append(figure)
     own.appendix += appendix_of_part(name, part, runs, where, data)
     return own
 
 
 def _accuracy(own: Outcome, name: str, blocks: Mapping[Key, BlockErrors], kind: str) -> None:
-    own.front += ["## Tables I and II", tables.overview(blocks, name, kind)]
+    own.front.append(tables.overview(blocks, name, kind))
     own.appendix.append(f"## Appendix: Tables I and II, {kind}")
     for test, tyre in SETS.items():
         which = (
@@ -210,7 +218,6 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     seeds = [model.seed for model in models]
     own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
     own.front += [
-        "## Friction",
         friction.figure(tracks, part.protocol.skip_seconds, name, where),
         friction.convergence_table(tracks, times, name, kind.upper()),
     ]

@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.evaluation.metrics import COVERAGE
 from vehest.report.document import Column, Table
-from vehest.report.style import fixed
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key
 from vehest_papers.kit.reading import median_and_range
@@ -61,6 +61,12 @@ def candidates_in(blocks: Mapping[Key, BlockErrors], part: str, test: str) -> li
         for key in blocks
         if (key.part, key.test_set, key.metric) == (part, test, "mae_weighted")
     ]
+
+
+def mse_text(blocks: Mapping[Key, BlockErrors], part: str, candidate: str, test: str) -> str:
+    """Weighted MSE with its interval; a dash where the candidate is not trained."""
+    errors = blocks.get(Key(part, candidate, test, "mse_weighted"))
+    return MISSING if errors is None else figure_in_words(value_of(errors, "mse_weighted")[1])
 
 
 def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
