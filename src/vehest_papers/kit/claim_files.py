@@ -113,6 +113,19 @@ class Paper:
     claims: list[Claim]
     tables: list[Table]
 
+    def metrics(self) -> list[tuple[str, str, str]]:
+        """Part, test set and metric of every error that claims or tables name."""
+        keys = [
+            (part, claim.test_set, claim.metric)
+            for claim in self.claims
+            if claim.metric
+            for part in (claim.part, claim.other_part or claim.part)
+        ]
+        keys += [
+            (table.part, table.test_set, row.metric) for table in self.tables for row in table.rows
+        ]
+        return list(dict.fromkeys(keys))
+
 
 _NEEDED: Mapping[Kind, Sequence[str]] = {
     "order": ("candidate", "other", "direction", "part", "test_set", "metric"),

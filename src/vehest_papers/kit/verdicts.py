@@ -205,6 +205,14 @@ def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]
     return contrast, _exponential(contrast, CONFIDENCE)
 
 
+def ratio_of(pair: Pair) -> Figure:
+    """Ratio of the pooled errors with its 95 % interval; without one where there are too few blocks."""
+    if pair.is_testable:
+        return _exponential(pair.size(), CONFIDENCE)
+    ratio = pair.first.mean(axis=0).sum() / pair.second.mean(axis=0).sum()
+    return Figure(float(ratio) ** pair.exponent, math.nan, math.nan)
+
+
 def judge_paper(
     paper: Paper, blocks: Mapping[Key, BlockErrors] | None, training: Mapping[str, Training]
 ) -> dict[str, Judgement]:
