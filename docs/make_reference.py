@@ -43,7 +43,7 @@ OVERVIEWS = {
         "cnn_ukf",
         "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
         {
-            "part": "learnt on",
+            "part": "trained on",
             "candidate": "method",
             "ours_mse": "MSE",
             "ours_mse_nonlinear": "MSE_nl",
@@ -52,7 +52,7 @@ OVERVIEWS = {
     ),
     "learned_ukf": (
         "learned_ukf",
-        "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
+        "Weighted squared error of the states, **real** recordings, means over seeds; no training uses tyre D",
         {
             "candidate": "method",
             "ours_tyre_a": "tyre A",
@@ -62,6 +62,16 @@ OVERVIEWS = {
     ),
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
+
+HEADINGS = {
+    "v = 0": "zero",
+    "map with reference": "static map, fitted to the drive",
+    "shipped": "shipped network",
+    "band holds": "coverage",
+    "worse than v = 0": "worse than zero",
+    "than 1.1 times shipped": "worse than 1.1 times the shipped network",
+}
+"""Headings of reports' tables -> those of pages."""
 
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
@@ -312,7 +322,7 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
 
 
 def figures(shown: str, *estimators: str) -> Iterable[str]:
-    """What published studies say of families, and a figure, named as STUDY/FIGURE, with its caption."""
+    """What published studies report of families, and a figure, named as STUDY/FIGURE, with its caption."""
     yield from _on_the_same_drive(estimators)
     for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
         rows = [
@@ -340,7 +350,7 @@ def _on_the_same_drive(estimators: Sequence[str]) -> Iterable[str]:
     wanted = [*estimators, *(name for name in BASELINES if name not in estimators)]
     shown = [row for name in wanted for row in rows if row["estimator"] == name]
     if any(row["estimator"] in estimators for row in shown):
-        yield "RMSE(β) [deg] with its 95 % interval, learnt on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
+        yield "RMSE(β) [deg] with its 95 % interval, trained on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
         cells = ("Ferrari 250 LM (real), 550 to 700 s", *(_with_interval(row) for row in shown))
         yield _table(("test", *(row["title"] for row in shown)), [cells], right=len(shown))
 
@@ -380,6 +390,29 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         yield _table(("estimator", *columns), lines, right=len(columns))
 
 
+def excerpt(source: str, columns: str, first_cells: str = "") -> Iterable[str]:
+    """Columns, numbered from 1, of a Markdown table of a report.
+
+    ``source`` is a report below results/, with ``#2`` behind it for its second table. ``first_cells`` are
+    beginnings of the first cells of the rows to show, joined by ``|``, with ``_`` in the place of a blank.
+    """
+    name, _, number = source.partition("#")
+    path = RESULTS / name
+    if not path.is_file():
+        return
+    text = path.read_text(encoding="utf-8")
+    tables = re.findall(r"^\|.*(?:\n\|.*)+", text, re.MULTILINE)
+    lines = [
+        [cell.strip() for cell in line.strip("|").split(" | ")]
+        for line in tables[int(number or 1) - 1].splitlines()
+    ]
+    indices = [int(column) - 1 for column in columns.split(",")]
+    starts = tuple(start.replace("_", " ") for start in first_cells.split("|"))
+    header = [HEADINGS.get(lines[0][index], lines[0][index]) for index in indices]
+    rows = [[line[index] for index in indices] for line in lines[2:] if line[0].startswith(starts)]
+    yield _table(header, rows, right=len(indices) - 1)
+
+
 def _rows(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
@@ -406,7 +439,18 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-_PARTS = (commands, files, channels, units, manoeuvres, courses, settings, figures, leaderboard)
+_PARTS = (
+    commands,
+    files,
+    channels,
+    units,
+    manoeuvres,
+    courses,
+    settings,
+    figures,
+    excerpt,
+    leaderboard,
+)
 PARTS: dict[str, Callable[..., Iterable[str]]] = {part.__name__: part for part in _PARTS}
 
 if __name__ == "__main__":
