@@ -69,6 +69,14 @@ HEADINGS = {
     "shipped": "shipped network",
     "band holds": "coverage",
     "worse than v = 0": "worse than zero",
+    "paper": "published",
+    "real_drive": "550 to 700 s",
+    "real_whole": "whole drive",
+    "share": "share of faults that are flagged",
+    "per_hour": "alarms an hour",
+    "low": "from (95 %)",
+    "high": "to",
+    "of_a_sensor": "alarms that accuse a sensor",
     "than 1.1 times shipped": "worse than 1.1 times the shipped network",
 }
 """Headings of reports' tables -> those of pages."""
@@ -390,27 +398,36 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         yield _table(("estimator", *columns), lines, right=len(columns))
 
 
-def excerpt(source: str, columns: str, first_cells: str = "") -> Iterable[str]:
-    """Columns, numbered from 1, of a Markdown table of a report.
+def excerpt(source: str, columns: str, rows: str = "") -> Iterable[str]:
+    """Columns, numbered from 1, of a CSV file or of a Markdown table of a report.
 
-    ``source`` is a report below results/, with ``#2`` behind it for its second table. ``first_cells`` are
-    beginnings of the first cells of the rows to show, joined by ``|``, with ``_`` in the place of a blank.
+    ``source`` is a file below results/, of a report with ``#2`` behind it for its second table. ``rows`` is a
+    pattern that the cells of a row, joined by commas, begin with; ``_`` stands for a blank.
     """
     name, _, number = source.partition("#")
     path = RESULTS / name
     if not path.is_file():
         return
-    text = path.read_text(encoding="utf-8")
-    tables = re.findall(r"^\|.*(?:\n\|.*)+", text, re.MULTILINE)
-    lines = [
-        [cell.strip() for cell in line.strip("|").split(" | ")]
-        for line in tables[int(number or 1) - 1].splitlines()
-    ]
+    lines = _csv_lines(path) if path.suffix == ".csv" else _table_lines(path, int(number or 1))
     indices = [int(column) - 1 for column in columns.split(",")]
-    starts = tuple(start.replace("_", " ") for start in first_cells.split("|"))
+    pattern = re.compile(rows.replace("_", " "))
     header = [HEADINGS.get(lines[0][index], lines[0][index]) for index in indices]
-    rows = [[line[index] for index in indices] for line in lines[2:] if line[0].startswith(starts)]
-    yield _table(header, rows, right=len(indices) - 1)
+    matches = [line for line in lines[1:] if pattern.match(",".join(line))]
+    yield _table(
+        header, [[line[index] for index in indices] for line in matches], right=len(indices) - 1
+    )
+
+
+def _csv_lines(path: Path) -> list[list[str]]:
+    with open(path, newline="", encoding="utf-8") as stream:
+        return [[_rounded(cell) or "–" for cell in line] for line in csv.reader(stream)]
+
+
+def _table_lines(path: Path, number: int) -> list[list[str]]:
+    """Cells of a report's table, without the rule below its header."""
+    tables = re.findall(r"^\|.*(?:\n\|.*)+", path.read_text(encoding="utf-8"), re.MULTILINE)
+    header, _, *lines = tables[number - 1].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in (header, *lines)]
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
