@@ -75,6 +75,12 @@ HEADINGS = {
     "rmse_sideslip_offline_deg": "RMSE(β) offline [deg]",
     "rmse_sideslip_online_deg": "online [deg]",
     "ratio_sideslip": "ratio",
+    "title": "estimator",
+    "rmse_sideslip": "RMSE(β) [deg]",
+    "interval": "95 % interval",
+    "n_seeds": "seeds",
+    "beats_zero": "better than zero",
+    "beats_static_map": "better than static_map",
     "share": "share of faults that are flagged",
     "per_hour": "alarms an hour",
     "low": "from (95 %)",
@@ -83,6 +89,8 @@ HEADINGS = {
     "than 1.1 times shipped": "worse than 1.1 times the shipped network",
 }
 """Headings of reports' tables -> those of pages."""
+CELLS = {"not told apart": "no significant difference", "Zero (v = 0)": "Zero"}
+"""Cells of reports' tables -> those of pages."""
 
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
@@ -416,9 +424,8 @@ def excerpt(source: str, columns: str, rows: str = "") -> Iterable[str]:
     pattern = re.compile(rows.replace("_", " "))
     header = [HEADINGS.get(lines[0][index], lines[0][index]) for index in indices]
     matches = [line for line in lines[1:] if pattern.match(",".join(line))]
-    yield _table(
-        header, [[line[index] for index in indices] for line in matches], right=len(indices) - 1
-    )
+    cells = [[CELLS.get(line[index], line[index]) for index in indices] for line in matches]
+    yield _table(header, cells, right=len(indices) - 1)
 
 
 def _csv_lines(path: Path) -> list[list[str]]:
