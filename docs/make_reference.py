@@ -26,6 +26,35 @@ PART = re.compile(
     r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL
 )
 
+HEADINGS = {
+    "v = 0": "zero",
+    "map with reference": "static map, fitted to the drive",
+    "shipped": "shipped network",
+    "band holds": "coverage",
+    "worse than v = 0": "worse than zero",
+    "paper": "published",
+    "real_drive": "550 to 700 s",
+    "real_whole": "whole drive",
+    "rmse_sideslip_offline_deg": "RMSE(β) offline [deg]",
+    "rmse_sideslip_online_deg": "online [deg]",
+    "ratio_sideslip": "ratio",
+    "title": "estimator",
+    "rmse_sideslip": "RMSE(β) [deg]",
+    "interval": "95 % interval",
+    "n_seeds": "seeds",
+    "beats_zero": "better than zero",
+    "beats_static_map": "better than static_map",
+    "share": "share of faults that are flagged",
+    "per_hour": "alarms an hour",
+    "low": "from (95 %)",
+    "high": "to",
+    "of_a_sensor": "alarms that accuse a sensor",
+    "than 1.1 times shipped": "worse than 1.1 times the shipped network",
+}
+"""Headings of reports' tables -> those of pages."""
+CELLS = {"not told apart": "no significant difference", "Zero (v = 0)": "Zero"}
+"""Cells of reports' tables -> those of pages."""
+
 BASELINES = ("zero", "static_map")
 OVERVIEWS = {
     "rational_ekf": (
@@ -62,35 +91,6 @@ OVERVIEWS = {
     ),
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
-
-HEADINGS = {
-    "v = 0": "zero",
-    "map with reference": "static map, fitted to the drive",
-    "shipped": "shipped network",
-    "band holds": "coverage",
-    "worse than v = 0": "worse than zero",
-    "paper": "published",
-    "real_drive": "550 to 700 s",
-    "real_whole": "whole drive",
-    "rmse_sideslip_offline_deg": "RMSE(β) offline [deg]",
-    "rmse_sideslip_online_deg": "online [deg]",
-    "ratio_sideslip": "ratio",
-    "title": "estimator",
-    "rmse_sideslip": "RMSE(β) [deg]",
-    "interval": "95 % interval",
-    "n_seeds": "seeds",
-    "beats_zero": "better than zero",
-    "beats_static_map": "better than static_map",
-    "share": "share of faults that are flagged",
-    "per_hour": "alarms an hour",
-    "low": "from (95 %)",
-    "high": "to",
-    "of_a_sensor": "alarms that accuse a sensor",
-    "than 1.1 times shipped": "worse than 1.1 times the shipped network",
-}
-"""Headings of reports' tables -> those of pages."""
-CELLS = {"not told apart": "no significant difference", "Zero (v = 0)": "Zero"}
-"""Cells of reports' tables -> those of pages."""
 
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
@@ -378,35 +378,7 @@ def _with_interval(row: dict[str, str]) -> str:
     return f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
 
 
-# Published results
-
-
-def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> Iterable[str]:
-    """The leaderboard of the study on one real car."""
-    lines = [
-        (
-            row["title"],
-            f"{float(row['n_parameters']):.0f}",
-            f"{float(row['rmse_sideslip']):.3f}",
-            row["interval"],
-            row["against_best"],
-            row["beats_zero"] or "–",
-            row["beats_static_map"] or "–",
-            f"{float(row['fvu']):.3f}",
-        )
-        for row in _rows(RESULTS / source)
-    ]
-    columns = (
-        "parameters",
-        "RMSE(β) [deg]",
-        "95 % interval [deg]",
-        "to the lowest [deg]",
-        "beats v = 0",
-        "beats static map",
-        "FVU",
-    )
-    if lines:
-        yield _table(("estimator", *columns), lines, right=len(columns))
+# Excerpts
 
 
 def excerpt(source: str, columns: str, rows: str = "") -> Iterable[str]:
@@ -438,6 +410,37 @@ def _table_lines(path: Path, number: int) -> list[list[str]]:
     tables = re.findall(r"^\|.*(?:\n\|.*)+", path.read_text(encoding="utf-8"), re.MULTILINE)
     header, _, *lines = tables[number - 1].splitlines()
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in (header, *lines)]
+
+
+# Published results
+
+
+def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> Iterable[str]:
+    """The leaderboard of the study on one real car."""
+    lines = [
+        (
+            row["title"],
+            f"{float(row['n_parameters']):.0f}",
+            f"{float(row['rmse_sideslip']):.3f}",
+            row["interval"],
+            row["against_best"],
+            row["beats_zero"] or "–",
+            row["beats_static_map"] or "–",
+            f"{float(row['fvu']):.3f}",
+        )
+        for row in _rows(RESULTS / source)
+    ]
+    columns = (
+        "parameters",
+        "RMSE(β) [deg]",
+        "95 % interval [deg]",
+        "to the lowest [deg]",
+        "beats v = 0",
+        "beats static map",
+        "FVU",
+    )
+    if lines:
+        yield _table(("estimator", *columns), lines, right=len(columns))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
