@@ -1,11 +1,8 @@
 """Write docs/examples/drive.asc and car.dbc, the CAN log of docs/bus.md: 20 s of a simulated drive as frames.
 
-Run as ``PYTHONPATH=tests/sources python docs/make_example_bus.py RECORDING`` with a stored recording of the
-quickstart, such as outputs/downsample/sim_quickstart-20hz-…/drive_3.parquet. Frames are up to 2 ms late, and
-1 % of them are lost.
+`python tests/sources/example_bus.py RECORDING` takes a stored recording of the quickstart at 20 Hz, such as
+outputs/downsample/sim_quickstart-20hz-…/drive_3.parquet. Frames are up to 2 ms late, and 1 % of them are lost.
 """
-
-from __future__ import annotations
 
 import sys
 from pathlib import Path
@@ -14,7 +11,7 @@ from can_drive import write_log
 
 import vehest
 
-OUT = Path(__file__).parent / "examples"
+OUT = Path(__file__).parents[2] / "docs" / "examples"
 START = 60.0
 SECONDS = 20.0
 
