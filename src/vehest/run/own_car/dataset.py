@@ -351,9 +351,11 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
         return not len(known) or (
             log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED)
         )
-    if log.source != "mdf" or own.stamps is None or not len(known):
-        return len(known) < len(own.values)
-    return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= BRIDGED).any())
+    if log.source != "rosbag" or own.stamps is None or not len(known):
+        return not len(known) or (log.source != "mdf" and len(known) < len(own.values))
+    measured = own.stamps[known]
+    ends = own.stamps[[0, -1]] == measured[[0, -1]]
+    return not ends.all() or bool((np.diff(measured)[np.diff(known) > 1] > BRIDGED).any())
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
@@ -402,16 +404,12 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     for one in proposals:
         place = columns[one.column].place
         short = str(place["topic"]).strip("/").replace("/", "_")
-        if short not in topics:
-            rate, gap = _rate_and_gap(columns[one.column])
-            rates.append(rate)
-            max_gap = max(LEAST_GAP, math.ceil(150.0 * gap) / 100.0)
-            topics[short] = {
-                "topic": place["topic"],
-                "type": place["type"],
-                "stamps": place["stamps"],
-                "max_gap": max_gap,
-            }
+        rate, gap = _rate_and_gap(columns[one.column])
+        rates.append(rate)
+        topic = topics.setdefault(
+            short, {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": LEAST_GAP}
+        )
+        topic["max_gap"] = max(topic["max_gap"], math.ceil(150.0 * gap) / 100.0)
         entry = _entry(one, {"topic": short, "field": place["field"]})
         channels[one.channel] = entry | (
             {"offset": float(f"{one.offset:.5g}")} if one.offset else {}

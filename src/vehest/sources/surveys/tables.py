@@ -27,6 +27,7 @@ from vehest.data.limits import check_limit
 from vehest.data.parquet import DAMAGE, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
 from vehest.sources.tables import (
@@ -50,27 +51,6 @@ WIDE = re.compile(
 )  # letters of Japanese, which accents in Windows-1252 make only one by one
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
-MARKS = frozenset(
-    {
-        "-",
-        "--",
-        "---",
-        "----",
-        "–",
-        "—",
-        "*",
-        "?",
-        "n.a.",
-        "none",
-        "missing",
-        "invalid",
-        "inv",
-        "void",
-        "#value!",
-        "#div/0!",
-    }
-)
-"""What loggers and spreadsheets write where there is no sample, in lower case."""
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
@@ -269,8 +249,10 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
 
 def _share(row: Sequence[str], decimal: str) -> float:
     """Share of cells that are numbers, empty ones left out; 0 where there is none."""
-    filled = [cell for cell in row if cell.strip() and cell.strip().lower() not in MARKS]
-    return sum(_is_number(cell, decimal) for cell in filled) / len(filled) if filled else 0.0
+    filled = [cell for cell in row if cell.strip()]
+    n_numbers = sum(_is_number(cell, decimal) for cell in filled)
+    n_others = sum(not (_is_number(cell, decimal) or marks_not_measured(cell)) for cell in filled)
+    return n_numbers / (n_numbers + n_others) if n_numbers else 0.0
 
 
 def _is_number(cell: str, decimal: str) -> bool:
@@ -368,7 +350,7 @@ def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str
         marks = {
             cell
             for cell in compute.unique(column).to_pylist()
-            if cell is not None and cell.strip().lower() in MARKS
+            if cell is not None and marks_not_measured(cell)
         }
         if marks:
             column = compute.if_else(
