@@ -529,11 +529,20 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     assert any("makes 2 recordings" in note for note in made.notes)
 
 
-@pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
+def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path):
+    table = usual(drive())
+    table.loc[1000:1025, "Steer"] = np.nan
+    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert made.dataset["channels"]["handwheel"]["max_gap"] == pytest.approx(0.54)
+    steer = read_back(made)["handwheel"][1000:1026]
+    np.testing.assert_allclose(np.diff(steer, 2), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".vbo", ".csv"])
 def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(
     tmp_path, suffix
 ):
-    """Half a second in a VBOX's log and in a measurement, two in a table without times."""
+    """Half a second in a VBOX's log, two in a table without times."""
     table = usual(drive())
     table.loc[1000 : 1100 if suffix == ".csv" else 1025, "Steer"] = np.nan
     table = table.drop(columns="Time [s]") if suffix == ".csv" else table
@@ -1068,3 +1077,33 @@ def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
     assert not proposed(tmp_path, table)["handwheel"].asked
     table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
     assert proposed(tmp_path, table)["handwheel"].asked
+
+
+TILTED = {"roll": "Roll [rad]", "pitch": "Pitch [rad]"}
+
+
+@pytest.mark.parametrize(
+    ("of_ay", "of_yaw_rate", "of_pitch", "is_asked"),
+    [(1, 1, 1, False), (-1, -1, -1, False), (-1, 1, -1, True), (1, -1, 1, True)],
+    ids=["forward-left-up", "forward-right-down", "ay to the right", "yaw to the right"],
+)
+def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
+    tmp_path, of_ay, of_yaw_rate, of_pitch, is_asked
+):
+    """Gravity is 9.81·sin(roll) along y and -9.81·sin(pitch) along x, so signs show in ay and ax."""
+    d = drive(240.0)
+    heading = np.cumsum(d["r"]) / 50.0
+    table = usual(d).drop(columns=["Steer", "Beta"])
+    table["Latitude"] = 48.0 + np.cumsum(d["vx"] * np.sin(heading)) / 50.0 / 111_000.0
+    metres = 111_000.0 * np.cos(np.radians(48.0))
+    table["Longitude"] = 16.0 + np.cumsum(d["vx"] * np.cos(heading)) / 50.0 / metres
+    table["LatAcc"] *= of_ay
+    table["Gyro"] *= of_yaw_rate
+    table[TILTED["roll"]] = -0.01 * d["ay"]
+    table[TILTED["pitch"]] = -0.01 * of_pitch * d["ax"]
+    found = proposed(tmp_path, table)
+    assert (found["yaw_rate"].sign, found["ay"].sign) == (of_yaw_rate, of_ay)
+    assert (found["roll"].sign, found["pitch"].sign) == (1, of_pitch)
+    assert {bool(found[name].asked) for name in TILTED} == {is_asked}
+    mirrored = proposals_of(tmp_path, table).mirrored().by_channel
+    assert (mirrored["roll"].sign, mirrored["pitch"].sign) == (1, -of_pitch)

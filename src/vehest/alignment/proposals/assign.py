@@ -309,7 +309,8 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         )
         found |= {one.channel: one for one in made}
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
-    return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
+    proposals = Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
+    return proposals.with_tilt_signs()
 
 
 def _named_channels(
