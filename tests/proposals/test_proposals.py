@@ -1107,3 +1107,72 @@ def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
     assert {bool(found[name].asked) for name in TILTED} == {is_asked}
     mirrored = proposals_of(tmp_path, table).mirrored().by_channel
     assert (mirrored["roll"].sign, mirrored["pitch"].sign) == (1, -of_pitch)
+
+
+WRAPPED = {
+    "16 bit of ms": lambda ms: (60_000 + ms) % 65_536,
+    "signed 16 bit of ms": lambda ms: (90_000 + ms + 32_768) % 65_536 - 32_768,
+    "32 bit of us": lambda ms: (2**32 - 30_000_000 + 1000 * ms) % 2**32,
+    "seconds of the week": lambda ms: (604_750.0 + 1e-3 * ms) % 604_800.0,
+}
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_a_counter_of_time_that_wraps_goes_on(tmp_path, name):
+    unit = "us" if "us" in name else "s" if "seconds" in name else "ms"
+    table = usual(drive()).rename(columns={"Time [s]": f"tick_{unit}"})
+    table.iloc[:, 0] = WRAPPED[name](20 * np.arange(6000))
+    made = drafted(tmp_path, table)
+    assert [round(seconds, 2) for seconds in made.durations.values()] == [120.0]
+    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+
+
+def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path):
+    table = usual(drive())
+    rows = np.arange(6000)
+    rows[500:503] = [502, 500, 501]
+    rows[3000:5000:100], rows[3001:5001:100] = (
+        rows[3001:5001:100].copy(),
+        rows[3000:5000:100].copy(),
+    )
+    made = drafted(tmp_path, table.iloc[rows])
+    assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
+    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    table.loc[2000:, "Time [s]"] -= 40.0
+    made = drafted(tmp_path, table)
+    assert [round(seconds) for seconds in made.durations.values()] == [40, 80]
+    (note,) = [note for note in made.notes if "go back" in note]
+    assert "makes 2 recordings; a command on one recording takes the longest, 80 of 120 s" in note
+
+
+@pytest.mark.parametrize("excess", [1.0, 1.08])
+def test_a_speed_is_compared_with_ay_less_the_change_of_the_lateral_velocity(tmp_path, excess):
+    """ay over vx·yaw_rate is 0.94 here, by d(vy)/dt, where the speed is right."""
+    d = drive(240.0)
+    t = d["t"]
+    turning = 3.0 * np.sin(2 * np.pi * 0.2 * t) + 2.0 * np.sin(2 * np.pi * 0.07 * t)
+    vy = np.cumsum(-0.06 * turning) / 50.0
+    d |= {"r": turning / d["vx"], "vy": vy, "ay": 0.94 * turning}
+    table = pd.DataFrame(
+        {"t": t, "vx": excess * d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "vy_ref": d["vy"]}
+    )
+    notes = proposals_of(tmp_path, table).notes
+    assert any("'vx' reads" in note for note in notes) == (excess > 1.0)
+
+
+def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp_path):
+    d = drive()
+    stand = np.zeros(1500)
+    vx, rate = (np.concatenate([stand, d[name], stand]) for name in ("vx", "r"))
+    noise = np.random.default_rng(1).standard_normal((2, 9000))
+    heading = np.cumsum(rate) / 50.0
+    table = pd.DataFrame({"t": np.arange(9000) / 50.0, "Speed [m/s]": vx, "Gyro [rad/s]": -rate})
+    table["LatAcc [m/s2]"] = -vx * rate + 0.05 * noise[0]
+    metres = 111_000.0 * np.cos(np.radians(48.0))
+    table["Latitude"] = 48.0 + np.cumsum(vx * np.sin(heading)) / 50.0 / 111_000.0
+    table["Longitude"] = 11.0 + np.cumsum(vx * np.cos(heading)) / 50.0 / metres
+    table[["Latitude", "Longitude"]] += 1e-7 * noise.T
+    table.to_csv(tmp_path / "course.csv", index=False)
+    found = inspect("my_car", [tmp_path / "course.csv"]).proposals
+    assert "course over latitude and longitude" in found.left_right
+    assert (found.by_channel["yaw_rate"].sign, found.by_channel["ay"].sign) == (-1, -1)

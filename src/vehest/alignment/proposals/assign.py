@@ -57,6 +57,7 @@ STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
 FITTING_SPEED = (0.97, 1.08)
+FITTING_SPEED_ALONE = (0.92, 1.08)  # where d(vy)/dt is not known
 MISREAD = (
     0.9,
     1.35,
@@ -82,6 +83,7 @@ RATES = (
 )
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
+COURSE_SPEED = 0.2  # of the top speed, below which a course over positions is noise
 SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 USUAL = {  # 99th percentile of the motion's channels, SI
@@ -147,7 +149,7 @@ def propose(
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
     if search is not None:
-        proposals, more = _speedometer(proposals, search.turning, wheels)
+        proposals, more = _speedometer(proposals, search, wheels, found)
         notes += more
     clues = () if known is None else _clues(found, wheels, known, is_vbo)
     proposals = _as_most_count(
@@ -186,28 +188,33 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
 
 
 def _speedometer(
-    proposals: Proposals, turning: Turning, wheels: Wheels
+    proposals: Proposals, search: Search, wheels: Wheels, columns: Sequence[Candidate]
 ) -> tuple[Proposals, list[str]]:
-    """The speed asked where ay over the yaw rate and the wheels agree that it misreads; a note where ay alone says so."""
+    """The speed asked where ay over the yaw rate and the wheels agree that it misreads.
+
+    A note where ay alone says so: by d(vy)/dt + vx·yaw_rate where a reference gives vy. Without
+    one, d(vy)/dt makes up some per cent, so that only more than these count.
+    """
     own = proposals.by_channel.get("vx")
-    is_right = FITTING_SPEED[0] <= turning.scale <= FITTING_SPEED[1]
-    if (
-        "ay" not in turning.columns
-        or own is None
-        or is_right
-        or not MISREAD[0] < turning.scale < MISREAD[1]
-    ):
+    turning = search.turning
+    if "ay" not in turning.columns or own is None:
+        return proposals, []
+    expected, usual = _expected_ay(proposals, search.known, columns)
+    ay = slow_of(search.known["ay"], search.known.rate_hz)
+    scale = float(np.std(ay) / np.std(expected))
+    agreeing = abs(correlation(ay, expected))
+    if not MISREAD[0] < scale < MISREAD[1] or usual[0] <= scale <= usual[1]:
         return proposals, []
     by_wheels = wheels_over_speed(
         wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx")
     )
     if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
-        excess = _excess(
-            turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation)
-        )  # by regression either way
-        other = "little" if turning.scale < 1.0 else "much, as in a body that rolls"
+        bounds = scale / agreeing, scale * agreeing  # by regression either way
+        if any(usual[0] <= bound <= usual[1] for bound in bounds):
+            return proposals, []
+        other = "little" if scale < 1.0 else "much, as in a body that rolls"
         return proposals, [
-            f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
+            f"'{own.column}' reads {_excess(*bounds)} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
         ]
     scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
     doubt = (
@@ -218,6 +225,22 @@ def _speedometer(
     return replace(
         proposals, channels=tuple(changed if one is own else one for one in proposals.channels)
     ), []
+
+
+def _expected_ay(
+    proposals: Proposals, known: Motion, columns: Sequence[Candidate]
+) -> tuple[FloatArray, tuple[float, float]]:
+    """ay by the motion, (S,), and the range of ay over it by which the speed is right."""
+    for name in REFERENCES:
+        reference = proposals.by_channel.get(name)
+        if reference is None:
+            continue
+        samples = next(one.values for one in columns if one.name == reference.column)
+        factor = reference.sign * si_factor(reference.unit, name)
+        channels = {**known.channels, name: np.where(known.moving, samples * factor, 0.0)}
+        motion = replace(known, channels=channels, velocity=name)
+        return slow_of(motion.turning + motion.sliding, known.rate_hz), FITTING_SPEED
+    return slow_of(known.turning, known.rate_hz), FITTING_SPEED_ALONE
 
 
 def _excess(*scales: float) -> str:
@@ -515,11 +538,14 @@ def _clues(
         * (-1.0 if is_vbo else 1.0)
         * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
     )
+    rate = slow_of(known["yaw_rate"], known.rate_hz)
+    speed = slow_of(np.abs(known.vx), known.rate_hz)
     steps = np.gradient(east), np.gradient(latitude)
-    turned = -np.gradient(np.unwrap(np.arctan2(*steps)))
-    usual = (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
+    course = np.arctan2(*steps)
+    turned = np.angle(np.exp(-1j * np.gradient(np.unwrap(course))))
+    moving = speed > COURSE_SPEED * float(speed.max())  # noise of positions turns a slow course
+    usual = moving & (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
     if usual.sum() > FEWEST:
-        rate = slow_of(known["yaw_rate"], known.rate_hz)
         yield (
             "the course over latitude and longitude runs against yaw_rate, sign {}",
             correlation(turned[usual], rate[usual]),

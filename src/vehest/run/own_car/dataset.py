@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -126,13 +125,7 @@ def draft(examined: Examined) -> Draft:
             ratio = (found.value, found.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
-    if pause := dataset.get("max_gap"):
-        of_file = Counter(str(one.provenance.get("file")) for one in recordings)
-        notes += [
-            f"'{file}' pauses for more than {pause:g} s and makes {n} recordings"
-            for file, n in of_file.items()
-            if n > 1
-        ]
+    notes += _cuts(dataset, recordings)
     used_ratio = vehicle["steering_ratio"] or (
         ratio[0] if ratio and ratio[1] <= MAX_RATIO_UNCERTAINTY * abs(ratio[0]) else None
     )
@@ -179,6 +172,24 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     source = open_source(dataset)
     return [source.read(name) for name in source.ids()]
+
+
+def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
+    """Notes of files that are cut into several recordings, and why."""
+    pause = dataset.get("max_gap")
+    causes = [f"pauses for more than {pause:g} s"] if pause else []
+    causes += ["has times that go back"] if dataset.get("time_restarts") else []
+    if not causes:
+        return
+    durations: dict[str, list[float]] = {}
+    for recording in recordings:
+        durations.setdefault(str(recording.provenance.get("file")), []).append(recording.duration)
+    for file, seconds in durations.items():
+        if len(seconds) > 1:
+            yield (
+                f"'{file}' {' and '.join(causes)} and makes {len(seconds)} recordings; "
+                f"a command on one recording takes the longest, {max(seconds):.0f} of {sum(seconds):.0f} s"
+            )
 
 
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
@@ -259,7 +270,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset |= log.options
     if log.source != "vbo":
         dataset["time"] = (
-            None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
+            None
+            if log.clock is None
+            else {"column": log.clock.column, "unit": log.clock.unit, **log.clock.repair}
         )
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
     dataset["clock"] = "strict"

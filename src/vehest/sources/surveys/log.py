@@ -35,6 +35,7 @@ class Stamps:
     unit: str  # of time: ``s``, ``ms``, ``us`` or ``ns``
     evidence: str  # reasons for it, for people
     asked: bool = False  # whether the unit is ambiguous
+    repair: Mapping[str, Any] = field(default_factory=dict)  # options that put times in order
 
 
 @dataclass(frozen=True, eq=False)

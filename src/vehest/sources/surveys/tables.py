@@ -142,6 +142,9 @@ def survey_table(file: Path) -> Log:
         for name, times in {**clocks, **named}.items()
         if stamps is None or name != stamps.column
     ]
+    if stamps is not None and stamps.repair.get("sort"):
+        rows = np.argsort({**clocks, **values}[stamps.column], kind="stable")
+        values = {name: samples[rows] for name, samples in values.items()}
     options = {**options, **cuts}
     beside = {stamps.column if stamps else None, cuts.get("runs")}
     columns = [
