@@ -1151,8 +1151,9 @@ def test_a_speed_is_compared_with_ay_less_the_change_of_the_lateral_velocity(tmp
     d = drive(240.0)
     t = d["t"]
     turning = 3.0 * np.sin(2 * np.pi * 0.2 * t) + 2.0 * np.sin(2 * np.pi * 0.07 * t)
-    vy = np.cumsum(-0.06 * turning) / 50.0
-    d |= {"r": turning / d["vx"], "vy": vy, "ay": 0.94 * turning}
+    vy = np.cumsum(-0.06 * turning) / 50.0 + 0.1 * np.sin(2 * np.pi * 0.31 * t)
+    ay = turning + np.gradient(vy, t)
+    d |= {"r": turning / d["vx"], "vy": vy, "ay": ay}
     table = pd.DataFrame(
         {"t": t, "vx": excess * d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "vy_ref": d["vy"]}
     )
@@ -1176,3 +1177,89 @@ def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp
     found = inspect("my_car", [tmp_path / "course.csv"]).proposals
     assert "course over latitude and longitude" in found.left_right
     assert (found.by_channel["yaw_rate"].sign, found.by_channel["ay"].sign) == (-1, -1)
+
+
+def left_out(tmp_path, table):
+    """Channels with their columns, and keys of open questions, where every question stays open."""
+    examined, questions = ask(
+        inspect("my_car", [write(tmp_path / "lap.csv", table)]), interactive=False
+    )
+    by_channel = {name: one.column for name, one in examined.proposals.by_channel.items()}
+    return by_channel, {one.key: one for one in questions}
+
+
+def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "Ux": d["vx"],
+            "Uy": d["vy"],
+            "r [rad/s]": d["r"],
+            "e": 0.3 * np.sin(0.2 * d["t"]),
+            "dpsi [rad]": d["sideslip"] + 0.01 * np.sin(0.3 * d["t"]),
+            "roll": -0.01 * d["ay"],
+            "heading_error": d["r"] / 3.0,
+        }
+    )
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"yaw_rate": "r [rad/s]", "vy_ref": "Uy"}
+    assert (open_questions["Ux"].proposed, open_questions["Ux"].candidates[0]) == ("-", "vx m/s")
+    assert '--answer "Ux=vx m/s"' in open_questions["Ux"].text
+
+
+def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answer(tmp_path):
+    d = drive()
+    columns = {"a": d["t"], "b": d["vx"], "c": d["r"], "d": d["ay"]}
+    assert left_out(tmp_path, pd.DataFrame(columns))[0] == {}
+    named = {"a": d["t"], "speed": d["vx"], "c [rad/s]": d["r"], "d": d["ay"]}
+    assert left_out(tmp_path, pd.DataFrame(named))[0] == {"vx": "speed", "yaw_rate": "c [rad/s]"}
+    found = left_out(tmp_path, pd.DataFrame({**columns, "e": d["ax"]}))[0]
+    assert found == {"vx": "b", "yaw_rate": "c", "ay": "d", "ax": "e"}
+
+
+def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
+    d = drive()
+    noise = 0.02 * np.random.default_rng(2).standard_normal((3, len(d["t"])))
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "AccelerationX": d["ay"],
+            "AccelerationY": noise[0],
+            "AccelerationZ": d["ax"],
+            "VelocityX": d["vy"],
+            "VelocityY": noise[1],
+            "VelocityZ": d["vx"],
+            "AngularVelocityX": noise[2],
+            "AngularVelocityY": d["r"],
+            "AngularVelocityZ": noise[1] + noise[2],
+        }
+    )
+    found = {name: one.column for name, one in proposed(tmp_path, table).items()}
+    assert found == {
+        "vx": "VelocityZ",
+        "yaw_rate": "AngularVelocityY",
+        "ay": "AccelerationX",
+        "ax": "AccelerationZ",
+        "vy_ref": "VelocityX",
+    }
+
+
+def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
+    d = drive()
+    heading = 3.0 * np.cumsum(d["r"]) / 50.0
+    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    table = pd.DataFrame({"t": d["t"], "Velocity east [m/s]": east, "vel_n [m/s]": north})
+    table["Velocity forward [m/s]"] = d["vx"]
+    table = table.assign(**{"Gyro [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
+    found = proposed(tmp_path, table)
+    assert (found["vx"].column, found["vx"].asked) == ("Velocity forward [m/s]", "")
+    assert {"vx_ref", "vy_ref"}.isdisjoint(found)
+    heading = np.cumsum(d["r"]) / 50.0  # always nearly along x
+    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    table = pd.DataFrame({"t": d["t"], "twist.linear.x": east, "twist.linear.y": north})
+    table = table.assign(x=np.cumsum(east) / 50.0, y=np.cumsum(north) / 50.0)
+    table = table.assign(**{"gyro_z [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"yaw_rate": "gyro_z [rad/s]", "ay": "LatAcc [m/s2]"}
+    assert "an axis of the world" in open_questions["twist.linear.x"].text

@@ -18,6 +18,7 @@ from vehest.alignment.proposals.columns import (
     largest,
     si_factor,
     slow_of,
+    without_axes,
 )
 from vehest.alignment.proposals.fitting import (
     CLEAR,
@@ -63,6 +64,8 @@ MISREAD = (
     1.35,
 )  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
 WHEELS_AGREE = 0.02
+WORLD_AGREEING = 0.98  # correlation of a velocity with the derivative of a position
+WORLD_CROSSING = 0.05  # of the position's other axis over it, so that the car turned
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
 RATES = (
     5.0,
@@ -97,6 +100,10 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "sideslip_ref": (0.002, 0.8),
 }
 UNCONFIRMED = "no other column agrees with it"
+SINGLE_EVIDENCE = (
+    "one piece of evidence is not enough: neither unit, name nor another column agrees"
+)
+NEEDS_EVIDENCE = ("vx", "yaw_rate", "ay")  # channels of two pieces of evidence, or none
 BY_NAME_ALONE = (
     "motor_current",
     "brake_pressure_front",
@@ -131,6 +138,10 @@ def propose(
     speeds = [one for one in found if "vx" in one.hints and one.unit and one.measures("vx")]
     stands = bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
     turning = [] if stands else find_turning(found)
+    if not (turning or stands):
+        by_motion = without_axes(found)
+        turning = find_turning(by_motion)
+        found = by_motion if turning else found
     guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
     if guessed is not None:
         return replace(propose(columns, guessed, is_vbo=is_vbo), rate_hz=guessed)
@@ -148,6 +159,7 @@ def propose(
         notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
+    proposals = _world_axis_asked(proposals, found, rate)
     if search is not None:
         proposals, more = _speedometer(proposals, search, wheels, found)
         notes += more
@@ -185,6 +197,38 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
         else:
             kept.append(one)
     return replace(proposals, channels=tuple(kept), notes=tuple(notes))
+
+
+def _world_axis_asked(
+    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
+) -> Proposals:
+    """The velocities asked where one is the derivative of a position along an axis of the world."""
+    speed = proposals.by_channel.get("vx")
+    positions = [
+        next(one.slow for one in columns if role in one.hints)
+        for role in ("position_x", "position_y")
+        if any(role in one.hints for one in columns)
+    ]
+    if speed is None or speed.asked or len(positions) < 2:
+        return proposals
+    along, across = (np.gradient(samples) for samples in positions)
+    by_name = {one.name: one for one in columns}
+    slow = by_name[speed.column].slow if speed.column in by_name else along
+    crossing = float(np.std(across)) > WORLD_CROSSING * float(np.std(along))
+    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
+    of_path = abs(correlation(slow, np.hypot(along, across)))
+    if not (crossing and of_axis > WORLD_AGREEING and of_axis > of_path):
+        return proposals
+    doubt = "it is the derivative of a position: of an axis of the world, not of the car?"
+    return replace(
+        proposals,
+        channels=tuple(
+            replace(one, asked=one.asked or doubt, is_weak=True)
+            if one.channel in ("vx", "vy_ref")
+            else one
+            for one in proposals.channels
+        ),
+    )
 
 
 def _speedometer(
@@ -399,6 +443,7 @@ def _by_name(column: Candidate, channel: str) -> Proposal:
         (evidence,),
         f"unit and sign: {UNCONFIRMED}",
         others=UNITS[channel],
+        is_weak=channel in NEEDS_EVIDENCE,
     )
 
 
@@ -443,23 +488,28 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:
-    """The three of turning asked where no name, unit or other column speaks for them: yaw_rate ≈ steer·vx / wheelbase looks alike."""
-    named = any(
-        one.unit or channel in one.hints
-        for channel, one in turning.columns.items()
-        if channel != "vx"
-    )
-    confirmed = any(
+    """Speed, yaw rate and lateral acceleration asked where one piece of evidence is all.
+
+    Pieces are the relation ay ≈ vx·yaw_rate, another column that agrees, the unit of the header
+    and the name. yaw_rate ≈ steer·vx / wheelbase and a lateral velocity follow a turn alike.
+    """
+    is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR
+    is_confirmed = any(
         channel in found and not found[channel].asked for channel in ("ax", *REFERENCES)
     )
-    if named or confirmed or "ay" not in turning.columns:
-        return found
-    doubt = "no name and no other column speaks for it: yaw rate and acceleration could be steering and yaw rate"
-    three = {one.name for one in turning.columns.values()}
-    return {
-        name: replace(one, asked=one.asked or doubt) if one.column in three else one
-        for name, one in found.items()
-    }
+    roles = {column.name: channel for channel, column in turning.columns.items()}
+    changed = {}
+    for name, one in found.items():
+        channel = roles.get(one.column)
+        if channel is None:
+            continue
+        column = turning.columns[channel]
+        others = column.name != one.column or any("agrees" in text for text in one.evidence[1:])
+        pieces = [is_related, is_related and is_confirmed, others]
+        pieces += [bool(column.unit), channel in column.hints]
+        if sum(pieces) < 2:
+            changed[name] = replace(one, asked=one.asked or SINGLE_EVIDENCE, is_weak=True)
+    return {**found, **changed}
 
 
 def _left_and_right(

@@ -43,6 +43,9 @@ class Proposal:
     offset: float = 0.0  # value of the column at zero, in its own unit
     others: tuple[str, ...] = ()  # channels or units that would do as well
     delay: float = 0.0  # by which it is late, as far as it is known [s]
+    is_weak: bool = (
+        False  # whether one piece of evidence is all: left out unless an answer takes it
+    )
 
     @property
     def in_words(self) -> str:

@@ -19,6 +19,7 @@ from vehest.alignment.settings import AlignmentSettings
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
+from vehest.data.derived import STANDSTILL_SPEED, speed_of_reference
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
@@ -41,9 +42,10 @@ POLICIES = {
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
+CRAWL_SPEED = 1.0  # m/s, below which a sideslip angle has no meaning
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 GAIN_APART = (
     1.15  # factor between the gains of two files, of which each half is beyond the other file's
@@ -113,7 +115,7 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"written twice, or {BRIDGED:g} s and more without a sample"
+        why = f"written twice, names repeated, or {BRIDGED:g} s and more without a sample"
         notes.append(
             f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}"
         )
@@ -134,7 +136,12 @@ def draft(examined: Examined) -> Draft:
             f"'steer' is left out: the steering ratio by slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
             f"less certain than {MAX_RATIO_UNCERTAINTY:.0%}; --steering-ratio with your car's adds it"
         )
-    made = _transforms(examined, longest, late, speed, used_ratio)
+    at_crawl = any(map(_has_sideslip_at_crawl, recordings))
+    if at_crawl:
+        notes.append(
+            f"below {CRAWL_SPEED:g} m/s, where sideslip reaches 90° and more, it is taken as 0"
+        )
+    made = _transforms(examined, longest, late, speed, used_ratio, has_sideslip_at_crawl=at_crawl)
     dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -172,6 +179,15 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     source = open_source(dataset)
     return [source.read(name) for name in source.ids()]
+
+
+def _has_sideslip_at_crawl(recording: Recording) -> bool:
+    """Whether a sideslip angle reaches 90 degrees at a speed at which it has no meaning."""
+    if "sideslip_ref" not in recording:
+        return False
+    speed = np.abs(recording[speed_of_reference(recording)])
+    slow = (speed >= STANDSTILL_SPEED) & (speed < CRAWL_SPEED)
+    return bool((np.abs(recording["sideslip_ref"][slow]) >= 0.5 * np.pi).any())
 
 
 def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
@@ -291,14 +307,18 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         )
         if log.clock is not None:
             holes = {
-                stem: [
-                    f"{first + 1}-{last}"
-                    for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))
+                own.file.stem: [
+                    f"{own.file_row(first)}-{own.file_row(last - 1)}"
+                    for first, last in true_runs(gaps[own.file.stem].max(axis=0) > BRIDGED)
                 ]
-                for stem, own in gaps.items()
+                for own in examined.logs
             }
             dropped = {
-                own.file.stem: [*holes[own.file.stem], *_rows_written_twice(own)]
+                own.file.stem: [
+                    *own.repeated_names,
+                    *holes[own.file.stem],
+                    *map(own.file_row, _rows_written_twice(own)),
+                ]
                 for own in examined.logs
             }
             dataset |= (
@@ -346,14 +366,14 @@ def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[st
 
 
 def _rows_written_twice(log: Log) -> list[int]:
-    """From 1."""
+    """Places in the columns, from 0."""
     rows = np.nan_to_num(
         [
             *([] if log.seconds is None else [log.seconds]),
             *(column.values for column in log.columns),
         ]
     )
-    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)) + 1).tolist()
+    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0))).tolist()
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -423,6 +443,10 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
             short, {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": LEAST_GAP}
         )
         topic["max_gap"] = max(topic["max_gap"], math.ceil(150.0 * gap) / 100.0)
+        stamps = columns[one.column].stamps
+        if stamps is not None and (np.diff(stamps) == 0.0).any():  # delivered in batches
+            mean_rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
+            topic |= {"clock": "uniform", "rate_hz": plain_rate(mean_rate, INTERPOLATED_TOLERANCE)}
         entry = _entry(one, {"topic": short, "field": place["field"]})
         channels[one.channel] = entry | (
             {"offset": float(f"{one.offset:.5g}")} if one.offset else {}
@@ -472,6 +496,8 @@ def _transforms(
     late: Mapping[str, Late],
     speed: Sequence[dict[str, Any]],
     ratio: float | None,
+    *,
+    has_sideslip_at_crawl: bool,
 ) -> list[dict[str, Any]]:
     """Transforms that make the channels that estimators want.
 
@@ -498,6 +524,9 @@ def _transforms(
         )
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
+    for entry in made:
+        if entry["name"] == "velocity_from_sideslip" and has_sideslip_at_crawl:
+            entry["min_speed"] = CRAWL_SPEED
     if "handwheel" in longest and "steer" not in longest and ratio:
         made.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
     return made

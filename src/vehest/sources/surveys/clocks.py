@@ -148,16 +148,17 @@ def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     fitting = [
         own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
     ]
-    chosen = unit or next(iter(fitting), "s" if named else "")
+    chosen = unit if unit in fitting or not fitting else fitting[0]
+    chosen = chosen or ("s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
-    how = (
-        f"unit in the header, {rate:.6g} Hz"
-        if unit
-        else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
-    )
-    return Stamps(name, chosen, how, asked=chosen not in fitting)
+    how = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    if unit == chosen:
+        how = f"unit in the header, {rate:.6g} Hz"
+    elif unit:
+        how += f", {1.0 / (step * UNITS[unit]):.6g} Hz in {unit}, as the header says"
+    return Stamps(name, chosen, how, asked=chosen not in fitting or unit not in ("", chosen))
 
 
 def _run_starts(
