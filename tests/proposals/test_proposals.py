@@ -1211,7 +1211,8 @@ def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_on
 def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answer(tmp_path):
     d = drive()
     columns = {"a": d["t"], "b": d["vx"], "c": d["r"], "d": d["ay"]}
-    assert left_out(tmp_path, pd.DataFrame(columns))[0] == {}
+    with pytest.raises(VehestError, match='--answer "b=vx m/s"'):
+        left_out(tmp_path, pd.DataFrame(columns))
     named = {"a": d["t"], "speed": d["vx"], "c [rad/s]": d["r"], "d": d["ay"]}
     assert left_out(tmp_path, pd.DataFrame(named))[0] == {"vx": "speed", "yaw_rate": "c [rad/s]"}
     found = left_out(tmp_path, pd.DataFrame({**columns, "e": d["ax"]}))[0]

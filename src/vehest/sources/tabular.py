@@ -226,9 +226,11 @@ class TabularSource(FileSource):
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns in the order of their times, without the rows that the data set leaves out."""
-        values = read_columns(file, wanted, self.layout)
-        if self.time is not None:
-            values = self.time.in_order(values)
+        time = self.time
+        sorting = [time.column] if time is not None and time.sort else []
+        values = read_columns(file, list(dict.fromkeys([*wanted, *sorting])), self.layout)
+        if time is not None and time.column in values:
+            values = time.in_order(values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values

@@ -103,6 +103,12 @@ UNCONFIRMED = "no other column agrees with it"
 SINGLE_EVIDENCE = (
     "one piece of evidence is not enough: neither unit, name nor another column agrees"
 )
+AGREEING = {
+    "vx": {"ax"},
+    "yaw_rate": {"steer", "handwheel", *REFERENCES},
+    "ay": {*REFERENCES},
+}
+"""Channel -> those whose relation confirms it."""
 NEEDS_EVIDENCE = ("vx", "yaw_rate", "ay")  # channels of two pieces of evidence, or none
 BY_NAME_ALONE = (
     "motor_current",
@@ -494,9 +500,7 @@ def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Prop
     and the name. yaw_rate ≈ steer·vx / wheelbase and a lateral velocity follow a turn alike.
     """
     is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR
-    is_confirmed = any(
-        channel in found and not found[channel].asked for channel in ("ax", *REFERENCES)
-    )
+    sure = {name for name, one in found.items() if not one.asked}
     roles = {column.name: channel for channel, column in turning.columns.items()}
     changed = {}
     for name, one in found.items():
@@ -505,7 +509,8 @@ def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Prop
             continue
         column = turning.columns[channel]
         others = column.name != one.column or any("agrees" in text for text in one.evidence[1:])
-        pieces = [is_related, is_related and is_confirmed, others]
+        confirming = AGREEING[channel] | (AGREEING["vx"] if is_related else set())
+        pieces = [is_related, bool(sure & confirming), others]
         pieces += [bool(column.unit), channel in column.hints]
         if sum(pieces) < 2:
             changed[name] = replace(one, asked=one.asked or SINGLE_EVIDENCE, is_weak=True)

@@ -12,7 +12,7 @@ _STRONG = {  # over the name without blanks
     "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
     r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
-    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|^e$|crosstrack|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
+    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|crosstrack|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
     "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|"

@@ -19,7 +19,7 @@ from vehest.alignment.settings import AlignmentSettings
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
-from vehest.data.derived import STANDSTILL_SPEED, speed_of_reference
+from vehest.data.derived import speed_of_reference
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
@@ -42,7 +42,9 @@ POLICIES = {
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
-CRAWL_SPEED = 1.0  # m/s, below which a sideslip angle has no meaning
+CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
+CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
+MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
@@ -136,12 +138,13 @@ def draft(examined: Examined) -> Draft:
             f"'steer' is left out: the steering ratio by slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
             f"less certain than {MAX_RATIO_UNCERTAINTY:.0%}; --steering-ratio with your car's adds it"
         )
-    at_crawl = any(map(_has_sideslip_at_crawl, recordings))
-    if at_crawl:
+    crawl_speed = max(map(_crawl_speed, recordings))
+    if crawl_speed:
         notes.append(
-            f"below {CRAWL_SPEED:g} m/s, where sideslip reaches 90° and more, it is taken as 0"
+            f"sideslip has no meaning below {crawl_speed:g} m/s, where it is beyond "
+            f"{np.degrees(MAX_CRAWL_SIDESLIP):.0f}°, and is taken as 0 there"
         )
-    made = _transforms(examined, longest, late, speed, used_ratio, has_sideslip_at_crawl=at_crawl)
+    made = _transforms(examined, longest, late, speed, used_ratio, crawl_speed)
     dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -181,13 +184,14 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return [source.read(name) for name in source.ids()]
 
 
-def _has_sideslip_at_crawl(recording: Recording) -> bool:
-    """Whether a sideslip angle reaches 90 degrees at a speed at which it has no meaning."""
+def _crawl_speed(recording: Recording) -> float:
+    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout."""
     if "sideslip_ref" not in recording:
-        return False
+        return 0.0
     speed = np.abs(recording[speed_of_reference(recording)])
-    slow = (speed >= STANDSTILL_SPEED) & (speed < CRAWL_SPEED)
-    return bool((np.abs(recording["sideslip_ref"][slow]) >= 0.5 * np.pi).any())
+    crawl = float(f"{min(CRAWL_SPEED, CRAWL_SHARE * float(np.nanmax(speed))):.2g}")
+    angles = np.abs(recording["sideslip_ref"][speed < crawl])
+    return crawl if (angles > MAX_CRAWL_SIDESLIP).any() else 0.0
 
 
 def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
@@ -496,8 +500,7 @@ def _transforms(
     late: Mapping[str, Late],
     speed: Sequence[dict[str, Any]],
     ratio: float | None,
-    *,
-    has_sideslip_at_crawl: bool,
+    crawl_speed: float,
 ) -> list[dict[str, Any]]:
     """Transforms that make the channels that estimators want.
 
@@ -525,8 +528,8 @@ def _transforms(
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
     for entry in made:
-        if entry["name"] == "velocity_from_sideslip" and has_sideslip_at_crawl:
-            entry["min_speed"] = CRAWL_SPEED
+        if entry["name"] == "velocity_from_sideslip" and crawl_speed:
+            entry["min_speed"] = crawl_speed
     if "handwheel" in longest and "steer" not in longest and ratio:
         made.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
     return made

@@ -137,7 +137,8 @@ def inspect(
         names = counted([column.name for column in longest.columns])
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(
-            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}"
+            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}; "
+            "needed are speed, yaw rate and lateral acceleration: name their columns so, with units"
         )
     computed = [
         f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement"

@@ -75,6 +75,15 @@ def ask(
         else:
             left.append(question)
             examined = _answered(examined, question, question.proposed)
+    if left and not examined.proposals.channels:
+        takes = " ".join(
+            f'--answer "{question.key}={question.candidates[0]}"'
+            for question in left
+            if question.candidates and question.proposed == LEAVE_OUT
+        )
+        raise ConfigurationError(
+            f"no column has two pieces of evidence for its channel; add those that are right: {takes}"
+        )
     return examined, tuple(left)
 
 

@@ -47,7 +47,7 @@ from vehest.sources.unit_spellings import plain_unit
 HEAD = 1 << 18  # bytes that are looked at
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
-MIN_NUMBERS = 20  # different ones in a column of numbers and other texts
+MAX_ODD_SHARE = 0.01  # of its numbers
 MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
@@ -409,20 +409,17 @@ def _numbers(
     """
     if not pa.types.is_string(column.type):
         return (numbers_of(column), set(), {}) if _is_numeric(column.type) else None
-    texts = compute.unique(column).drop_null().to_pylist()
-    others = [text for text in texts if not _is_number(text, decimal)]
-    odd = [text for text in others if not marks_not_measured(text) and text.strip()]
-    if len(odd) > MAX_ODD_CELLS or len(texts) < MIN_NUMBERS + len(others):
+    plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
+    is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
+    is_other = compute.fill_null(compute.invert(is_number), False)
+    others = compute.unique(column.filter(is_other)).to_pylist()
+    odd = [text for text in others if text.strip() and not marks_not_measured(text)]
+    rows = {text: compute.index(column, text).as_py() + 1 for text in odd[:MAX_ODD_CELLS]}
+    n_odd = compute.sum(compute.is_in(column, pa.array(odd, pa.string()))).as_py() or 0
+    if len(odd) > MAX_ODD_CELLS or n_odd > MAX_ODD_SHARE * (compute.sum(is_number).as_py() or 0):
         return None
-    rows = {text: compute.index(column, text).as_py() + 1 for text in odd}
-    if others:
-        is_other = compute.is_in(column, pa.array(others))
-        column = compute.if_else(is_other, pa.scalar(None, pa.string()), column)
-    column = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
-    try:
-        return numbers_of(column), {text for text in others if text.strip()}, rows
-    except pa.ArrowException:
-        return None
+    column = compute.if_else(is_other, pa.scalar(None, pa.string()), plain)
+    return numbers_of(column), {text for text in others if text.strip()}, rows
 
 
 def _is_numeric(kind: pa.DataType) -> bool:
