@@ -123,6 +123,12 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
             raise DataError(
                 f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one"
             )
+        numbered = [one for one in names if re.fullmatch(rf"{re.escape(name)} #\d+", one)]
+        if not count and numbered:
+            raise DataError(
+                f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or remove "
+                f"all but one, or declare one of them: {listed(numbered)}"
+            )
         if not count:
             raise DataError(
                 f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset"
