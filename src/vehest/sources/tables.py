@@ -9,7 +9,7 @@ import codecs
 import csv
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -73,7 +73,10 @@ def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
         lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))
         filled = filter(None, lines[layout.skip_rows :])
         rows = csv.reader(filled, delimiter=layout.delimiter)
-        return [next(rows, []), next(islice(rows, layout.rows_below_names, None), [])]
+        header = next(rows, [])
+        with suppress(csv.Error):  # of an endless line, which the reader of the rows reports
+            return [header, next(islice(rows, layout.rows_below_names, None), [])]
+        return [header, []]
     except (ValueError, csv.Error) as error:
         raise _unreadable(file, error) from None
 
