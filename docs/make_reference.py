@@ -63,6 +63,9 @@ OVERVIEWS = {
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
 
+VERDICTS = {"lowest": "best", "not told apart": "no significant difference", "": "–"}
+"""Verdict in a published leaderboard -> how the page says it."""
+
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
 
@@ -360,9 +363,10 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
             f"{float(row['n_parameters']):.0f}",
             f"{float(row['rmse_sideslip']):.3f}",
             row["interval"],
-            row["against_best"],
-            row["beats_zero"] or "–",
-            row["beats_static_map"] or "–",
+            *(
+                VERDICTS.get(row[column], row[column])
+                for column in ("against_best", "beats_zero", "beats_static_map")
+            ),
             f"{float(row['fvu']):.3f}",
         )
         for row in _rows(RESULTS / source)
@@ -371,8 +375,8 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         "parameters",
         "RMSE(β) [deg]",
         "95 % interval [deg]",
-        "to the lowest [deg]",
-        "beats v = 0",
+        "difference to best [deg]",
+        "beats zero",
         "beats static map",
         "FVU",
     )
