@@ -427,9 +427,11 @@ def estimate(
     Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     from vehest.run.estimate import estimate_file
+    from vehest.run.estimate_summary import summary_lines
 
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    emit(as_json, estimate_file(words, out, strict=strict, car=car))
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    emit(as_json, outcome, summary_lines(outcome))
 
 
 @app.command()

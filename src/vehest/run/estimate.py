@@ -24,11 +24,11 @@ from vehest.alignment.findings import Finding
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.estimate import QUANTITIES, Estimate
+from vehest.data.estimate import IN_DEGREES, QUANTITIES, Estimate, number_cell, time_cell
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import UNNAMED_VEHICLE, Recording, joined
-from vehest.data.store import estimate_columns, write_estimate_parts
+from vehest.data.store import estimate_columns, with_degrees, write_estimate_parts
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
@@ -40,6 +40,7 @@ from vehest.run.config import compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled, resampled_parts
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
+from vehest.run.estimate_summary import point_of_estimate
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import car_of, read_single, source_of_file
@@ -235,6 +236,7 @@ def estimate_file(
         "model": name if name in WITH_VEHEST else str(folder),
         **({"car": str(car)} if car is not None else {}),
         **report.summary(),
+        "point": point_of_estimate(model, folder),
         **({"band": band} if band else {}),
         "verdict": report.verdict(),
         "findings": findings,
@@ -441,6 +443,7 @@ def _too_short(model: Estimator, recording_id: str, seconds: float) -> DataError
 def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
     """Write an estimate, of parts that follow one another, as Parquet or CSV, by the file's ending.
 
+    Units are those of `COLUMN_UNITS`. CSV has six significant digits, times to a microsecond.
     ``band`` says what calibrated the bands, in the metadata of Parquet.
     """
     _check_table_name(path)
@@ -458,16 +461,17 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") 
 
 def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
     """Cells of a table of text, with the reasons of health in words."""
-    cells: dict[str, list[Any]] = {"time": columns["time"].tolist()}
-    own = {name: values for name, values in columns.items() if name in QUANTITIES}
-    cells |= {
-        name: ["" if np.isnan(value) else value for value in values.tolist()]
-        for name, values in own.items()
-    }
+    cells: dict[str, list[Any]] = {"time": [time_cell(time) for time in columns["time"].tolist()]}
+    quantities = [name for name in columns if name in QUANTITIES]
+    cells |= {name: [number_cell(value) for value in columns[name].tolist()] for name in quantities}
     if "health" in columns:
         cells["health"] = columns["health"].astype(int).tolist()
         cells["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
-    return cells
+    angles = with_degrees(columns)
+    in_degrees = [name for name in IN_DEGREES if name in angles]
+    return cells | {
+        name: [number_cell(value) for value in angles[name].tolist()] for name in in_degrees
+    }
 
 
 def _check_table_name(path: Path) -> None:
@@ -550,6 +554,11 @@ class _Report:
             "rate_hz": last.rate_hz,
             "samples": self.samples,
             "estimated": self.estimated,
+            "seconds": self.seconds,
+            "valid_percent": self.valid_percent,
+            "invalid_reasons": self.invalid_reasons,
+            "outside_training": self.outside_training,
+            "has_calibration": self.health is not None,
             "quantities": {name: QUANTITIES[name] for name in last.channels},
             "sideslip_deg": {
                 end: round(float(take.reduce(self.extremes)), 3)
@@ -568,18 +577,29 @@ class _Report:
             figures["band_sideslip_deg"] = band
         return figures
 
+    @property
+    def valid_percent(self) -> float:
+        """Share of the estimated samples whose health is valid [%]."""
+        return 100.0 * (1.0 - self.invalid / self.estimated)
+
+    @property
+    def invalid_reasons(self) -> list[str]:
+        """The two most frequent reasons for samples that are not valid."""
+        counts = sorted(self.reasons.items(), key=lambda reason: -reason[1])
+        return [reason_in_words(code) for code, _ in counts[:2]]
+
+    @property
+    def outside_training(self) -> str:
+        """Share of the drive outside the range of the training, and its channels; empty if there is none."""
+        return domain_verdict(self.health, self.outside) if self.health is not None else ""
+
     def verdict(self) -> str:
         """The share of valid samples and what makes others invalid, in a line."""
         if self.health is None:
             bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
-        worst = [
-            reason_in_words(code)
-            for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]
-        ]
-        share = 100.0 * (1.0 - self.invalid / self.estimated)
-        valid = f"valid in {share:.3g} % of the drive" + (
-            f"; else: {', '.join(worst)}" if worst else ""
+        reasons = self.invalid_reasons
+        valid = f"valid in {self.valid_percent:.3g} % of the drive" + (
+            f"; otherwise: {', '.join(reasons)}" if reasons else ""
         )
-        outside = domain_verdict(self.health, self.outside)
-        return f"{outside}; {valid}" if outside else valid
+        return "; ".join(filter(None, (self.outside_training, valid)))
