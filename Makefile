@@ -127,9 +127,9 @@ readme_picture: $(INSTALLED) ## the picture of README.md, of the study ferrari_d
 	$(BIN)/python docs/make_readme_picture.py "$${VEHEST_OUTPUT:-outputs}"
 
 example_log: $(INSTALLED) ## docs/examples/lap.csv, the log of the how-to guides: four minutes of a simulated Ferrari 250 LM
-	$(BIN)/vehest ingest sim_quickstart vehicle@dataset.vehicle=ferrari_250_lm dataset.sensors=race \
+	$(BIN)/vehest downsample sim_quickstart rate_hz=20 vehicle@dataset.vehicle=ferrari_250_lm \
 	  'dataset.drives=[{id: lap, seed: 7, manoeuvre: {name: laps, course: palm_beach_like, duration: 240, severity: [0.92, 1.0]}}]'
-	$(BIN)/python docs/make_example_log.py "$$(ls -t "$${VEHEST_OUTPUT:-outputs}"/ingest/sim_quickstart-*/lap.parquet | head -1)"
+	$(BIN)/python docs/make_example_log.py "$$(ls -t "$${VEHEST_OUTPUT:-outputs}"/downsample/sim_quickstart-20hz-*/lap.parquet | head -1)"
 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml

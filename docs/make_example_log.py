@@ -1,6 +1,6 @@
 """Write docs/examples/lap.csv, the log of the how-to guides: a simulated lap in the units of a logger.
 
-Run by ``make example_log``, which simulates the lap first; the only argument is the stored recording.
+Run by ``make example_log``, which simulates the lap and brings it to 20 Hz; the only argument is the stored recording.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 import vehest
 
 OUT = Path(__file__).parent / "examples" / "lap.csv"
-STEP = 5  # every fifth of 100 samples a second
 STEERING_RATIO = 16.0
 COLUMNS = "Timestamp,Speed,GyroZ,AccX,AccY,SteerWheel,SlipAngle"
 FORMATS = ("%.2f", "%.3f", "%.3f", "%.3f", "%.3f", "%.2f", "%.3f")
@@ -31,7 +30,7 @@ def write_log(stored: Path) -> None:
         STEERING_RATIO * np.degrees(recording["steer"]),
         np.degrees(recording["sideslip_ref"]),
     )
-    rows = np.stack(columns, axis=1)[::STEP]
+    rows = np.stack(columns, axis=1)
     np.savetxt(OUT, rows, FORMATS, delimiter=",", header=COLUMNS, comments="")
 
 
