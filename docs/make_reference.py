@@ -428,7 +428,7 @@ def benchmarks(*names: str) -> Iterable[str]:
             case["case"],
             _seconds(case["baseline_seconds"]),
             _seconds(case["ours_seconds"]),
-            f"{case['baseline_seconds'] / case['ours_seconds']:.3g}",
+            _two_digits(case["baseline_seconds"] / case["ours_seconds"]),
             name,
         )
         for name in names
@@ -503,6 +503,10 @@ def launchers() -> Iterable[str]:
 def _json(source: str) -> dict[str, Any]:
     path = RESULTS / source
     return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+def _two_digits(ratio: float) -> str:
+    return f"{float(f'{ratio:.2g}'):g}"
 
 
 def _seconds(value: float) -> str:
