@@ -64,7 +64,7 @@ OVERVIEWS = {
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
 
-VERDICTS = {"lowest": "best", "not told apart": "no significant difference", "": "–"}
+VERDICTS = {"lowest": "best", "not told apart": "not significant", "": "–"}
 """Verdict in a published leaderboard -> how the page says it."""
 
 COMMON = 4  # commands from which on an option is listed once for all

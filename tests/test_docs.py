@@ -79,11 +79,11 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     columns = (
         "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     )
-    rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
+    rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,best,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not significant,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
     (made,) = make_reference.leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | best | yes | no | 0.012 |"
-    second = "| Other | 2 | 0.500 | 0.400 … 0.600 | no significant difference | – | – | 0.200 |"
+    second = "| Other | 2 | 0.500 | 0.400 … 0.600 | not significant | – | – | 0.200 |"
     assert made.endswith(f"{first}\n{second}")
 
 

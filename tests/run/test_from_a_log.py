@@ -63,7 +63,7 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
     assert "ay points the other way" not in out
     out, err = logged.done("run", "my_log", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in err
-    assert "test set 'test' is too short to tell estimators apart: no interval, no winner" in out
+    assert "test set 'test' is too short to compare estimators: no interval, no winner" in out
     report = next((logged.folder / "outputs" / "report").glob("my_log-*")) / "report.md"
     text = report.read_text(encoding="utf-8")
     assert all(

@@ -274,7 +274,7 @@ def compare_estimates(
         if ranking.order
         else f"Sideslip is not scored: the car is slower than {min_speed:.3g} m/s throughout."
     )
-    for words in ("**", " over its seeds", " and over seeds"):
+    for words in ("**", " over all seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
     rows = []
     for ranked in ranking.order or sorted(errors, key=lambda name: errors[name]["rmse_vy"]):
