@@ -33,7 +33,7 @@ def _statuses(err):
     return [
         tuple(line.split()[:2])
         for line in err.splitlines()
-        if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")
+        if line.split()[:1] and line.split()[0] in ("done", "reused", "would")
     ]
 
 
@@ -45,7 +45,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
 
     again, err = place.done("run", "small", "tracking=none")
     assert ({status for status, _ in _statuses(err)}, again, place.files()) == (
-        {"skipped"},
+        {"reused"},
         out,
         made,
     )
@@ -53,7 +53,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     (place.folder / "README.md").write_text("changed")
     place.change("conf/dataset/mine.yaml", citation="somebody else", licence="another")
     _, _, err = place("run", "small", "tracking=none", "--dry-run")
-    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert {status for status, _ in _statuses(err)} == {"reused"}
 
     _, _, err = place("run", "small", "tracking=none", "training.learning_rate=0.002")
     done = [line for line in err.splitlines() if line.startswith("done")]

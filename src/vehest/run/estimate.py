@@ -58,6 +58,13 @@ PRETRAINED = "pretrained"
 SELF_CALIBRATING = "self_calibrating"
 """Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
 WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
+SHIPPED_NOTES = {
+    PRETRAINED: "trained on simulated cars, not on yours; the KS-NN is patented by its authors (PCT/IT2023/050058); "
+    "errors and limits: docs/estimators/ksnn.md",
+    SELF_CALIBRATING: "the network inside was trained on simulated cars, not on yours; the KS-NN is patented by its "
+    "authors (PCT/IT2023/050058); errors and limits: docs/estimators/self_calibrating.md",
+}
+"""What users of these models should know, in one line; their model.yaml says more."""
 
 
 def pretrained_folder(name: str = PRETRAINED) -> Path:
@@ -240,11 +247,7 @@ def estimate_file(
         **({"band": band} if band else {}),
         "verdict": report.verdict(),
         "findings": findings,
-        **(
-            {"note": " ".join(read_description(folder).about.note.split())}
-            if name in WITH_VEHEST
-            else {}
-        ),
+        **({"note": SHIPPED_NOTES[name]} if name in SHIPPED_NOTES else {}),
     }
 
 

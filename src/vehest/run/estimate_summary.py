@@ -68,7 +68,7 @@ def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
         "sideslip": f"{sideslip['min']:.2f}° to {sideslip['max']:.2f}°{_band(outcome)}",
         "bands": outcome.get("band", ""),
         "valid": _valid(outcome),
-        "training": outcome["outside_training"],
+        "range": outcome["outside_training"],
         "point": f"v and β at the {outcome['point']}",
         "warnings": f"{len(outcome['findings'])}, printed above" if outcome["findings"] else "none",
         "file": f"{outcome['out']}{_columns(Path(outcome['out']))}",

@@ -86,7 +86,10 @@ def open_runner(
         launcher,
     )
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
-        yield runner
+        try:
+            yield runner
+        finally:
+            messages.print_reused()
 
 
 def run_study(
@@ -98,7 +101,7 @@ def run_study(
     sweep: bool = False,
     only_report: bool = False,
 ) -> Ran:
-    """Run every stage of a pipeline, or of a sweep; what is there is skipped. A study that overrides changed is not published.
+    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that overrides changed is not published.
 
     Args:
         name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
