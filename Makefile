@@ -68,7 +68,7 @@ test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium c
 	$(BIN)/python -m pytest -m "page and not slow" -rs
 
 TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
-TESTS_docs := tests/test_docs.py tests/test_examples.py
+TESTS_docs := tests/test_docs.py tests/test_shown_commands.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py

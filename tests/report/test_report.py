@@ -445,7 +445,10 @@ def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(ar
     )
     text = words_of(twins)
     assert "Twin is not significantly worse. **Recommended: KS-NN" in text
-    assert "of the 2 estimators among these that are significantly better than the zero-sideslip baseline" in text
+    assert (
+        "of the 2 estimators among these that are significantly better than the zero-sideslip baseline"
+        in text
+    )
     missing = "none was compared with the zero-sideslip baseline and the static map."
     assert f"**No estimator is recommended**: {missing}" in words_of(alone)
     without = replace(

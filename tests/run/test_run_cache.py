@@ -52,9 +52,7 @@ def test_a_finished_study_prints_what_a_run_in_full_prints(study):
         forget(study)
         assert study(*words) == recognised, words
         assert recognised[0] == 0
-        assert words[0] == "report" or ("reused  " in recognised[2]) == (
-            words[-1] != "--quiet"
-        )
+        assert words[0] == "report" or ("reused  " in recognised[2]) == (words[-1] != "--quiet")
         study.done("run", *WORDS)  # dry runs and reports leave no record
 
 
