@@ -15,7 +15,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import UNSET, setting
-from vehest.estimators.base import rate, require_positive, require_shapes
+from vehest.estimators.base import Trial, rate, require_positive, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import c_tables, packed
 from vehest.estimators.ksnn import Ksnn
@@ -51,6 +51,13 @@ class SelfCalibrating(Recursive):
 
     name = "self_calibrating"
     title = "Self-calibrating filter"
+    trials = (
+        Trial(
+            1.5,
+            "filter that identifies the car on each drive; nothing is trained, compiled once",
+            "estimator.wheelbase={wheelbase}",
+        ),
+    )
     version = "4"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent

@@ -648,4 +648,6 @@ def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
     if not named:
         return ""
     words = ", ".join(text for _, text in sorted(named, reverse=True)[:3])
-    return f"{100.0 * outside / samples:.3g} % of the drive outside the range of the training: {words}"
+    return (
+        f"{100.0 * outside / samples:.3g} % of the drive outside the range of the training: {words}"
+    )
