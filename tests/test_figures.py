@@ -52,12 +52,8 @@ PAGES_NOT_LISTED = (
     "docs/estimators/velocity_networks.md",
     "docs/evaluation.md",
     "docs/export.md",
-    "docs/from_a_log.md",
     "docs/ksnn.md",
     "docs/learned_ukf.md",
-    "docs/many_machines.md",
-    "docs/own_car.md",
-    "docs/performance.md",
     "docs/scorecard.md",
     "docs/trust.md",
 )
