@@ -6,7 +6,8 @@ docs/figures.csv lists them, a row a statement:
 - ``source``: a CSV, JSON, Markdown or text file, a test, or ``not a result``;
 - ``rows``: of a table the rows, as `pandas.DataFrame.query` takes them (empty: all); of a test the name of the function or constant; of
   prose in Markdown or text (``column`` empty) a phrase of it; for ``not a result`` the reason;
-- ``column``: column or expression of columns (`pandas.DataFrame.eval`), several separated by ``;``;
+- ``column``: column or expression of columns (`pandas.DataFrame.eval`), several separated by ``;``; of a test that compares the page
+  itself ``reads the page``;
 - ``statistic``: min, max, median, mean, sum or count over these rows, several separated by ``;``; empty for a single row.
 
 A number agrees if it is the value of the source rounded to the digits that the page prints.
@@ -29,6 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LIST = "docs/figures.csv"
 COLUMNS = ("page", "stated", "source", "rows", "column", "statistic")
 NOT_A_RESULT = "not a result"
+READS_THE_PAGE = "reads the page"
 PAGES_NOT_LISTED = (
     "docs/adding_an_estimator.md",
     "docs/alignment.md",
@@ -70,7 +72,8 @@ MASKED = (
     r"^[ \t]*(`{3,})[^`\n]*\n.*?^[ \t]*\1[ \t]*$",
     r"`[^`]*`",
     r"(?<=\])\([^)]*\)",
-    r"\[10\.\d{4,}/[^\]]*\]",  # DOIs
+    r"\[(?:10\.\d{4,}/|arXiv )[^\]]*\]",
+    r"\b9[05] % (?:intervals?|bands?)\b",
     r"<!--.*?-->",
 )
 
@@ -181,14 +184,24 @@ def values_of_table(source, rows, columns, statistics):
     raise LookupError("; ".join(dict.fromkeys(reasons)) or "no table")
 
 
-def text_of_test(source, name):
-    """The source of a function, or of the assignment of a constant."""
+def node_of(source, name):
+    """The text of a function, or of the assignment of a constant, and the numbers in it."""
     text = (ROOT / source).read_text(encoding="utf-8")
     for node in ast.walk(ast.parse(text)):
-        targets = node.targets if isinstance(node, ast.Assign) else [node]
-        names = [getattr(target, "name", getattr(target, "id", None)) for target in targets]
-        if name in names and isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Assign):
-            return ast.get_source_segment(text, node)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign):
+            names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+        else:
+            continue
+        if name in names:
+            constants = (part.value for part in ast.walk(node) if isinstance(part, ast.Constant))
+            numbers = [
+                Decimal(repr(value))
+                for value in constants
+                if isinstance(value, int | float) and not isinstance(value, bool)
+            ]
+            return ast.get_source_segment(text, node), numbers
     raise LookupError(f"nothing is called '{name}' there")
 
 
@@ -205,8 +218,9 @@ def disagreement(row):
         return "" if rows else f"{LIST}: '{stated}' of {page} needs a reason in the column 'rows'"
     try:
         if source.endswith(".py"):
-            asserted = numbers_in(text_of_test(source, rows))
-            values = numbers if set(numbers) <= set(asserted) else asserted
+            code, asserted = node_of(source, rows)
+            reads = row["column"] == READS_THE_PAGE and Path(page).name in code
+            values = numbers if reads or set(numbers) <= set(asserted) else asserted
         elif row["column"]:
             values = values_of_table(source, rows, row["column"], row["statistic"])
         else:
