@@ -382,7 +382,7 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     drive = planar_drive(10.0, 20.0).without_references()
     slow = pd.DataFrame({"time": drive.time, **drive.channels})
     for name, table in (
-        ("slow", slow),
+        ("slow", slow.iloc[::5]),
         ("less", slow.drop(columns="ax")),
         ("lap", slow.assign(time=slow["time"] / 5.0)),
     ):
@@ -397,6 +397,9 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     ):
         place.refused("estimate", "luenberger", name, "-o", out, says=says)
         assert not Path("out.parquet").exists()
+    slow.to_csv("twenty.csv", index=False)
+    _, said = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
+    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in said
     swapped = (
         "split.train=[{recording: three}]",
         "split.tests.test=[{recording: one, start: 5, stop: 20}]",

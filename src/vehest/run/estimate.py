@@ -48,6 +48,7 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
+SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
 SUFFIXES = (".parquet", ".csv")
 SHARPEST_TURN = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
@@ -214,6 +215,11 @@ def estimate_file(
         same_vehicle = same_vehicle_from_config(config)
         band = describe_band(trust, first.vehicle, same_vehicle, first.car)
         elsewhere = is_other_vehicle(trust, first.vehicle, same_vehicle, first.car)
+        if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
+            remarks.append(
+                f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
+                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the estimate"
+            )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
         log = out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
@@ -225,6 +231,7 @@ def estimate_file(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
+            slowest_hz=SLOWEST_LOG_HZ,
         )
         estimates = report.counted(_estimates(run, needed))
         if log:

@@ -219,11 +219,16 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     ):
         text += f", and {'a wheelbase' if channel == 'steer' else 'wheelbase times ratio'} of {length:.3g} m by slow corners"
     alternatives = tuple(" ".join(other) for other in others)
-    return Offer(
-        score,
-        column,
-        Proposal(column.name, channel, unit, sign, (*evidence, text), asked, others=alternatives),
+    ay = search.known.channels.get("ay", search.known.turning)
+    of_ay = abs(correlation(column.slow, slow_of(ay, search.known.rate_hz)))
+    is_weak = not (hint or column.unit) and of_ay >= best.strength
+    if is_weak:
+        asked = f"no name or unit says so, and it follows ay ({of_ay:.2f}) as well"
+    evidence = (*evidence, text)
+    proposal = Proposal(
+        column.name, channel, unit, sign, evidence, asked, others=alternatives, is_weak=is_weak
     )
+    return Offer(score, column, proposal)
 
 
 def _as_lateral(search: Search, column: Candidate) -> Offer | None:
