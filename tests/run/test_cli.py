@@ -20,7 +20,7 @@ from conftest import planar_drive
 from place import DATASET, PIPELINE, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
-from vehest.data.store import read_recording
+from vehest.data.store import read_estimate, read_recording
 from vehest.run import ingest, inspect_data, runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.comparison import NO_TIME
@@ -174,9 +174,32 @@ def test_train_eval_estimate_report_one_by_one(place):
         "band_sideslip",
         "health",
         "health_reason",
+        "sideslip_deg",
+        "band_sideslip_deg",
     ]
-    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
-        assert np.allclose(frame[column], text[column], equal_nan=True), column
+    assert list(text.columns) == list(frame.columns)
+    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health", "sideslip_deg"):
+        # half a unit of the sixth digit
+        assert np.allclose(frame[column], text[column], rtol=5e-6, atol=0.0, equal_nan=True), column
+    assert np.allclose(frame["time"], text["time"], rtol=0.0, atol=5.1e-7)
+    for angle in ("sideslip", "band_sideslip"):
+        assert np.allclose(frame[f"{angle}_deg"], np.degrees(frame[angle]), equal_nan=True)
+    units = {
+        field.name: field.metadata[b"unit"].decode()
+        for field in pq.ParquetFile("out.parquet").schema_arrow
+    }
+    assert units == {
+        "time": "s",
+        "vy": "m/s",
+        "sideslip": "rad",
+        "band_vy": "m/s",
+        "band_sideslip": "rad",
+        "health": "1",
+        "health_reason": "1",
+        "sideslip_deg": "deg",
+        "band_sideslip_deg": "deg",
+    }
+    assert "sideslip_deg" not in read_estimate(Path("out.parquet")).channels
     assert [reason_in_words(code) for code in frame["health_reason"]] == text[
         "health_reason"
     ].fillna("").tolist()

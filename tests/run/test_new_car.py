@@ -185,6 +185,7 @@ def test_run_takes_what_was_written(log):
     assert set(planned) >= {
         "static_map",
         "data_sheet",
+        "self_calibrating",
         "ksnn",
         "luenberger",
         "kalman",
@@ -193,6 +194,9 @@ def test_run_takes_what_was_written(log):
         "cnn_ukf",
     }
     assert log("data", "check", "my_car")[0] == 0
+    rows = json.loads(log("data", "usable", "my_car", "--json")[1])["estimators"]
+    usable = {row["estimator"] for row in rows if row["usable"] in ("yes", "with settings")}
+    assert usable == set(planned), "what is usable is written and run, and nothing else"
 
 
 def test_nothing_half_written_stays(log):

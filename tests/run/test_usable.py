@@ -262,7 +262,8 @@ def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
     assert ("estimator.wheelbase=" in plain.to_give) == (name == "data_sheet")
     given = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
     after = usability(name, compose_config("train", [f"estimator={name}", *given]), contents)
-    assert not (after.missing.to_estimate or after.missing.to_train or after.patterns)
+    assert after.missing.to_estimate == after.missing.to_train == []
+    assert after.patterns == ()
     assert after.usable == ("with settings" if after.of_car else "yes")
 
 

@@ -213,7 +213,9 @@ def compare_estimates(
         reference.rate_hz,
     )
     titles = {
-        name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0])
+        name: {"zero": "the zero-sideslip baseline", "static_map": "the static map"}.get(
+            name[0], name[0]
+        )
         for name in ranking.order
     }
     errors = {name: accuracy([own]) for name, own in scored.items()}

@@ -236,7 +236,7 @@ def _check(override: Override) -> None:
     text = _shortened(override.input_line)
     if override.is_sweep_override():
         raise ConfigurationError(
-            f"'{text}' names several values; one is wanted here (pipelines and sweeps take several)"
+            f"'{text}' names several values; one is required here (pipelines and sweeps take several)"
         )
     if override.is_delete() and "." not in group:
         raise ConfigurationError(

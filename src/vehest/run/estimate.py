@@ -90,14 +90,16 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
             )
         return pretrained_folder(name)
     if not found:
-        known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
+        known = (
+            f"'{output / 'train'}', which contains {counted([folder.name for folder in models])}"
+        )
         raise MissingError(
             f"there is no model '{name}', neither a folder nor in {known}; train one first"
         )
     newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
     if len(found) > 1:
         say(
-            f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}"
+            f"'{name}' is assumed to be {newest.name}, the newest of {counted([folder.name for folder in found])}"
         )
     return newest
 

@@ -430,5 +430,5 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         return "note", f"no bands: {trust.about.note}"
     return (
         "done",
-        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}",
+        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
     )

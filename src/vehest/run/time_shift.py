@@ -15,6 +15,8 @@ MIN_OVERLAP_SHARE = 0.5  # of the shorter of both
 MIN_VARIANCE_RATIO = 1.5
 """By which the second best shift must leave more variance unexplained than the best one, to be refused otherwise."""
 
+MIN_UNEXPLAINED = 1e-3  # share of the variance, below which two shifts are equally good
+
 
 @dataclass(frozen=True)
 class Series:
@@ -79,7 +81,7 @@ def estimate_shift(estimate: Series, reference: Series) -> Shift:
     peak = float(correlations[best])
     other = _second_peak(correlations, best)
     second = float(correlations[other]) if other is not None else 0.0
-    unexplained = 1.0 - max(peak, 0.0) ** 2
+    unexplained = max(1.0 - max(peak, 0.0) ** 2, MIN_UNEXPLAINED)
     if 1.0 - max(second, 0.0) ** 2 < MIN_VARIANCE_RATIO * unexplained:
         alternative = f", {second:.2f} at {shifts[other]:.3g} s" if other is not None else ""
         raise DataError(
