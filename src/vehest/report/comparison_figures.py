@@ -23,10 +23,10 @@ from vehest.report.style import (
 
 FOREST_WIDTH = 4.4  # in, narrow enough for a phone
 FOREST_FONT = 8.5  # pt
-MIN_RATIO_FOR_LOG = 12.0  # highest over lowest RMSE, from which the axis is logarithmic
-MAX_POINTS = 1500  # of a cloud of samples
+MIN_RATIO_FOR_LOG = 8.0  # highest over lowest RMSE, from which the axis is logarithmic
+MAX_POINTS = 500  # of a cloud of samples
 AGREEMENT_COLUMNS = 4
-TITLE_CHARACTERS = 28  # of a panel, in a line
+TITLE_CHARACTERS = 25  # of an estimator, in a line
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
 
     sizes = [row.rmse for row in rows]
     decimals = max(2, decimals_for(sizes, 2))
-    with new_figure(FOREST_WIDTH, 0.6 + 0.25 * len(rows)) as figure:
+    with new_figure(FOREST_WIDTH, 0.6 + 0.29 * len(rows)) as figure:
         axes = figure.add_subplot()
         for height, row in enumerate(rows):
             if math.isfinite(row.low):
@@ -82,7 +82,11 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
                 va="center",
                 annotation_clip=False,
             )
-        axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=FOREST_FONT)
+        axes.set_yticks(
+            range(len(rows)),
+            [textwrap.fill(row.label, TITLE_CHARACTERS) for row in rows],
+            fontsize=FOREST_FONT,
+        )
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
         axes.tick_params(axis="x", labelsize=FOREST_FONT)
