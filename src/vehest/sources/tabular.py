@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import repeat, takewhile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from pydantic import AfterValidator, Field
 
@@ -104,10 +104,13 @@ class TabularSource(FileSource):
         self.columns = (
             None if options.channels is None else columns_from_config(options.channels, self.name)
         )
-        self.time = (
+        self.time: TimeColumn | None = (
             None
             if options.time is None
-            else column_from_config(options.time, f"{where}: time", "s", TimeColumn)
+            else cast(
+                TimeColumn,
+                column_from_config(options.time, f"{where}: time", "s", TimeColumn),
+            )
         )
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")

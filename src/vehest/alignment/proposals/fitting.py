@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -29,6 +29,7 @@ OF_REFERENCE = 2.5
 BESIDE_BUS = 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
+CRAWL_SHARE = 0.05  # of the top speed, below which a sideslip angle has no meaning
 HARDLY = "the motion hardly decides it"
 SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
 REFERENCES = ("vy_ref", "sideslip_ref")
@@ -315,6 +316,8 @@ def agreement(
 ) -> Agreement:
     """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
     samples = (column.values - offset) * si_factor(unit, channel)
+    if channel == "sideslip_ref":
+        samples = np.where(np.abs(known.vx) < CRAWL_SHARE * largest(known.vx), 0.0, samples)
     velocity = channel if channel in REFERENCES else ""
     with np.errstate(all="ignore"):
         relations = relations_of(

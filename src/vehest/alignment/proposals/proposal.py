@@ -121,7 +121,8 @@ class Proposals:
         """
         signs = {name: one.sign for name, one in self.by_channel.items()}
         axes = [signs.get("ax", signs.get("vx")), signs.get("ay"), signs.get("yaw_rate")]
-        is_right_handed = None not in axes and math.prod(axes) == 1
+        axis_signs = [sign for sign in axes if sign is not None]
+        is_right_handed = len(axis_signs) == len(axes) and math.prod(axis_signs) == 1
         doubt = (
             ""
             if is_right_handed
