@@ -122,7 +122,7 @@ def _correlations(
     product = variance_a * variance_b
     usable = enough & (product > floor)
     correlation = covariance / np.sqrt(np.where(usable, product, 1.0))
-    return np.where(usable, correlation, -np.inf), lags
+    return np.where(usable, correlation, -np.inf), lags.astype(np.float64)
 
 
 def _second_peak(correlations: FloatArray, best: int) -> int | None:
