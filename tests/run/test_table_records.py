@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import runpy
 import subprocess
 from pathlib import Path
@@ -173,3 +174,16 @@ def test_every_folder_of_results_has_a_provenance():
     others = {"benchmarks", "scorecard"}
     recorded = {file.parent.name for file in results.glob(f"*/{PROVENANCE}")}
     assert folders - others == recorded
+
+
+def test_every_recorded_data_set_has_the_digest_of_its_raw_files():
+    """Without one a table is stale at once wherever the raw files are."""
+    records = (Path(__file__).parents[2] / RESULTS).glob(f"*/{PROVENANCE}")
+    keys = {
+        f"{file.parent.name}/{what}": key
+        for file in records
+        for what, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
+        if re.match(r"\S+\.\w+: (data|files) ", what)
+    }
+    assert keys
+    assert [what for what, key in keys.items() if "data" not in key] == []
