@@ -444,9 +444,9 @@ def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(ar
         ],
     )
     text = words_of(twins)
-    assert "Twin is not significantly worse. **Recommended: KS-NN" in text
+    assert "Twin and 1 other are not significantly worse. **Recommended: KS-NN" in text
     assert (
-        "of the 2 estimators among these that are significantly better than the zero-sideslip baseline"
+        "of the 3 estimators among these that are significantly better than the zero-sideslip baseline"
         in text
     )
     missing = "none was compared with the zero-sideslip baseline and the static map."
