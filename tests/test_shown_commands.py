@@ -15,7 +15,7 @@ pytestmark = pytest.mark.apart
 ROOT = Path(__file__).resolve().parents[1]
 LOG = ROOT / "docs" / "examples" / "lap.csv"
 SHOWN = re.compile(
-    r"^```sh\n(?P<commands>.*?)^```$(?:\n\n[^`#|]*?)?\n\n?```text\n(?P<output>.*?)^```$",
+    r"^```sh\n(?P<commands>.*?)^```$(?:\n\n[^`#|]*?)?\n\n?```(?:text|output)\n(?P<output>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
 NEEDS = "vehest new my_car lap.csv --yes --wheelbase 2.4"
