@@ -27,6 +27,35 @@ PART = re.compile(
     r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL
 )
 
+HEADINGS = {
+    "v = 0": "zero",
+    "map with reference": "static map, fitted to the drive",
+    "shipped": "shipped network",
+    "band holds": "coverage",
+    "worse than v = 0": "worse than zero",
+    "paper": "published",
+    "real_drive": "550 to 700 s",
+    "real_whole": "whole drive",
+    "rmse_sideslip_offline_deg": "RMSE(β) offline [deg]",
+    "rmse_sideslip_online_deg": "online [deg]",
+    "ratio_sideslip": "ratio",
+    "title": "estimator",
+    "rmse_sideslip": "RMSE(β) [deg]",
+    "interval": "95 % interval",
+    "n_seeds": "seeds",
+    "beats_zero": "better than zero",
+    "beats_static_map": "better than static_map",
+    "share": "share of faults that are flagged",
+    "per_hour": "alarms an hour",
+    "low": "from (95 %)",
+    "high": "to",
+    "of_a_sensor": "alarms that accuse a sensor",
+    "than 1.1 times shipped": "worse than 1.1 times the shipped network",
+}
+"""Headings of reports' tables -> those of pages."""
+CELLS = {"not told apart": "no significant difference", "Zero (v = 0)": "Zero"}
+"""Cells of reports' tables -> those of pages."""
+
 BASELINES = ("zero", "static_map")
 OVERVIEWS = {
     "rational_ekf": (
@@ -44,7 +73,7 @@ OVERVIEWS = {
         "cnn_ukf",
         "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
         {
-            "part": "learnt on",
+            "part": "trained on",
             "candidate": "method",
             "ours_mse": "MSE",
             "ours_mse_nonlinear": "MSE_nl",
@@ -53,7 +82,7 @@ OVERVIEWS = {
     ),
     "learned_ukf": (
         "learned_ukf",
-        "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
+        "Weighted squared error of the states, **real** recordings, means over seeds; no training uses tyre D",
         {
             "candidate": "method",
             "ours_tyre_a": "tyre A",
@@ -316,7 +345,7 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
 
 
 def figures(shown: str, *estimators: str) -> Iterable[str]:
-    """What published studies say of families, and a figure, named as STUDY/FIGURE, with its caption."""
+    """What published studies report of families, and a figure, named as STUDY/FIGURE, with its caption."""
     yield from _on_the_same_drive(estimators)
     for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
         rows = [
@@ -344,13 +373,47 @@ def _on_the_same_drive(estimators: Sequence[str]) -> Iterable[str]:
     wanted = [*estimators, *(name for name in BASELINES if name not in estimators)]
     shown = [row for name in wanted for row in rows if row["estimator"] == name]
     if any(row["estimator"] in estimators for row in shown):
-        yield "RMSE(β) [deg] with its 95 % interval, learnt on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
+        yield "RMSE(β) [deg] with its 95 % interval, trained on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
         cells = ("Ferrari 250 LM (real), 550 to 700 s", *(_with_interval(row) for row in shown))
         yield _table(("test", *(row["title"] for row in shown)), [cells], right=len(shown))
 
 
 def _with_interval(row: dict[str, str]) -> str:
     return f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
+
+
+# Excerpts
+
+
+def excerpt(source: str, columns: str, rows: str = "") -> Iterable[str]:
+    """Columns, numbered from 1, of a CSV file or of a Markdown table of a report.
+
+    ``source`` is a file below results/, of a report with ``#2`` behind it for its second table. ``rows`` is a
+    pattern that the cells of a row, joined by commas, begin with; ``_`` stands for a blank.
+    """
+    name, _, number = source.partition("#")
+    path = RESULTS / name
+    if not path.is_file():
+        return
+    lines = _csv_lines(path) if path.suffix == ".csv" else _table_lines(path, int(number or 1))
+    indices = [int(column) - 1 for column in columns.split(",")]
+    pattern = re.compile(rows.replace("_", " "))
+    header = [HEADINGS.get(lines[0][index], lines[0][index]) for index in indices]
+    matches = [line for line in lines[1:] if pattern.match(",".join(line))]
+    cells = [[CELLS.get(line[index], line[index]) for index in indices] for line in matches]
+    yield _table(header, cells, right=len(indices) - 1)
+
+
+def _csv_lines(path: Path) -> list[list[str]]:
+    with open(path, newline="", encoding="utf-8") as stream:
+        return [[_rounded(cell) or "–" for cell in line] for line in csv.reader(stream)]
+
+
+def _table_lines(path: Path, number: int) -> list[list[str]]:
+    """Cells of a report's table, without the rule below its header."""
+    tables = re.findall(r"^\|.*(?:\n\|.*)+", path.read_text(encoding="utf-8"), re.MULTILINE)
+    header, _, *lines = tables[number - 1].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in (header, *lines)]
 
 
 # Published results
@@ -550,6 +613,7 @@ _PARTS = (
     courses,
     settings,
     figures,
+    excerpt,
     leaderboard,
     wheelbase_of_small_cars,
     benchmarks,

@@ -76,6 +76,34 @@ CSV_COLUMNS = (
     "verdict",
     "reason",
 )
+LEGEND = (
+    ("published", "value of the paper"),
+    (
+        "ours",
+        "the same error of our run with its 95 % interval; the data are marked as real or simulated",
+    ),
+    (
+        "metric",
+        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], `rmse_sideslip` [deg] and the "
+        "others: [metrics](../docs/evaluation.md#metrics)",
+    ),
+    (
+        "ratio",
+        "error of the first candidate of a claim over that of the second, all samples together; below 1 the first "
+        "one is better",
+    ),
+    (
+        "mean of blocks' ratios",
+        "the same ratio within each manoeuvre, lap or segment (a block), averaged: each block has one vote",
+    ),
+    ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
+    (
+        "verdict",
+        "from the errors by block and seed ([definitions, and how often they are right](../docs/scorecard.md)); in "
+        "*italics* where the training has not been shown to be sufficient",
+    ),
+)
+"""Columns of the page's tables and what they hold."""
 
 
 @dataclass(frozen=True)
@@ -164,9 +192,9 @@ def _page(studies: Sequence[Study], results: Path) -> str:
     lines = [
         "# Scorecard: published and ours",
         "",
-        "Four papers on the estimation of lateral velocity and sideslip angle, re-created with vehest. One engine judges",
-        "every claim from the errors by block and seed; a verdict in *italics* rests on a network whose training has not",
-        "been shown to be sufficient. [What the verdicts mean and how often they are right](../docs/scorecard.md).",
+        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs of their methods in vehest:",
+        "first whether to use each method, then how many claims of its paper were reproduced, then every table row and",
+        "claim with the published value and ours.",
         "",
         "## Should I use this method?",
         "",
@@ -177,6 +205,10 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
         "earlier code and shorter trainings.",
+        "",
+        "## How to read the tables",
+        "",
+        *_table(("column", "meaning"), LEGEND, n_text=2),
         "",
         "## Verdicts on the papers' claims",
         "",

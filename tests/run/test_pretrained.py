@@ -114,7 +114,7 @@ def bands_on(name, data_root):
 def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
     told = re.search(
-        r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid",
+        r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % of the drive is valid",
         text,
     )
     inside, median, valid = bands_on("ferrari_250lm", data_root)

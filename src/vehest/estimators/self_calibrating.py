@@ -76,7 +76,7 @@ class SelfCalibrating(Recursive):
     )
     smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline")
     measured_ax: bool = setting(
-        True, "whether ax is measured; else the longitudinal equation tells nothing"
+        True, "whether ax is measured; else the longitudinal equation is unused"
     )
     grips: tuple[float, ...] = setting(
         (4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]"
