@@ -503,7 +503,7 @@ def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_
 ):
     text = (written / "report.md").read_text(encoding="utf-8")
     targets = re.findall(r"\]\(([^)]+)\)", text)
-    assert len(targets) == 5 + 2 * 5
+    assert len(targets) == 5 + 2 * 8
     assert all((written / target).stat().st_size > 0 for target in targets)
     assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {
         *targets,
@@ -513,7 +513,7 @@ def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_
     lines = text.splitlines()
     tables = [len(re.findall(r"(?<!\\)\|", line)) for line in lines if line.startswith("| ")]
     assert set(tables) == {
-        4,
+        5,
         6,
         7,
         12,

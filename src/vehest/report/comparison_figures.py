@@ -84,7 +84,7 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
             )
         axes.set_yticks(
             range(len(rows)),
-            [textwrap.fill(row.label, TITLE_CHARACTERS) for row in rows],
+            [_wrapped(row.label) for row in rows],
             fontsize=FOREST_FONT,
         )
         axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -148,7 +148,7 @@ def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> Matpl
         for axes, cloud in zip(grid.flat, estimates, strict=False):
             _scatter(axes, cloud)
             axes.axline((0.0, 0.0), slope=1.0, color=REFERENCE_GREY, linewidth=0.9)
-            axes.set_title(textwrap.fill(cloud.label, TITLE_CHARACTERS), loc="left", fontsize=6.5)
+            axes.set_title(_wrapped(cloud.label), loc="left", fontsize=6.5)
             axes.set_xlim(-limit, limit)
             axes.set_ylim(-limit, limit)
         for axes in grid.flat[len(estimates) :]:
@@ -156,6 +156,13 @@ def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> Matpl
         figure.supxlabel("measured sideslip [deg]", fontsize=7.5)
         figure.supylabel("estimated sideslip [deg]", fontsize=7.5)
     return figure
+
+
+def _wrapped(label: str) -> str:
+    """A label on lines of at most `TITLE_CHARACTERS`, an equation such as ``P = 2`` on one of them."""
+    return textwrap.fill(
+        label.replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}"), TITLE_CHARACTERS
+    )
 
 
 def _scatter(axes: Any, cloud: Cloud) -> None:
