@@ -54,8 +54,11 @@ PAGES_NOT_LISTED = (
     "docs/estimators/velocity_networks.md",
     "docs/evaluation.md",
     "docs/export.md",
+    "docs/faults.md",
+    "docs/health.md",
     "docs/ksnn.md",
     "docs/learned_ukf.md",
+    "docs/online_contract.md",
     "docs/scorecard.md",
     "docs/trust.md",
 )
