@@ -32,6 +32,7 @@ HEADINGS = {
     "map with reference": "static map, fitted to the drive",
     "shipped": "shipped network",
     "band holds": "coverage",
+    "choices": "role",
     "worse than v = 0": "worse than zero",
     "paper": "published",
     "real_drive": "550 to 700 s",
@@ -53,7 +54,12 @@ HEADINGS = {
     "than 1.1 times shipped": "worse than 1.1 times the shipped network",
 }
 """Headings of reports' tables -> those of pages."""
-CELLS = {"not told apart": "no significant difference", "Zero (v = 0)": "Zero"}
+CELLS = {
+    "not told apart": "no significant difference",
+    "Zero (v = 0)": "Zero",
+    "made on it": "development",
+    "not": "test",
+}
 """Cells of reports' tables -> those of pages."""
 
 BASELINES = ("zero", "static_map")
