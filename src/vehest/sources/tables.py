@@ -9,7 +9,7 @@ import codecs
 import csv
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -73,7 +73,10 @@ def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
         lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))
         filled = filter(None, lines[layout.skip_rows :])
         rows = csv.reader(filled, delimiter=layout.delimiter)
-        return [next(rows, []), next(islice(rows, layout.rows_below_names, None), [])]
+        header = next(rows, [])
+        with suppress(csv.Error):  # of an endless line, which the reader of the rows reports
+            return [header, next(islice(rows, layout.rows_below_names, None), [])]
+        return [header, []]
     except (ValueError, csv.Error) as error:
         raise _unreadable(file, error) from None
 
@@ -122,6 +125,12 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
         if count > 1:
             raise DataError(
                 f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one"
+            )
+        numbered = [one for one in names if re.fullmatch(rf"{re.escape(name)} #\d+", one)]
+        if not count and numbered:
+            raise DataError(
+                f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or remove "
+                f"all but one, or declare one of them: {listed(numbered)}"
             )
         if not count:
             raise DataError(
