@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import inspect
+import json
 import math
 import re
 from collections import Counter
@@ -97,6 +98,9 @@ OVERVIEWS = {
     ),
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
+
+VERDICTS = {"lowest": "best", "not told apart": "not significant", "": "–"}
+"""Verdict in a published leaderboard -> how the page says it."""
 
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
@@ -429,9 +433,10 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
             f"{float(row['n_parameters']):.0f}",
             f"{float(row['rmse_sideslip']):.3f}",
             row["interval"],
-            row["against_best"],
-            row["beats_zero"] or "–",
-            row["beats_static_map"] or "–",
+            *(
+                VERDICTS.get(row[column], row[column])
+                for column in ("against_best", "beats_zero", "beats_static_map")
+            ),
             f"{float(row['fvu']):.3f}",
         )
         for row in _rows(RESULTS / source)
@@ -447,6 +452,136 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
     )
     if lines:
         yield _table(("estimator", *columns), lines, right=len(columns))
+
+
+def wheelbase_of_small_cars() -> Iterable[str]:
+    """RMSE(β) of the self-calibrating filter on small cars with and without their wheelbase."""
+    tables = _tables_of_markdown(RESULTS / "unseen_car" / "report.md")
+    zero = {
+        row["car"]: row["v = 0"]
+        for table in tables
+        for row in table
+        if {"car", "v = 0"} <= row.keys()
+    }
+    lines = [
+        (row["car"].removesuffix(" (real)"), zero[row["car"]], row["cold"], row["car not given"])
+        for table in tables
+        for row in table
+        if "car not given" in row and ", 1:" in row["car"]
+    ]
+    columns = ("`zero` [deg]", "with wheelbase [deg]", "without [deg]")
+    if lines:
+        yield _table(("car", *columns), lines, right=len(columns))
+
+
+def _tables_of_markdown(path: Path) -> list[list[dict[str, str]]]:
+    """Every table of a report, a dictionary a row."""
+    if not path.is_file():
+        return []
+    tables = []
+    for block in re.findall(r"(?:^\|.*\|$\n?)+", path.read_text(encoding="utf-8"), re.MULTILINE):
+        header, _, *rows = (
+            [cell.strip() for cell in line.strip("| ").split(" | ")] for line in block.splitlines()
+        )
+        tables.append([dict(zip(header, row, strict=True)) for row in rows])
+    return tables
+
+
+# Benchmarks
+
+
+def benchmarks(*names: str) -> Iterable[str]:
+    """Time and memory of the plain way and of vehest, a row a case of the benchmarks named."""
+    lines = [
+        (
+            case["case"],
+            _seconds(case["baseline_seconds"]),
+            _seconds(case["ours_seconds"]),
+            _two_digits(case["baseline_seconds"] / case["ours_seconds"]),
+            name,
+        )
+        for name in names
+        for case in _json(f"benchmarks/{name}.json").get("cases", [])
+        if {"baseline_seconds", "ours_seconds"} <= case.keys()
+    ]
+    if lines:
+        yield _table(("case", "plain", "vehest", "ratio", "file"), lines, right=4)
+
+
+def workflow() -> Iterable[str]:
+    """Time and memory of whole commands."""
+    titles = {
+        "help": "`vehest --help`",
+        "run_finished": "`vehest run` of a finished study",
+        "estimate_minute": "`vehest estimate`, one minute",
+        "estimate_15_h": "`vehest estimate`, 15 hours at 100 Hz",
+    }
+    measured = _json("benchmarks/workflow.json").get("now", {})
+    lines = [
+        (titles[name], f"{value['seconds']:.2f} s", f"{value['peak_mb']:.0f} MB")
+        for name, value in measured.items()
+    ]
+    if lines:
+        yield _table(("command", "time", "memory"), lines, right=2)
+
+
+def launchers() -> Iterable[str]:
+    """Time that the launchers add to a task, and what one parent process sustains."""
+    measured = _json("benchmarks/launchers.json")
+    if not measured:
+        return
+    local, ray = measured["launchers"]["local"], measured["launchers"]["ray"]
+    yield _table(
+        ("two cores", "local", "Ray"),
+        [
+            ("until the first group begins", _seconds(local["start_s"]), _seconds(ray["start_s"])),
+            ("added to a task", _seconds(local["added_s"]), _seconds(ray["added_s"])),
+        ],
+        right=2,
+    )
+    untracked, tracked = measured["sweep"]["none"], measured["sweep"]["mlflow"]
+    yield _table(
+        ("part of one parent process", "measured"),
+        [
+            (
+                "Ray's scheduler",
+                f"{measured['scheduler']['empty_tasks_a_second']:.0f} empty tasks a second",
+            ),
+            (
+                "work for a training, without tracking",
+                _seconds(untracked["parent_cpu_s_a_training"]),
+            ),
+            (
+                "work for a training in MLflow's local store",
+                _seconds(tracked["mlflow_s_a_training"]),
+            ),
+            (
+                "planning of a combination of a sweep",
+                _seconds(measured["planning"]["seconds_a_combination"]),
+            ),
+            (
+                "artefacts of a training",
+                f"{untracked['bytes_a_training'] / 1e3:.0f} kB, {untracked['files_a_training']:.0f} files",
+            ),
+            ("memory over 2,000 trainings", f"{untracked['parent_mb']:.0f} MB"),
+        ],
+        right=1,
+    )
+
+
+def _json(source: str) -> dict[str, Any]:
+    path = RESULTS / source
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+def _two_digits(ratio: float) -> str:
+    return f"{float(f'{ratio:.2g}'):g}"
+
+
+def _seconds(value: float) -> str:
+    """Three digits, in s, ms or µs."""
+    factor, unit = (1.0, "s") if value >= 1.0 else (1e3, "ms") if value >= 1e-3 else (1e6, "µs")
+    return f"{value * factor:.3g} {unit}" if value < 1000.0 else f"{value:.0f} s"
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -486,6 +621,10 @@ _PARTS = (
     figures,
     excerpt,
     leaderboard,
+    wheelbase_of_small_cars,
+    benchmarks,
+    workflow,
+    launchers,
 )
 PARTS: dict[str, Callable[..., Iterable[str]]] = {part.__name__: part for part in _PARTS}
 
