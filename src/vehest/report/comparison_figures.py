@@ -142,7 +142,7 @@ def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> Matpl
     """Estimated over measured sideslip, (K,) [deg], one panel an estimator, with the line on which both are equal."""
     columns = min(len(estimates), AGREEMENT_COLUMNS)
     n_rows = math.ceil(len(estimates) / columns)
-    limit = 1.05 * float(np.nanmax(np.abs(reference)))
+    limit = 1.05 * float(np.nanmax(np.abs(reference))) or 1.0  # of a reference that is zero
     with new_figure(DOUBLE_COLUMN, 0.4 + 1.85 * n_rows) as figure:
         grid = figure.subplots(n_rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes, cloud in zip(grid.flat, estimates, strict=False):
