@@ -156,6 +156,7 @@ def test_json_says_all_of_it_to_a_script(log):
         "unit": "s",
         "evidence": "unit in the header, 50 Hz",
         "asked": False,
+        "repair": {},
     }
     assert ([question["key"] for question in said["open"]], said["has_reference"]) == (
         ["left_right"],
