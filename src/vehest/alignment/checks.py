@@ -26,6 +26,7 @@ from vehest.alignment.signs import (
 )
 from vehest.alignment.standstill import BoolArray, standstill
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
@@ -256,15 +257,18 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
                 yield Finding("warning", "saturated", name, message)
 
 
-def _spikes(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
-    """Short excursions far beyond the usual range that begin and end with a jump, while the car moves.
+def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Short excursions far beyond the usual range that begin and end with a jump.
 
     A code for "not available" or a lost bit looks so; a manoeuvre needs longer to come and go.
-    Those beyond what a vehicle can do are the finding ``impossible``. At standstill a sideslip
-    angle is noise.
+    Those beyond what a vehicle can do are the finding ``impossible``. A sideslip angle without
+    speed is noise.
     """
+    speed = np.abs(recording["vx"]) if "vx" in recording else np.full(len(recording), np.inf)
     for name, samples in recording.channels.items():
-        possible = (samples >= CHANNELS[name].low) & (samples <= CHANNELS[name].high)
+        counts = (samples >= CHANNELS[name].low) & (samples <= CHANNELS[name].high)
+        if name == "sideslip_ref":
+            counts &= speed > STANDSTILL_SPEED
         known = samples[np.isfinite(samples)]
         if len(known) < FEWEST_SAMPLES:
             continue
@@ -282,8 +286,7 @@ def _spikes(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
             and end - begin <= most
             and steps[begin - 1] > jump
             and steps[end - 1] > jump
-            and possible[begin:end].all()
-            and moving[begin:end].any()
+            and counts[begin:end].all()
         ]
         if spikes:
             worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
