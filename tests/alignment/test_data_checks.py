@@ -288,3 +288,17 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
     found = [one for one in checks_of_recording(drive) if one.check == "spike"]
     assert [one.channel for one in found] == ["handwheel"] * is_found
     assert all("jumps 1 times" in one.message and "7.3 rad at 40 s" in one.message for one in found)
+
+
+def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
+    drive = clean_drive()
+    shaking = 5.0 * (-1.0) ** np.arange(len(drive))
+    shaking[3000] = 22.0  # by 27 m/s², two of its ranges, but not three of its steps of 10 m/s²
+    standing = {name: samples.copy() for name, samples in drive.channels.items()}
+    for samples in standing.values():
+        samples[3000:3400] = 0.0
+    standing["sideslip_ref"] = 0.02 * np.sin(0.01 * np.arange(len(drive)))
+    standing["sideslip_ref"][3200] = 3.0
+    for channels in ({**drive.channels, "ax": shaking}, standing):
+        found = checks_of_recording(replace(drive, channels=channels))
+        assert "spike" not in [one.check for one in found]

@@ -156,6 +156,7 @@ def test_json_says_all_of_it_to_a_script(log):
         "unit": "s",
         "evidence": "unit in the header, 50 Hz",
         "asked": False,
+        "repair": {},
     }
     assert ([question["key"] for question in said["open"]], said["has_reference"]) == (
         ["left_right"],
@@ -241,7 +242,10 @@ def test_without_a_speed_no_pipeline_is_written_that_could_not_run_and_a_yaw_rat
     )
     assert log("data", "check", "my_car")[0] == 0
     log.write("gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
-    out, err = log.new("gyro.csv", "--yes", "--force")
+    _, err = log.new("gyro.csv", "--yes", "--force", code=2)
+    assert err.endswith('add those that are right: --answer "Gyro=yaw_rate deg/s"\n')
+    answer = ("--answer", "Gyro=yaw_rate deg/s")
+    out, err = log.new("gyro.csv", "--yes", "--force", *answer)
     assert (err, "lacks vx, ay" in out) == ("", True)
 
 

@@ -190,6 +190,16 @@ def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, n
     assert "has a gap of 0.06 s after 0.19 s" in said
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
+def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding):
+    log(tmp_path, "", ramp(0, [65535] * 5))
+    content = choices('65535 "Ungültig"').replace("m/s", "km/h").encode(encoding)
+    (tmp_path / "car.dbc").write_bytes(content)
+    speed = {**SPEED["vx"], "unit": "km/h", "max_gap": 0.1}
+    got = read(tmp_path, channels={"vx": speed})
+    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 360.0, atol=1e-9)
+
+
 def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(tmp_path):
     log(tmp_path, choices('65535 "SNA"'), ramp(0, [65535] * 50))
     declared = {"files": "drive.*", "dbc": str(tmp_path / "car.dbc"), "rate_hz": 100}

@@ -185,10 +185,11 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
 
 
 def _crawl_speed(recording: Recording) -> float:
-    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout."""
-    if "sideslip_ref" not in recording:
+    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout or no speed is known."""
+    name = speed_of_reference(recording)
+    if not {"sideslip_ref", name} <= set(recording.channels):
         return 0.0
-    speed = np.abs(recording[speed_of_reference(recording)])
+    speed = np.abs(recording[name])
     crawl = float(f"{min(CRAWL_SPEED, CRAWL_SHARE * float(np.nanmax(speed))):.2g}")
     angles = np.abs(recording["sideslip_ref"][speed < crawl])
     return crawl if (angles > MAX_CRAWL_SIDESLIP).any() else 0.0

@@ -124,7 +124,11 @@ def read_dbc(file: Path) -> list[Any]:
     require_package("cantools", "bus", "reading CAN")
     from cantools.database import load_string
 
-    text = file.read_bytes().decode("cp1252", errors="replace")
+    raw = file.read_bytes()
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:  # "°" and umlauts of the usual code page are no UTF-8
+        text = raw.decode("cp1252", errors="replace")
     if found := _TOO_LONG.search(text):
         raise DataError(
             f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}"
