@@ -91,6 +91,10 @@ CSV_COLUMNS = (
     "reason",
 )
 LEGEND = (
+    (
+        "NNTF_UH, RATTE, …",
+        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` describes each",
+    ),
     ("published", "value of the paper"),
     (
         "ours",
@@ -108,7 +112,7 @@ LEGEND = (
     ),
     (
         "mean of blocks' ratios",
-        "the same ratio within each manoeuvre, lap or segment (a block), averaged: each block has one vote",
+        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same weight for each",
     ),
     ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
     (
@@ -222,7 +226,7 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         "## How to read the tables",
         "",
-        *_table(("column", "meaning"), LEGEND, n_text=2),
+        *_table(("column or name", "meaning"), LEGEND, n_text=2),
         "",
         "## Verdicts on the papers' claims",
         "",
