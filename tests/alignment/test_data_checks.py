@@ -287,7 +287,7 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
     drive = replace(drive, channels={**drive.channels, "handwheel": handwheel})
     found = [one for one in checks_of_recording(drive) if one.check == "spike"]
     assert [one.channel for one in found] == ["handwheel"] * is_found
-    assert all("jumps 1 times" in one.message and "7.3 rad at 40 s" in one.message for one in found)
+    assert all("jumps once" in one.message and "7.3 rad at 40 s" in one.message for one in found)
 
 
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():

@@ -81,7 +81,10 @@ def test_the_point_of_the_self_calibrating_filter_depends_on_the_centre_of_gravi
     lap({})
     words = ("lap.csv", "estimator.wheelbase=2.4", "-o", "out.csv")
     out, _ = saved.done("estimate", *words)
-    assert "30 % of the way from the accelerometer to a typical centre of gravity (1.15 m" in out
+    assert (
+        "30 % of the way from the accelerometer to a typical centre of gravity, which is assumed 1.15 m"
+        in out
+    )
     out, _ = saved.done("estimate", *words, "estimator.cg_to_rear_axle=1.07")
     assert "v and β at the centre of gravity, 1.07 m ahead of the rear axle" in out
     [note] = [line for line in out.splitlines() if line.startswith("note")]

@@ -292,8 +292,9 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
             at = worst[0] + int(np.argmax(np.abs(samples[worst[0] : worst[1]])))
             unit = CHANNELS[name].unit
+            times = "once" if len(spikes) == 1 else f"{len(spikes)} times"
             message = (
-                f"jumps {len(spikes)} times for {SPIKE_SECONDS:g} s or less far beyond its usual "
+                f"jumps {times} for {SPIKE_SECONDS:g} s or less far beyond its usual "
                 f"range ({low:.4g} to {high:.4g} {unit}), to {samples[at]:.4g} {unit} at "
                 f"{recording.time[at]:.12g} s; mark such samples as missing, or cut them out"
             )

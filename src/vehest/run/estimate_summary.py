@@ -35,8 +35,8 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
         if model.cg_to_rear_axle is not None:
             return f"centre of gravity, {model.cg_to_rear_axle:g} m ahead of the rear axle"
         return (
-            f"point {100 * model.rear_share:.0f} % of the way from the accelerometer to a typical centre of gravity "
-            f"({model.rear:.2f} m ahead of the rear axle); estimator.cg_to_rear_axle=… gives the centre of gravity"
+            f"point {100 * model.rear_share:.0f} % of the way from the accelerometer to a typical centre of gravity, which is "
+            f"assumed {model.rear:.2f} m ahead of the rear axle; state yours by estimator.cg_to_rear_axle=…"
         )
     unknown = [
         name

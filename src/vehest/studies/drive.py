@@ -520,11 +520,7 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
     }
     rows = []
     for role, spans in roles.items():
-        recordings = [
-            artefacts.reference(span).cut(span.start, span.stop)
-            for span in spans
-            if (span.dataset, span.recording) in artefacts.references
-        ]
+        recordings = artefacts.reference_ranges(spans)
         if not recordings:
             continue
         sideslip = np.concatenate(

@@ -32,7 +32,7 @@ AFTER = {" after 1.5 s": ENOUGH, " after 3 s": LONGER}  # end of a name -> lengt
 LOW_YAW_RATE = "rmse_vy_low_yaw_rate"
 AFTER_START = "rmse_vy_after_start"
 CLOSED_FORM = "a direct search, a filter or a fixed function; nothing is learnt in epochs"
-Wanted = tuple[str, str, str]  # part, test set, metric
+Comparison = tuple[str, str, str]  # part, test set, metric
 
 
 def error_rows(
@@ -48,7 +48,7 @@ def error_rows(
         Part -> what its candidates do at little yaw rate, after a start and without biases.
     """
     rows = []
-    for (name, test, metric), candidates in wanted(claimed).items():
+    for (name, test, metric), candidates in compared_candidates(claimed).items():
         schemes = [
             own for part, own in parts.items() if re.fullmatch(rf"{re.escape(name)}(_[a-z])?", part)
         ]
@@ -64,9 +64,9 @@ def error_rows(
     return rows
 
 
-def wanted(claimed: Paper) -> dict[Wanted, list[str]]:
+def compared_candidates(claimed: Paper) -> dict[Comparison, list[str]]:
     """Part, test set and metric -> candidates whose errors claims and tables compare there."""
-    found: dict[Wanted, list[str]] = {}
+    found: dict[Comparison, list[str]] = {}
     for claim in claimed.claims:
         if claim.kind in ("order", "equal", "limit"):
             parts = [claim.part, claim.other_part or claim.part]

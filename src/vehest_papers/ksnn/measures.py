@@ -1,8 +1,8 @@
 """What claims of the paper measure beside errors: values by block and seed, one function a kind of claim.
 
 A ratio of two pooled errors is given by block as its linearisation: the mean over blocks is the ratio (or its logarithm), the spread
-that of a ratio of sums. Two tests have different blocks: both are cut into equally many stretches, whose k-th are taken together. As
-stretches of two tests are independent, the variance of the difference is the sum of both.
+that of a ratio of sums. Two tests have different blocks: both are cut into equally many segments, whose k-th are paired. As
+segments of two tests are independent, the variance of the difference is the sum of both.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from vehest.evaluation.blocks import block_sums
 from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.kit.block_errors import BlockErrors
 from vehest_papers.kit.claim_files import Claim
+from vehest_papers.kit.measured import paired_seeds
 from vehest_papers.kit.reading import recordings_of
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
 from vehest_papers.ksnn import behaviour, cost, paper
@@ -75,12 +76,6 @@ def as_ratio(logs: FloatArray) -> FloatArray:
     return np.asarray(np.exp(mean) * (1.0 + logs - mean), dtype=np.float64)
 
 
-def difference(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Of the values of two candidates, seed by seed, of as many seeds as both have."""
-    n_seeds = min(len(first), len(second))
-    return np.asarray(first[:n_seeds] - second[:n_seeds], dtype=np.float64)
-
-
 def least_other_over_own(claim: Claim, parts: Parts) -> ByBlock | None:
     """FVU on the other car over that on the own one, of the structure in which the ratio is smallest.
 
@@ -96,7 +91,7 @@ def least_other_over_own(claim: Claim, parts: Parts) -> ByBlock | None:
     if not ratios:
         return None
     least = min(ratios, key=lambda logs: float(logs.mean()))
-    return ByBlock(_stretches(least.shape[1]), as_ratio(least))
+    return ByBlock(_segment_names(least.shape[1]), as_ratio(least))
 
 
 def other_over_own_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
@@ -106,8 +101,8 @@ def other_over_own_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     if not all(name in scheme.errors(scheme.own) for name in names):
         return None
     first, second = (_log_other_over_own(scheme, name) for name in names)
-    logs = difference(first, second)
-    return ByBlock(_stretches(logs.shape[1]), np.exp(logs))
+    logs = np.subtract(*paired_seeds(first, second))
+    return ByBlock(_segment_names(logs.shape[1]), np.exp(logs))
 
 
 def _log_other_over_own(scheme: Scheme, name: str) -> FloatArray:
@@ -116,16 +111,16 @@ def _log_other_over_own(scheme: Scheme, name: str) -> FloatArray:
         scheme.errors(test).block_errors(name, "fvu") for test in (scheme.own, scheme.other)
     )
     number = min(len(own.blocks), len(other.blocks))
-    return _log_of_stretches(other, number) - _log_of_stretches(own, number)
+    return _log_of_segment_names(other, number) - _log_of_segment_names(own, number)
 
 
-def _log_of_stretches(errors: BlockErrors, number: int) -> FloatArray:
+def _log_of_segment_names(errors: BlockErrors, number: int) -> FloatArray:
     """`log_values` of so many stretches of blocks that follow each other."""
     stretch = np.arange(len(errors.blocks)) * number // len(errors.blocks)
     return log_values(block_sums(errors.sums, stretch), block_sums(errors.sizes, stretch))
 
 
-def _stretches(number: int) -> list[str]:
+def _segment_names(number: int) -> list[str]:
     return [f"stretch {place} of {number} of both tests" for place in range(1, number + 1)]
 
 
@@ -173,7 +168,9 @@ def specialised_over_others(claim: Claim, parts: Parts) -> ByBlock | None:
     if not all(lowest):
         return None
     first, second = (errors.block_errors(name, "fvu") for name in lowest)
-    logs = difference(*(log_values(own.sums, own.sizes) for own in (first, second)))
+    logs = np.subtract(
+        *paired_seeds(*(log_values(errors.sums, errors.sizes) for errors in (first, second)))
+    )
     return ByBlock(first.blocks, as_ratio(logs))
 
 
@@ -246,7 +243,11 @@ def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
         powers.append(np.stack([values for _, values in of_seeds]))
     ones = np.ones(len(names))
     ratios = [
-        difference(log_values(powers[0][:, :, band], ones), log_values(benchmark[:, :, band], ones))
+        np.subtract(
+            *paired_seeds(
+                log_values(powers[0][:, :, band], ones), log_values(benchmark[:, :, band], ones)
+            )
+        )
         for benchmark in powers[1:]
         for band in range(len(BANDS_HZ))
     ]
@@ -277,15 +278,17 @@ def regularisation_loss_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
         return None
     blocks = sides[0].block_errors(names[0], "fvu").blocks
     losses = [
-        difference(
-            *(
-                log_values(own.sums, own.sizes)
-                for own in (side.block_errors(name, "fvu") for side in sides)
+        np.subtract(
+            *paired_seeds(
+                *(
+                    log_values(errors.sums, errors.sizes)
+                    for errors in (side.block_errors(name, "fvu") for side in sides)
+                )
             )
         )
         for name in names
     ]
-    return ByBlock(blocks, np.exp(difference(*losses)))
+    return ByBlock(blocks, np.exp(np.subtract(*paired_seeds(*losses))))
 
 
 def leaks_at_zero_yaw_rate(claim: Claim, parts: Parts) -> ByBlock | None:

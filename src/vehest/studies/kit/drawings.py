@@ -191,11 +191,7 @@ def _accelerations(signals: DriveSignals) -> list[Cloud]:
     colours = {"training": REFERENCE_GREY, "test": TEST_COLOUR}
     clouds = []
     for role, spans in roles.items():
-        recordings = [
-            part.reference(span).cut(span.start, span.stop)
-            for span in spans
-            if (span.dataset, span.recording) in part.references
-        ]
+        recordings = part.reference_ranges(spans)
         if not recordings:
             continue
         if not all("ax" in recording and "ay" in recording for recording in recordings):
