@@ -444,7 +444,7 @@ def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(ar
         ],
     )
     text = words_of(twins)
-    assert "Twin and 1 other are not significantly worse. **Recommended: KS-NN" in text
+    assert "Twin and GRU | 5 &lt;states> are not significantly worse. **Recommended: KS-NN" in text
     assert (
         "of the 3 estimators among these that are significantly better than the zero-sideslip baseline"
         in text

@@ -157,7 +157,7 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     ]
     agreement = Figure(
         f"agreement_{file}",
-        "Estimated over measured sideslip of every sample of the test set; on the line both are equal.",
+        "Estimated over measured sideslip at evenly spaced samples of the test set; on the line both are equal.",
         agreement_figure(reference, clouds),
     )
     if not signals.has_ay:

@@ -92,7 +92,7 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
         )
     if len(equal) == 1:
         return f"{words} {equal[0]} is not significantly worse."
-    others = f"{len(equal) - 1} other{'s' * (len(equal) > 2)}"
+    others = equal[1] if len(equal) == 2 else f"{len(equal) - 1} others"
     return f"{words} {equal[0]} and {others} are not significantly worse."
 
 
@@ -129,5 +129,5 @@ def basis_sentence(ranking: Ranking, where: str) -> str:
         return f"{figures}."
     return (
         f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, "
-        f"corrected by Holm. The squared error of the best is spread as over {ranking.effective_blocks:.0f} equal blocks."
+        f"corrected by Holm. Effective number of blocks, by the squared error of the best: {ranking.effective_blocks:.0f}."
     )
