@@ -32,9 +32,9 @@ from vehest.inference.models import find_model, preparation_of
 from vehest.report.style import fixed
 from vehest.run.calibrate import plan_calibrate
 from vehest.run.console import Messages
-from vehest.run.estimate import model_artefact
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
+from vehest.run.train import model_artefact
 from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import read_trust, write_trust
 

@@ -255,8 +255,8 @@ def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
         **layout._asdict(),
         **{name: float(value) for name, value in model.settings._asdict().items()},
         "n_statistics": layout.statistics,
-        "limits": model.limits.every,
-        "inverse": model.inverse.every,
+        "limits": model.limits.all_values,
+        "inverse": model.inverse.all_values,
         "stops": _endless(model.stops),
         "wheels": bool(model.wheel.any()),
     }

@@ -34,7 +34,6 @@ from vehest.inference.car_values import adapted
 from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
-from vehest.run.estimate import finding_in_words
 from vehest.run.estimate_tables import (
     NamedColumn,
     names_of_table,
@@ -42,7 +41,14 @@ from vehest.run.estimate_tables import (
     parse_shift,
     read_estimate_table,
 )
-from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, note, score_cells
+from vehest.run.printing import (
+    SCORE_HEADER,
+    TerminalTable,
+    complain,
+    finding_in_words,
+    note,
+    score_cells,
+)
 from vehest.sources.base import read_single
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 

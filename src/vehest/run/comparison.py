@@ -19,7 +19,6 @@ from vehest.data.splits import Split
 from vehest.estimators.registry import new_estimator
 from vehest.inference.car_values import with_car_values
 from vehest.inference.models import find_model
-from vehest.run.estimate import model_artefact
 from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
@@ -28,7 +27,7 @@ from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
-from vehest.run.train import TrainJob, estimator_rate, plan_train
+from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
 from vehest.run.usable import lack
 from vehest.studies.reference_minutes import start_in_words
 

@@ -5,8 +5,6 @@ model, recording -> checks -> the model's rate -> estimate with bands and health
 
 from __future__ import annotations
 
-import hashlib
-import json
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,19 +16,16 @@ import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
 from vehest.alignment.findings import Finding
-from vehest.artefacts.artefact import MANIFEST, Artefact, read_artefact
 from vehest.configuration.estimate_options import EstimateOptions, estimate_options
 from vehest.configuration.files import is_file_name
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import QUANTITIES, Estimate
-from vehest.data.files import sha256_of
 from vehest.data.limits import use_limits
 from vehest.data.recording import Recording, joined
 from vehest.data.resampling import resampled_parts
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
-from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, read_description
 from vehest.inference.car_values import adapted, read_car
 from vehest.inference.estimation import estimate_parts, too_short_error
 from vehest.inference.models import (
@@ -44,8 +39,7 @@ from vehest.inference.reading import vehicle_of, without_references
 from vehest.inference.tables import LOG_SUFFIXES, check_table_name, write_estimate_table
 from vehest.run.estimate_log import check_log_name, write_log
 from vehest.run.estimate_summary import point_of_estimate
-from vehest.run.printing import complain, note
-from vehest.run.train import STAGE as TRAIN
+from vehest.run.printing import complain, finding_in_words, note
 from vehest.sources.base import car_of, source_of_file
 from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
@@ -187,29 +181,6 @@ def model_for_car(
     for remark in remarks:
         say(remark)
     return folder, model, trust, is_other
-
-
-def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
-    if (folder / MANIFEST).is_file():
-        artefact = read_artefact(folder)
-        if artefact.stage != TRAIN:
-            raise ConfigurationError(
-                f"'{folder}' holds no model but an artefact of the stage '{artefact.stage}'"
-            )
-        return artefact
-    about = read_description(folder)
-    outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
-    key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
-    config = {"estimator": dict(about.settings), "train": [], "validation": []}
-    return Artefact(
-        folder, TRAIN, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True
-    )
-
-
-def finding_in_words(finding: Finding) -> str:
-    """A finding, with the channel that it is about."""
-    return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
 def findings_of(

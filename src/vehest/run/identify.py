@@ -26,8 +26,8 @@ from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.inference.car_values import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
 from vehest.inference.estimation import prepared_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
-from vehest.run.estimate import finding_in_words, findings_of
-from vehest.run.printing import TerminalTable, complain, note
+from vehest.run.estimate import findings_of
+from vehest.run.printing import TerminalTable, complain, finding_in_words, note
 from vehest.sources.base import car_of
 
 IDENTIFIED_SHARE = (

@@ -23,6 +23,7 @@ from vehest.data.errors import counted as counted
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vehest.alignment.findings import Finding
     from vehest.studies.sweep import SweepArtefacts
 
 SCORE_HEADER = (
@@ -136,6 +137,11 @@ def silence(stream: Any) -> None:
     """Discard the rest of a broken stream, so that leaving does not complain about it."""
     with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def finding_in_words(finding: Finding) -> str:
+    """A finding, with the channel that it is about."""
+    return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
 def as_json_text(outcome: Any) -> str:

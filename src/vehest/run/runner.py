@@ -27,13 +27,13 @@ from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol
 from vehest.run.console import REUSED, Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
-from vehest.run.estimate import finding_in_words
 from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
+from vehest.run.printing import finding_in_words
 from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker

@@ -34,7 +34,6 @@ from vehest.run.comparison import (
     slowest,
 )
 from vehest.run.console import Messages
-from vehest.run.estimate import model_artefact
 from vehest.run.evaluate import Evaluation, fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.ingest import STAGE as INGEST
@@ -60,7 +59,7 @@ from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
+from vehest.run.train import learnt_spans, model_artefact, read_fit_metrics, trained_rate
 from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset

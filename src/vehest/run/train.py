@@ -6,21 +6,23 @@ configuration, split, recordings -> TrainJob -> `fit_jobs` -> estimator and reco
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from vehest.artefacts.artefact import MANIFEST, TIMINGS, Artefact, StagePlan
+from vehest.artefacts.artefact import MANIFEST, TIMINGS, Artefact, StagePlan, read_artefact
 from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.files import sha256_of
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.model_files import save_model
+from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, read_description, save_model
 from vehest.estimators.registry import new_estimator
 from vehest.run.versions import code_of
 from vehest.training.context import FitContext
@@ -243,6 +245,24 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
         raise DataError(
             f"'{model.folder / MANIFEST}': config describes no training ({first_line(error)})"
         ) from None
+
+
+def model_artefact(folder: Path) -> Artefact:
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
+    if (folder / MANIFEST).is_file():
+        artefact = read_artefact(folder)
+        if artefact.stage != STAGE:
+            raise ConfigurationError(
+                f"'{folder}' holds no model but an artefact of the stage '{artefact.stage}'"
+            )
+        return artefact
+    about = read_description(folder)
+    outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
+    key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
+    config = {"estimator": dict(about.settings), "train": [], "validation": []}
+    return Artefact(
+        folder, STAGE, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True
+    )
 
 
 def recording_file(data: Artefact, span: Span) -> Path:

@@ -39,14 +39,14 @@ class Autoregression:
 
     def innovations(self, samples: FloatArray) -> FloatArray:
         """y_k less its prediction from the p samples before, (T, C); NaN for the first p and where a sample is not finite."""
-        found = np.full(np.shape(samples), np.nan)
+        innovations = np.full(np.shape(samples), np.nan)
         if len(samples) > self.order:
-            found[self.order :] = samples[self.order :] - self.constant
+            innovations[self.order :] = samples[self.order :] - self.constant
             for lag, coefficient in enumerate(self.coefficients, start=1):
-                found[self.order :] -= (
+                innovations[self.order :] -= (
                     samples[self.order - lag : len(samples) - lag] @ coefficient.T
                 )
-        return found
+        return innovations
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
@@ -61,9 +61,9 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
     spread = np.maximum(targets.std(0), 1e-12)
     regressors = (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order)
     targets = (targets - centre) / spread
-    kept = np.ones(len(targets), dtype=bool)
+    is_regular = np.ones(len(targets), dtype=bool)
     for _ in range(2):
-        left = _least_squares(regressors[kept], targets[kept], max_order * n_channels)
+        left = _least_squares(regressors[is_regular], targets[is_regular], max_order * n_channels)
         residual = targets - left[0] - regressors @ left[1:]
         robust = 1.4826 * np.median(np.abs(residual), axis=0) + LEAST_DEVIATION
         robust = np.maximum(
@@ -76,13 +76,15 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
             ),
         )
         odd = (np.abs(residual) > OUTLIER * robust).any(1)
-        kept = ~odd if odd.mean() < 0.02 else kept
+        is_regular = ~odd if odd.mean() < 0.02 else is_regular
     chosen = left
     lowest = math.inf
     for order in range(1, max_order + 1):
-        fitted = _least_squares(regressors[kept], targets[kept], order * n_channels)
+        fitted = _least_squares(regressors[is_regular], targets[is_regular], order * n_channels)
         residual = (
-            targets[kept] - fitted[0] - regressors[kept][:, : order * n_channels] @ fitted[1:]
+            targets[is_regular]
+            - fitted[0]
+            - regressors[is_regular][:, : order * n_channels] @ fitted[1:]
         )
         covariance = residual.T @ residual / len(residual) + LEAST_DEVIATION**2 * np.eye(n_channels)
         criterion = len(residual) * float(
@@ -131,14 +133,14 @@ def learn_noise_levels(
         Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of samples; and root mean squares there, (L, C),
         outliers cut off, between which straight lines hold.
     """
-    known = np.isfinite(innovations).all(1) & np.isfinite(speed)
-    own = innovations[known] / np.sqrt(np.diag(covariance))
-    speed = np.abs(speed[known])
+    is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
+    scaled = innovations[is_finite] / np.sqrt(np.diag(covariance))
+    speed = np.abs(speed[is_finite])
     bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)
     speeds = np.array([float(np.median(speed[rows])) for rows in bins])
     factors = np.array(
         [
-            np.sqrt(np.mean(np.square(np.clip(own[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0))
+            np.sqrt(np.mean(np.square(np.clip(scaled[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0))
             for rows in bins
         ]
     )

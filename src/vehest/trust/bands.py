@@ -88,8 +88,8 @@ class Quantity:
     def beside(self, level: float) -> FloatArray:
         """Half widths of all `LEVELS` over that of one, (L,)."""
         factors = np.array(self.factors)
-        shown = factors[LEVELS.index(level)]
-        return factors / shown if shown > 0 else np.ones_like(factors)
+        level_factor = factors[LEVELS.index(level)]
+        return factors / level_factor if level_factor > 0 else np.ones_like(factors)
 
 
 @dataclass(frozen=True)
@@ -141,15 +141,19 @@ class Bands:
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
-        which = LEVELS.index(SHOWN_LEVEL)
+        level_place = LEVELS.index(SHOWN_LEVEL)
         wider = OTHER_VEHICLE if elsewhere else 1.0
         head = [
-            self.vy.factors[which] * wider,
-            self.sideslip.factors[which] * wider,
+            self.vy.factors[level_place] * wider,
+            self.sideslip.factors[level_place] * wider,
             self.vy.floor**2,
             self.sideslip.floor**2,
         ]
-        weights = [own.weights.get(name, 0.0) for own in (self.vy, self.sideslip) for name in TERMS]
+        weights = [
+            quantity.weights.get(name, 0.0)
+            for quantity in (self.vy, self.sideslip)
+            for name in TERMS
+        ]
         numbers = np.array(
             [*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)]
         )
@@ -164,12 +168,12 @@ class Bands:
         return bands
 
 
-def _check_terms(what: str, numbers: Mapping[str, float], smallest: float) -> None:
+def _check_terms(name_of_terms: str, numbers: Mapping[str, float], smallest: float) -> None:
     if not numbers.keys() <= set(TERMS):
-        raise DataError(f"{what} must be numbers from 0 on, of: {', '.join(TERMS)}")
+        raise DataError(f"{name_of_terms} must be numbers from 0 on, of: {', '.join(TERMS)}")
     for name, number in numbers.items():
         if number != 0.0:
-            check_number(f"{what}.{name}", number, smallest, MAX_TERM)
+            check_number(f"{name_of_terms}.{name}", number, smallest, MAX_TERM)
 
 
 class PackedBands(NamedTuple):
@@ -281,7 +285,7 @@ class Piece:
     rate_hz: float  # of the samples [Hz]
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def has_error(self) -> NDArray[np.bool_]:
         """Samples whose errors are known, (T,)."""
         return np.asarray(np.isfinite(self.errors).all(axis=1))
 
@@ -294,19 +298,24 @@ def calibrated(
     ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
     Raises `DataError` where one of the two has no sample whose error is known.
     """
-    for pieces, what in ((training, "training"), (validation, "validation")):
-        if not any(piece.known.any() for piece in pieces):
+    for pieces, role in ((training, "training"), (validation, "validation")):
+        if not any(piece.has_error.any() for piece in pieces):
             raise DataError(
-                f"no sample of the {what} ranges has both an estimate and a reference to calibrate bands by"
+                f"no sample of the {role} ranges has both an estimate and a reference to calibrate bands by"
             )
     columns = _columns(channels)
     terms = np.concatenate(
-        [terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.known] for piece in training]
+        [
+            terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.has_error]
+            for piece in training
+        ]
     )
     largest = np.array(
         [
-            np.quantile(own[np.isfinite(own)], DOMAIN_QUANTILE) if np.isfinite(own).any() else 0.0
-            for own in np.abs(terms).T
+            np.quantile(sizes[np.isfinite(sizes)], DOMAIN_QUANTILE)
+            if np.isfinite(sizes).any()
+            else 0.0
+            for sizes in np.abs(terms).T
         ]
     )
     vx = np.abs(terms[:, TERMS.index("vx")])
@@ -316,20 +325,22 @@ def calibrated(
         usable[FIRST_FEATURE:] = False
     names = [name for name, chosen in zip(TERMS, usable, strict=True) if chosen]
     filled = np.where(np.isfinite(terms), terms, largest)[:, usable]
-    errors = np.concatenate([piece.errors[piece.known] for piece in training])
+    errors = np.concatenate([piece.errors[piece.has_error] for piece in training])
     scales = []
-    for own, error in zip((filled, filled / speed[:, None]), errors.T, strict=True):
-        weights, floor = fitted_scale(own, error)
-        kept = {
+    for features, error in zip((filled, filled / speed[:, None]), errors.T, strict=True):
+        weights, floor = fitted_scale(features, error)
+        nonzero_weights = {
             name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0
         }
-        scales.append(Quantity(kept, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0))
+        scales.append(
+            Quantity(nonzero_weights, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0)
+        )
     labels, kind = block_labels(
         [piece.yaw_rate for piece in validation],
         [len(piece.vy) for piece in validation],
         validation[0].rate_hz,
     )
-    blocks = np.concatenate(labels)[np.concatenate([piece.known for piece in validation])]
+    blocks = np.concatenate(labels)[np.concatenate([piece.has_error for piece in validation])]
     bands = Bands(
         **origin,
         channels=channels,
@@ -345,13 +356,14 @@ def calibrated(
         sideslip=scales[1],
     )
     half = [
-        bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known] for piece in validation
+        bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.has_error]
+        for piece in validation
     ]
     scores = np.abs(
-        np.concatenate([piece.errors[piece.known] for piece in validation])
+        np.concatenate([piece.errors[piece.has_error] for piece in validation])
     ) / np.concatenate(half)
     vy, sideslip = (
-        _with_factors(own, score, blocks) for own, score in zip(scales, scores.T, strict=True)
+        _with_factors(scale, score, blocks) for scale, score in zip(scales, scores.T, strict=True)
     )
     return replace(bands, vy=vy, sideslip=sideslip)
 
@@ -369,15 +381,17 @@ def terms_of(
     )
 
 
-def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
-    factors, beyond = zip(
+def _with_factors(scale: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
+    factors, is_beyond = zip(
         *(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True
     )
     squared = np.asarray(
         np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)),
         dtype=np.float64,
     )
-    return replace(own, factors=factors, beyond=beyond, effective_blocks=effective_blocks(squared))
+    return replace(
+        scale, factors=factors, beyond=is_beyond, effective_blocks=effective_blocks(squared)
+    )
 
 
 def effective_blocks(sums: FloatArray) -> float:
@@ -443,9 +457,9 @@ def pooled_quantile(
     def quantile(share: float) -> float:
         return float(scores[order][min(int(np.searchsorted(below, share - 1e-9)), len(scores) - 1)])
 
-    alike = intraclass_correlation((scores <= quantile(level)).astype(np.float64), label)
-    alike = 1.0 if math.isnan(alike) else min(max(alike, 0.0), 1.0)
-    independent = len(scores) / (1.0 + (len(scores) / n_blocks - 1.0) * alike)
+    correlation = intraclass_correlation((scores <= quantile(level)).astype(np.float64), label)
+    correlation = 1.0 if math.isnan(correlation) else min(max(correlation, 0.0), 1.0)
+    independent = len(scores) / (1.0 + (len(scores) / n_blocks - 1.0) * correlation)
     if level > independent / (independent + 1.0) + 1e-12:
         return float(scores.max()) * (1.0 + 1.0 / independent), True
     return quantile(level * (1.0 + 1.0 / independent)), False
@@ -459,14 +473,14 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
     Source: Donner, A review of inference procedures for the intraclass correlation coefficient in the one-way random effects model,
     International Statistical Review 54 (1), 1986, for groups of unlike sizes.
     """
-    _, own, sizes = np.unique(labels, return_inverse=True, return_counts=True)
+    _, group_of_value, sizes = np.unique(labels, return_inverse=True, return_counts=True)
     groups = len(sizes)
     n = len(values)
     if groups < 2 or n <= groups:
         return float("nan")
-    means = np.bincount(own, weights=values) / sizes
+    means = np.bincount(group_of_value, weights=values) / sizes
     between = float(sizes @ np.square(means - values.mean())) / (groups - 1)
-    within = float(np.sum(np.square(values - means[own]))) / (n - groups)
+    within = float(np.sum(np.square(values - means[group_of_value]))) / (n - groups)
     typical = (n - float(np.sum(np.square(sizes))) / n) / (groups - 1)
     total = between + (typical - 1.0) * within
     return (between - within) / total if total > 0 else float("nan")
@@ -479,19 +493,19 @@ def block_labels(
 
     A range without yaw rate [rad/s] is one block.
     """
-    found = []
+    labels = []
     count = 0
     kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"
     for yaw_rate, length in zip(yaw_rates, lengths, strict=True):
-        whole = kind == "range" or yaw_rate is None
-        own = (
+        spans_range = kind == "range" or yaw_rate is None
+        turns = (
             np.zeros(length, dtype=np.int64)
-            if yaw_rate is None or whole
+            if yaw_rate is None or spans_range
             else turns_of(yaw_rate, rate_hz)
         )
-        found.append(own + count)
-        count += int(own[-1]) + 1 if length else 0
-    return found, kind
+        labels.append(turns + count)
+        count += int(turns[-1]) + 1 if length else 0
+    return labels, kind
 
 
 def turns_of(yaw_rate: FloatArray, rate_hz: float) -> NDArray[np.int64]:
@@ -501,12 +515,12 @@ def turns_of(yaw_rate: FloatArray, rate_hz: float) -> NDArray[np.int64]:
     than that belongs to the last.
     """
     turning = np.abs(np.nan_to_num(yaw_rate)) >= TURN_YAW_RATE
-    least = max(math.ceil(LEAST_BLOCK_SECONDS * rate_hz), 1)
+    min_samples = max(math.ceil(LEAST_BLOCK_SECONDS * rate_hz), 1)
     starts = [0]
     for start in np.flatnonzero(turning[1:] & ~turning[:-1]) + 1:
-        if start - starts[-1] >= least:
+        if start - starts[-1] >= min_samples:
             starts.append(int(start))
-    if len(starts) > 1 and len(turning) - starts[-1] < least:
+    if len(starts) > 1 and len(turning) - starts[-1] < min_samples:
         starts.pop()
     labels = np.zeros(len(turning), dtype=np.int64)
     labels[starts[1:]] = 1

@@ -88,7 +88,7 @@ def learn_trust(
 
 def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
     """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
-    found: list[Piece] = []
+    pieces: list[Piece] = []
     estimates = estimator.estimate(
         [stretch.recording.without_references() for stretch in stretches]
     )
@@ -103,7 +103,7 @@ def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
             [vy - recording["vy_ref"], np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi], axis=1
         )
         yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
-        found.append(
+        pieces.append(
             Piece(
                 rows[scored],
                 vy[scored],
@@ -113,4 +113,4 @@ def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
                 recording.rate_hz,
             )
         )
-    return found
+    return pieces

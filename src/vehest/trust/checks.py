@@ -13,39 +13,39 @@ MAX_NUMBER = 1e100
 """Of every number without a narrower range: products of three stay finite."""
 
 
-def check_channels(where: str, names: Sequence[str]) -> None:
+def check_channels(place: str, names: Sequence[str]) -> None:
     """Raise `DataError` unless channels exist and none occurs twice."""
     unknown = [name for name in names if name not in CHANNELS]
     if unknown:
-        raise DataError(f"{where}: there is no channel '{unknown[0][:40]}'")
+        raise DataError(f"{place}: there is no channel '{unknown[0][:40]}'")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise DataError(f"{where}: channel '{twice}' occurs twice")
+        raise DataError(f"{place}: channel '{twice}' occurs twice")
 
 
-def check_number(where: str, value: float, low: float, high: float = MAX_NUMBER) -> None:
+def check_number(place: str, value: float, low: float, high: float = MAX_NUMBER) -> None:
     """Raise `DataError` unless a number lies between two others, both included; NaN does not."""
     if low == math.ulp(0.0) and not value > 0.0:
-        raise DataError(f"{where} must be positive, not {value:.4g}")
+        raise DataError(f"{place} must be positive, not {value:.4g}")
     if not low <= value <= high:
-        raise DataError(f"{where} must lie between {low:g} and {high:g}, not at {value:.4g}")
+        raise DataError(f"{place} must lie between {low:g} and {high:g}, not at {value:.4g}")
 
 
 def check_numbers(
-    where: str, values: Iterable[float], low: float, high: float = MAX_NUMBER
+    place: str, values: Iterable[float], low: float, high: float = MAX_NUMBER
 ) -> None:
     """Raise `DataError` unless all numbers lie between two others, both included."""
     for value in values:
-        check_number(where, value, low, high)
+        check_number(place, value, low, high)
 
 
-def check_shape(where: str, values: Any, *shape: int) -> None:
+def check_shape(place: str, values: Any, *shape: int) -> None:
     """Raise `DataError` unless nested tuples have a shape and their numbers are at most `MAX_NUMBER` in size."""
     if not shape:
         if not math.fabs(values) <= MAX_NUMBER:
-            raise DataError(f"{where} holds {values:.4g}, beyond {MAX_NUMBER:g}")
+            raise DataError(f"{place} holds {values:.4g}, beyond {MAX_NUMBER:g}")
         return
     if len(values) != shape[0]:
-        raise DataError(f"{where} has {len(values)} entries, not {shape[0]}")
+        raise DataError(f"{place} has {len(values)} entries, not {shape[0]}")
     for part in values:
-        check_shape(where, part, *shape[1:])
+        check_shape(place, part, *shape[1:])

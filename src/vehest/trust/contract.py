@@ -53,8 +53,8 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
     """The limits learnt with an estimator, or those of any car; `DataError` where ``trust`` was learnt with another one."""
     if trust is not None:
         trust.check_fit(estimator)
-    own = trust.guard if trust is not None else None
-    return own or usual_limits(estimator.channels, estimator.settings.rate_hz)
+    learnt_limits = trust.guard if trust is not None else None
+    return learnt_limits or usual_limits(estimator.channels, estimator.settings.rate_hz)
 
 
 class GuardedRun:
@@ -93,7 +93,7 @@ class GuardedRun:
             (0, len(estimator.channels))
         )  # rows that it still sees, where it has no state
         self._late: dict[str, FloatArray] = {}  # values of the last ``horizon_steps`` rows
-        self.others: dict[str, FloatArray] = {}
+        self.extra_quantities: dict[str, FloatArray] = {}
         self.covariance: FloatArray | None = None
         self.covariance_of: tuple[str, ...] = ()
 
@@ -125,7 +125,7 @@ class GuardedRun:
         self.marks = np.zeros(steps, np.int8)
         self.vx = np.full(steps, np.nan)
         self.variance = np.full(steps, np.nan)
-        self.others = {name: np.full(steps, np.nan) for name in self.others}
+        self.extra_quantities = {name: np.full(steps, np.nan) for name in self.extra_quantities}
         if self.covariance is not None:
             self.covariance = np.full((steps, *self.covariance.shape[1:]), np.nan)
         at = 0
@@ -177,12 +177,12 @@ class GuardedRun:
         extra = (
             self.estimator.horizon_steps
         )  # rows after the last, whose values no estimate at their time depends on
-        seen = np.concatenate([window, self.cleaned.rows[start:end]])
-        self._window = seen[max(len(seen) - self.estimator.warm_up_steps, 0) :]
+        rows = np.concatenate([window, self.cleaned.rows[start:end]])
+        self._window = rows[max(len(rows) - self.estimator.warm_up_steps, 0) :]
         channels = dict(
             zip(
                 self.estimator.channels,
-                np.concatenate([seen, np.repeat(seen[-1:], extra, axis=0)]).T,
+                np.concatenate([rows, np.repeat(rows[-1:], extra, axis=0)]).T,
                 strict=True,
             )
         )
@@ -212,9 +212,9 @@ class GuardedRun:
             self.covariance[start:end] = estimate.covariance[shift]
         for name, values in estimate.channels.items():
             if name not in ("vy", "sideslip"):
-                self.others.setdefault(name, np.full(len(self.out), np.nan))[start:end] = values[
-                    shift
-                ]
+                self.extra_quantities.setdefault(name, np.full(len(self.out), np.nan))[
+                    start:end
+                ] = values[shift]
         return np.asarray(estimate["vy"][shift])
 
     def _estimated(
@@ -246,16 +246,16 @@ class GuardedRun:
         )
 
         def later(name: str, values: FloatArray) -> FloatArray:
-            both = np.concatenate([self._late.get(name, np.full(horizon, np.nan)), values])
-            self._late[name] = both[len(values) :]
-            return both[: len(values)]
+            delayed = np.concatenate([self._late.get(name, np.full(horizon, np.nan)), values])
+            self._late[name] = delayed[len(values) :]
+            return delayed[: len(values)]
 
         vy = later("vy", self.out)
         channels = {
             "vy": vy,
             "sideslip": np.where(np.hypot(vx, vy) < STANDSTILL_SPEED, 0.0, np.arctan2(vy, vx)),
         }
-        channels |= {name: later(name, values) for name, values in self.others.items()}
+        channels |= {name: later(name, values) for name, values in self.extra_quantities.items()}
         if monitor.has_bands:
             channels |= {
                 "band_vy": later("band_vy", bands[:, 0]),
@@ -342,7 +342,7 @@ class GuardedStepper(Stepper):
         ]
         self.clock = SampleClock(self.input_rate_hz) if clock is None else clock
         self._judges_samples = clock is None
-        self._others: dict[str, float] = {}
+        self._extra_quantities: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
 
@@ -408,8 +408,8 @@ class GuardedStepper(Stepper):
         motion = self._motion
         flow = cleaned.flow[0]
         for column, at in enumerate(self._places):
-            known = at >= 0 and (flow != WAIT or cleaned.measured[0, at])
-            motion[0, column] = cleaned.rows[0, at] if known else math.nan
+            is_measured = at >= 0 and (flow != WAIT or cleaned.measured[0, at])
+            motion[0, column] = cleaned.rows[0, at] if is_measured else math.nan
         if math.isnan(motion[0, 0]):
             motion[0, 0] = vx
         watched = self.watch(self._raw, motion, cleaned.flow)
@@ -422,29 +422,35 @@ class GuardedStepper(Stepper):
             self._vx[0] = motion[0, 0]
         bands = self.monitor.after(verdict, watched, cleaned, self._vx, self._variance)
         vx = float(self._vx[0])
-        found = {
-            **self._others,
+        quantities = {
+            **self._extra_quantities,
             "vy": vy,
             "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx),
         }
         if self.monitor.has_bands:
-            found["band_vy"] = float(bands[0, 0])
-            found["band_sideslip"] = float(bands[0, 1])
-        found["health"] = float(verdict.status[0])
-        found["health_reason"] = float(verdict.reason[0])
-        return found
+            quantities["band_vy"] = float(bands[0, 0])
+            quantities["band_sideslip"] = float(bands[0, 1])
+        quantities["health"] = float(verdict.status[0])
+        quantities["health_reason"] = float(verdict.reason[0])
+        return quantities
 
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float]:
         """The estimator on a row: v, its own vx and the variance of v's error."""
         flow = cleaned.flow[0]
-        self._others = {}
+        self._extra_quantities = {}
         if flow == WAIT:
             return math.nan, math.nan, math.nan
         if flow == RESTART and not self._fresh:
             self._stepper = self.estimator.online()
         self._fresh = False
-        found = self._stepper.step(dict(zip(self.channels, cleaned.rows[0].tolist(), strict=True)))
-        self._others = {
-            name: value for name, value in found.items() if name not in ("vy", "vy_variance")
+        quantities = self._stepper.step(
+            dict(zip(self.channels, cleaned.rows[0].tolist(), strict=True))
+        )
+        self._extra_quantities = {
+            name: value for name, value in quantities.items() if name not in ("vy", "vy_variance")
         }
-        return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan)
+        return (
+            quantities["vy"],
+            quantities.get("vx", math.nan),
+            quantities.get("vy_variance", math.nan),
+        )

@@ -89,13 +89,13 @@ class Fault:
     )
 
     def __post_init__(self) -> None:
-        for name, known in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
+        for name, choices in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
             value = getattr(self, name)
-            if value not in known:
-                close = difflib.get_close_matches(value, known, n=1)
+            if value not in choices:
+                close = difflib.get_close_matches(value, choices, n=1)
                 hint = f"did you mean {close[0]}? " if close else ""
                 raise ConfigurationError(
-                    f"fault.{name} '{value}' is not there; {hint}there are: {', '.join(known)}"
+                    f"fault.{name} '{value}' is not there; {hint}there are: {', '.join(choices)}"
                 )
         if CHANNELS[self.channel].is_reference:
             raise ConfigurationError(
@@ -106,20 +106,20 @@ class Fault:
             raise ConfigurationError(
                 f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}"
             )
-        own = KINDS[self.kind].own_size
-        for name, value, wanted, fits in (
+        size_rule = KINDS[self.kind].size_rule
+        for name, value, requirement, fits in (
             ("start", self.onset, "a time from 0 s on", 0 <= self.onset < math.inf),
             ("duration", self.duration, "positive", self.duration > 0),
             ("seed", self.seed, "a whole number from 0 to 2^63 - 1", 0 <= self.seed < 2**63),
             (
                 f"size of a fault '{self.kind}'",
                 self.size,
-                own,
-                self.size is None or OWN_SIZES[own](self.size),
+                size_rule,
+                self.size is None or SIZE_RULES[size_rule](self.size),
             ),
         ):
             if not fits:
-                raise ConfigurationError(f"fault.{name} must be {wanted}, not {value:g}")
+                raise ConfigurationError(f"fault.{name} must be {requirement}, not {value:g}")
 
     @property
     def condition(self) -> str:
@@ -138,27 +138,29 @@ def applies(kind: str, channel: str) -> bool:
 
     A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward velocity, which one wheel may measure.
     """
-    own = CHANNELS[channel]
+    channel_range = CHANNELS[channel]
     special = {
-        "sign": own.low == -own.high,
-        "unit": own.unit in UNIT_FACTORS,
+        "sign": channel_range.low == -channel_range.high,
+        "unit": channel_range.unit in UNIT_FACTORS,
         "lost_wheel": channel == "vx" or channel.startswith("wheel_speed"),
     }
-    return not own.is_reference and special.get(kind, True)
+    return not channel_range.is_reference and special.get(kind, True)
 
 
 def size_of(kind: str, channel: str, severity: Severity) -> float:
     """Size of a fault, as in the module's tables; offsets of wheels and motor are shares of the largest speed."""
-    own = CHANNELS[channel]
+    channel_range = CHANNELS[channel]
     at = SEVERITIES.index(severity)
     sizes = KINDS[kind].sizes
     if sizes is None:
-        return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[own.unit])[at]
+        return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[channel_range.unit])[at]
     if isinstance(sizes, tuple):
         return sizes[at]
     if channel in OFFSETS:
         return sizes * OFFSETS[channel][at]
-    return sizes * (OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(own))
+    return sizes * (
+        OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(channel_range)
+    )
 
 
 def inject(
@@ -221,9 +223,11 @@ class FaultedChannel:
 
     def drawn(self, share: float, number: int | None = None) -> NDArray[np.bool_]:
         """A share of single samples, or of a ``number`` of pieces, at least one."""
-        found = np.zeros(len(self.inside) if number is None else number, np.bool_)
-        found[self.random.permutation(len(found))[: max(round(share * len(found)), 1)]] = True
-        return found
+        is_chosen = np.zeros(len(self.inside) if number is None else number, np.bool_)
+        is_chosen[
+            self.random.permutation(len(is_chosen))[: max(round(share * len(is_chosen)), 1)]
+        ] = True
+        return is_chosen
 
     def pieces(self) -> NDArray[np.bool_]:
         """Samples in pieces of `PIECE_SECONDS`."""
@@ -237,7 +241,7 @@ class FaultedChannel:
         return self.values[np.maximum(np.arange(self.first, self.end) - samples, 0)]
 
 
-def _held(at: FaultedChannel) -> FloatArray:
+def _sample_and_hold(at: FaultedChannel) -> FloatArray:
     samples = max(round(at.size * at.rate_hz), 2)
     return at.inside[np.arange(len(at.inside)) // samples * samples]
 
@@ -259,7 +263,7 @@ class Kind(NamedTuple):
     sizes: (
         Sizes | float | None
     )  # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong unit
-    own_size: str  # what a size of one's own must be, a key of `OWN_SIZES`
+    size_rule: str  # what a size of one's own must be, a key of `SIZE_RULES`
     effect: Callable[[FaultedChannel], FloatArray]
 
 
@@ -267,7 +271,7 @@ ANY = "a number other than 0"
 SHARE = "a share above 0, up to 1"
 POSITIVE = "a positive number"
 FACTOR = "a factor from 0 on"
-OWN_SIZES: dict[str, Callable[[float], bool]] = {
+SIZE_RULES: dict[str, Callable[[float], bool]] = {
     ANY: lambda size: math.isfinite(size) and size != 0,
     SHARE: lambda size: 0 < size <= 1,
     POSITIVE: lambda size: 0 < size < math.inf,
@@ -313,7 +317,7 @@ KINDS: dict[str, Kind] = {
         POSITIVE,
         lambda at: np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside),
     ),
-    "held": Kind((0.1, 0.25, 0.5), POSITIVE, _held),  # s, at least two samples
+    "held": Kind((0.1, 0.25, 0.5), POSITIVE, _sample_and_hold),  # s, at least two samples
     "lost_wheel": Kind(
         (math.nan, 1.5, 0.0), FACTOR, _lost_wheel
     ),  # factor of the speed; NaN: drops out

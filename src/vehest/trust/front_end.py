@@ -30,10 +30,12 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     comes through the filter.
     """
     at = np.arange(len(samples))
-    known = [np.isfinite(column) for column in samples.T]
+    measured_columns = [np.isfinite(column) for column in samples.T]
     full = [
-        np.interp(at, at[own], column[own]) if own.any() else np.zeros(len(at))
-        for own, column in zip(known, samples.T, strict=True)
+        np.interp(at, at[is_measured], column[is_measured])
+        if is_measured.any()
+        else np.zeros(len(at))
+        for is_measured, column in zip(measured_columns, samples.T, strict=True)
     ]
     together = np.stack(full, axis=1)
     fast = scipy.signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
@@ -49,8 +51,8 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     )
     sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
     start = scipy.signal.sosfilt_zi(sections)[:, :, None] * fast[0]
-    found = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
-    return np.asarray(np.where(np.isnan(samples), np.nan, found), dtype=np.float64)
+    filtered = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
+    return np.asarray(np.where(np.isnan(samples), np.nan, filtered), dtype=np.float64)
 
 
 class FrontEnd:
@@ -84,8 +86,8 @@ class FrontEnd:
             channels, bus_rate_hz
         ).channels  # jumps are those of another rate; ranges are the same
         merged = {
-            name: replace(own, jump=max(usual[name].jump, own.jump))
-            for name, own in (limits.channels or usual).items()
+            name: replace(limits_of_channel, jump=max(usual[name].jump, limits_of_channel.jump))
+            for name, limits_of_channel in (limits.channels or usual).items()
         }
         self.guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)
         self.ratio = rate_hz / bus_rate_hz
@@ -97,7 +99,7 @@ class FrontEnd:
         else:
             self.sections = np.zeros((0, 6))
         self._state = np.full((len(self.sections), len(channels), 2), math.nan)
-        self._held = np.full(len(channels), math.nan)
+        self._last_row = np.full(len(channels), math.nan)
 
     @property
     def delay(self) -> float:
@@ -117,8 +119,8 @@ class FrontEnd:
         measured = cleaned.measured[0]
         if waits:
             self._state[:] = math.nan
-        out = np.where(measured, cleaned.rows[0], self._held)
-        self._held = out.copy()
+        out = np.where(measured, cleaned.rows[0], self._last_row)
+        self._last_row = out.copy()
         if len(self.sections) and not waits:
             filter_row(out, self.sections, self._state)
         self._phase += self.ratio

@@ -118,16 +118,16 @@ def learn_limits(
     A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for twice
     its longest run while the car moved.
     """
-    found = {}
+    channel_limits = {}
     for name in channels:
         usual = _usual(name, rate_hz)
         table = CHANNELS[name]
         having = [recording for recording in recordings if name in recording]
-        own = [recording[name] for recording in having]
-        stops = stops_of(own, name)
-        size = _largest(own)
-        jump = _largest([np.diff(part) for part in own])
-        found[name] = ChannelLimits(
+        parts = [recording[name] for recording in having]
+        stops = stops_of(parts, name)
+        size = _largest(parts)
+        jump = _largest([np.diff(part) for part in parts])
+        channel_limits[name] = ChannelLimits(
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
             jump=max(_fastest(name, rate_hz), MARGIN * jump),
@@ -144,7 +144,9 @@ def learn_limits(
     )
     tangents = _largest([_tan_sideslip(recording) for recording in recordings])
     return GuardLimits(
-        found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, TAN_MARGIN * tangents)
+        channel_limits,
+        MARGIN * top if top > 0 else GuardLimits.top_speed,
+        max(1.0, TAN_MARGIN * tangents),
     )
 
 
@@ -185,13 +187,13 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
     longest = 0.0
     for recording in recordings:
         samples = recording[name]
-        same = (
+        is_frozen = (
             np.concatenate([[False], samples[1:] == samples[:-1]])
             & _moves(recording)
             & (samples > stops[0])
             & (samples < stops[1])
         )
-        longest = max(longest, longest_run(same) / recording.rate_hz)
+        longest = max(longest, longest_run(is_frozen) / recording.rate_hz)
     return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
 
 
@@ -209,9 +211,10 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
-            still = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
+            repeats = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
             stayed = [
-                sign * part[2:][own[1:] & own[:-1]] for part, own in zip(parts, still, strict=True)
+                sign * part[2:][is_repeated[1:] & is_repeated[:-1]]
+                for part, is_repeated in zip(parts, repeats, strict=True)
             ]  # equal the two before them
             reached = [
                 value for values in stayed for value in values if value >= NEAR_STOP * farthest
@@ -225,10 +228,10 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
     """Samples at which the car moves, as far as speed and yaw rate tell."""
     if "vx" not in recording:
         return np.ones(len(recording), np.bool_)
-    still = np.abs(recording["vx"]) < STANDSTILL_SPEED
+    is_standing = np.abs(recording["vx"]) < STANDSTILL_SPEED
     if "yaw_rate" in recording:
-        still &= np.abs(recording["yaw_rate"]) < STANDSTILL_YAW_RATE
-    return ~still
+        is_standing &= np.abs(recording["yaw_rate"]) < STANDSTILL_YAW_RATE
+    return ~is_standing
 
 
 class Cleaned(NamedTuple):
@@ -310,7 +313,7 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
     n_channels = rows.shape[1]
     vx_at, yaw_at, bridged, persists, remembers = settings
     for k in range(rows.shape[0]):
-        still = (
+        is_standing = (
             vx_at >= 0
             and abs(state[vx_at, 0]) < STANDSTILL_SPEED
             and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
@@ -321,30 +324,30 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
         jumped = False
         for c in range(n_channels):
             x = rows[k, c]
-            own = state[c]
+            memory = state[c]
             accepted = limits[c, 0] <= x <= limits[c, 1]  # false for NaN
             if accepted:
-                own[2] = own[2] + 1.0 if x == own[3] else 0.0
-                own[3] = x
-                if own[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not still:
+                memory[2] = memory[2] + 1.0 if x == memory[3] else 0.0
+                memory[3] = x
+                if memory[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not is_standing:
                     accepted = False
                 elif (
-                    own[1] <= bridged and abs(x - own[0]) > limits[c, 2]
+                    memory[1] <= bridged and abs(x - memory[0]) > limits[c, 2]
                 ):  # a jump from what is not long gone
-                    own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0
-                    own[4] = x
-                    accepted = own[5] >= persists
+                    memory[5] = memory[5] + 1.0 if abs(x - memory[4]) <= limits[c, 2] else 1.0
+                    memory[4] = x
+                    accepted = memory[5] >= persists
                     jumped = jumped or accepted
             if accepted:
-                own[0] = x
-                own[1] = 0.0
-                own[4] = math.nan
-                own[5] = 0.0
+                memory[0] = x
+                memory[1] = 0.0
+                memory[4] = math.nan
+                memory[5] = 0.0
             else:
-                own[1] += 1.0
+                memory[1] += 1.0
             measured[k, c] = accepted
-            clean[k, c] = x if accepted else (math.nan if skippable[c] else own[0])
-            missing = math.inf if math.isnan(own[0]) else own[1]
+            clean[k, c] = x if accepted else (math.nan if skippable[c] else memory[0])
+            missing = math.inf if math.isnan(memory[0]) else memory[1]
             if skippable[c]:
                 any_skippable = True
                 least_skippable = min(least_skippable, missing)

@@ -1,11 +1,17 @@
-"""Judges estimates by the channels that they were made from: valid, degraded or invalid, with a reason.
+"""Health of estimates, judged by the channels that they were computed from: valid, degraded or invalid.
 
     drives -> learn_health -> HealthModel (trust.yaml) -> packed -> health_rows -> status, reason
 
-Learnt from training drives without any reference: relations between channels (`vehest.trust.relations`), an autoregression of what they
-leave (`vehest.trust.autoregression`), and for every statistic of `vehest.trust.health_kernel` the largest value that healthy training and
-validation drives reach. A statistic beyond its limit, that value times a margin, flags the estimate at once as degraded or invalid, with a
-reason. The flag is taken back after `HOLD_SECONDS` in which every statistic stayed below `CLEAR` times its limit.
+`learn_health` uses training drives without any reference:
+
+1. relations between channels (`vehest.trust.relations`), such as ay = du/dt + u r;
+2. an autoregression of their residuals (`vehest.trust.autoregression`);
+3. the largest value of every statistic of `vehest.trust.health_kernel` on healthy training and
+   validation drives. Multiplied by a margin it is the limit of the statistic.
+
+`health_rows` flags an estimate as degraded or invalid, with a reason, as soon as a statistic exceeds its
+limit. The flag is cleared after `HOLD_SECONDS` in which every statistic stayed below `CLEAR` times its
+limit.
 """
 
 from __future__ import annotations
@@ -47,45 +53,43 @@ VALID = 0
 DEGRADED = 1
 INVALID = 2
 
-HOLD_SECONDS = 1.0  # for which a flag stays after the last statistic went down
-BRIDGED_SECONDS = 0.5  # from which on a missing channel makes the estimate invalid
+HOLD_SECONDS = 1.0  # a flag is held for this time after the last statistic fell below its limit
+BRIDGED_SECONDS = 0.5  # a channel that is missing for longer makes the estimate invalid
 SPIN_SECONDS = 0.3
 SETTLE_SECONDS = 0.5  # after a start, before predictions count
-SHARE_SECONDS = 0.5  # over which equal samples are counted
-BRAKING_SECONDS = 0.2  # over which ax is averaged
-ENERGY_SECONDS = 0.5  # over which what is usual is known, before a jump
+
+# Time constants of the statistics' means.
+SHARE_SECONDS = 0.5  # share of equal samples
+BRAKING_SECONDS = 0.2  # ax
+ENERGY_SECONDS = 0.5  # energy of the innovations before a jump
 OFFSET_SECONDS = 4.0
 RELATION_SECONDS = 1.0
-SHORT_SECONDS = 0.25  # over which both sides of a relation are averaged before their signs and sizes are compared
+SHORT_SECONDS = 0.25  # both sides of a relation, before their signs and sizes are compared
 
-BLOCK_SECONDS = 5.0  # whose largest values set the limits
-HOURS = 100.0  # in which healthy drives are to exceed a limit about once
-BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: tyres, track, wind
-LEAST_VALUES = 10.0  # independent ones that any time holds
-LEAST_RUN = 4.0  # equal samples in a row
-LEAST_SHARE = 0.3
-LEAST = {
-    "normal": 4.5,
-    "slip": 0.3,
-    "largest": 0.0,
-}  # limits of statistics that are N(0, 1) without a fault, and of slip
-APART = (
-    2.0  # times the next largest block, from which on a block is a fault of the recording itself
-)
-MOST_APART = 0.01  # share of blocks that may be
+# Limits from healthy drives.
+BLOCK_SECONDS = 5.0  # limits are set by the largest value in each block of this length
+HOURS_BETWEEN_FALSE_ALARMS = 100.0  # healthy driving in which a limit is exceeded about once
+DAY_TO_DAY_FACTOR = 1.25  # tyres, track and wind of another day may raise a statistic by this
+MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, in a drive of any length
+MIN_RUN_SAMPLES = 4.0  # equal samples in a row
+MIN_REPEATED_SHARE = 0.3
+MIN_LIMITS = {"normal": 4.5, "slip": 0.3, "largest": 0.0}
+"""Rule of a statistic -> smallest limit; statistics of ``normal`` are N(0, 1) without a fault."""
+OUTLIER_FACTOR = 2.0  # a block that exceeds the next largest by this is a fault of the recording
+MAX_OUTLIER_SHARE = 0.01  # of the blocks
 SPIN_MARGIN = 1.3
-HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a likelihood ratio
-STILL = {"yaw_rate": 0.05, "ay": 0.5}  # rad/s, m/s²: below which a car may be taken to stand
+MAX_RELATIVE_WEIGHT = 5.0  # of one sample in a likelihood ratio, over the mean weight
+STANDSTILL_LIMITS = {"yaw_rate": 0.05, "ay": 0.5}
+"""Channel -> value below which the car may be at standstill [rad/s, m/s²]."""
 
 MAX_ORDER = 10
-MOST_COEFFICIENTS = 700  # of the autoregression: what a step can afford
+MAX_COEFFICIENTS = 700  # of the autoregression, for the time of a step
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
-"""Channels that the autoregression holds, beside the wheels' speeds; of others only range, gaps and standing still are watched."""
+"""Channels of the autoregression, besides wheel speeds; of other channels range, gaps and repeated samples are checked."""
 
-NUMBERS = {
-    name: number for number, name in enumerate(CHANNELS, start=1)
-}  # number of a channel in a reason's code
+NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
+"""Channel -> its number in the code of a reason."""
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
 NO_ESTIMATE = 30
@@ -120,9 +124,9 @@ REASONS: dict[int, tuple[str, float]] = {
     CLOCK_JUMPED: ("the time stamps jump, or all samples are missing", 0.0),
     CLOCK_UNEVEN: ("the time stamps are uneven, or come at another rate", 0.0),
 }
-"""Kind of a reason -> text, and priority over others: the most specific is given.
+"""Kind of a reason -> text, and its priority: the most specific reason is reported.
 
-A code is 10000 times the kind, 100 times the channel's number, and the partner's.
+code = 10000 kind + 100 (number of the channel) + number of the partner
 """
 
 RETIRED = (kernel.NOISE, kernel.SMOOTH, kernel.SCALE, kernel.LATE)  # kinds of earlier versions
@@ -130,8 +134,8 @@ RETIRED = (kernel.NOISE, kernel.SMOOTH, kernel.SCALE, kernel.LATE)  # kinds of e
 
 def reason_in_words(code: float) -> str:
     """Text of a reason's code; empty for 0."""
-    kind, rest = divmod(round(code), 10_000)
-    channel, partner = divmod(rest, 100)
+    kind, channels_code = divmod(round(code), 10_000)
+    channel, partner = divmod(channels_code, 100)
     return REASONS[kind][0].format(
         channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels")
     )
@@ -146,13 +150,13 @@ class Health(NamedTuple):
 
 
 class Statistic(NamedTuple):
-    """Kind of reason, channel, the other channel of a relation, time constant [s], and the rule for its limit."""
+    """One statistic of the kernel."""
 
-    kind: int
-    channel: str
-    partner: str
-    seconds: float
-    rule: str
+    kind: int  # of the reason that it leads to
+    channel: str  # that is accused
+    partner: str  # other channel of a relation; empty for statistics of one channel
+    seconds: float  # time constant [s]
+    rule: str  # for its limit, see `limits_from`
 
 
 @dataclass(frozen=True)
@@ -292,15 +296,17 @@ class HealthModel:
             "domain": ((kernel.OUTSIDE, 0.0),),
             "slip": ((kernel.LOCKED, 0.0),),
         }
-        own = [
+        of_channels = [
             Statistic(kind, name, "", seconds, rule)
-            for rule, those in kinds.items()
-            for kind, seconds in those
+            for rule, kinds_of_rule in kinds.items()
+            for kind, seconds in kinds_of_rule
             for name in self.channels
         ]
-        return own + [
-            Statistic(kernel.CONTRADICTION, one.target, one.partner, RELATION_SECONDS, "largest")
-            for one in self.relations
+        return of_channels + [
+            Statistic(
+                kernel.CONTRADICTION, relation.target, relation.partner, RELATION_SECONDS, "largest"
+            )
+            for relation in self.relations
         ]
 
     def start(self) -> FloatArray:
@@ -312,9 +318,12 @@ class HealthModel:
     def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> FloatArray:
         """The kernel's `Model` in one array.
 
-        Args:
-            forgets: whether the likelihood ratio of an offset does; if not, it is a sum over all rows.
-            behind_front_end: whether rows come through the filter from a faster bus.
+        Parameters
+        ----------
+        forgets : bool
+            Whether the likelihood ratio of an offset forgets; if not, it is a sum over all rows.
+        behind_front_end : bool
+            Whether rows come through the filter from a faster bus.
         """
         limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
         layout = self.layout
@@ -356,8 +365,8 @@ class HealthModel:
         model.healthy[:] = self.healthy[0] if self.healthy else 0.0
         model.heaviest[:] = self.heaviest[0] if self.heaviest else math.inf
         model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
-        model.limits.every[:] = limits or math.inf
-        model.inverse.every[:] = 1.0 / model.limits.every
+        model.limits.all_values[:] = limits or math.inf
+        model.inverse.all_values[:] = 1.0 / model.limits.all_values
         model.modelled[:] = np.diag(self.precision) > 0.0
         for i, name in enumerate(names):
             model.rests[i] = CHANNELS[name].rests
@@ -386,33 +395,44 @@ class HealthModel:
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Limits without those of statistics that earlier versions had: 23 C + 4 R of them at first, then 17 C + 3 R, now 7 C + R."""
+    """Limits of today's 7 C + R statistics from files of earlier versions, which had 23 C + 4 R or 17 C + 3 R."""
     forms = {
         23 * channels + 4 * relations: 7 * channels,
         17 * channels + 3 * relations: 5 * channels,
     }.get(len(limits))
     if forms is None:
         return tuple(limits)
-    given = np.array(limits)
+    former_limits = np.array(limits)
     times = 4 if forms == 7 * channels else 3
-    values, means = np.split(given[len(given) - 4 * channels - times * relations :], [4 * channels])
-    offsets = given[forms : forms + 4 * channels].reshape(channels, 4)[:, 2]
-    kept = [
-        given[channels : 2 * channels],
-        given[forms - channels : forms],
+    values, means = np.split(
+        former_limits[len(former_limits) - 4 * channels - times * relations :], [4 * channels]
+    )
+    offsets = former_limits[forms : forms + 4 * channels].reshape(channels, 4)[:, 2]
+    present_limits = [
+        former_limits[channels : 2 * channels],
+        former_limits[forms - channels : forms],
         offsets,
         values,
         means.reshape(relations, times)[:, 1],
     ]
-    return tuple(np.concatenate(kept).tolist())
+    return tuple(np.concatenate(present_limits).tolist())
 
 
 def health_rows(
     packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray
 ) -> Health:
-    """Judge rows (T, C), one at a time or all at once, to the same bits; they may hold anything where ``measured`` is false.
+    """Judge rows, one at a time or all at once, to the same bits.
 
-    ``packed`` is of `HealthModel.packed`; ``state`` of `HealthModel.start`, changed in place.
+    Parameters
+    ----------
+    packed : ndarray
+        Model as of `HealthModel.packed`.
+    rows : ndarray of shape (T, C)
+        Samples in SI units; any value where ``measured`` is false.
+    measured : ndarray of shape (T, C)
+        Whether a sample was accepted by the guard.
+    state : ndarray
+        As of `HealthModel.start`; changed in place.
     """
     out = np.empty((3, len(rows)))
     health_kernel(rows, measured, packed, state, out, _NO_STATISTICS)
@@ -435,11 +455,27 @@ def learn_health(
     channels: Sequence[str],
     rate_hz: float,
 ) -> HealthModel:
-    """Learn normal behaviour from drives at ``rate_hz``, without references: the training's limits count with those of validation.
+    """Learn the normal behaviour of channels from healthy drives, without references.
 
-    Single samples that stand apart from both neighbours are glitches of the recording and left out (`without_glitches`).
+    Single samples that differ from both neighbours are glitches of the recording and are left out
+    (`without_glitches`).
 
-    Raises `DataError`: a recording has another rate or lacks a channel, or there are too few samples.
+    Parameters
+    ----------
+    train : sequence of Recording
+        Determine relations, autoregression and ranges.
+    validation : sequence of Recording
+        Count for the limits of statistics, together with ``train``.
+    channels : sequence of str
+        In the order of the rows' columns.
+    rate_hz : float
+        Sampling rate of all recordings [Hz].
+
+    Raises
+    ------
+    DataError
+        A recording has another rate or lacks a channel, there are too few samples, or no channel can
+        be modelled.
     """
     names = tuple(channels)
     for recording in (*train, *validation):
@@ -460,7 +496,7 @@ def learn_health(
             f"health cannot be judged from {', '.join(names)} alone; it needs at least one of {', '.join(MODELLED)}"
         )
     relations = learn_relations(train, usable, rate_hz, least_speed)
-    order = max(1, min(MAX_ORDER, MOST_COEFFICIENTS // len(usable) ** 2))
+    order = max(1, min(MAX_ORDER, MAX_COEFFICIENTS // len(usable) ** 2))
     pieces = [
         residuals_of({name: recording[name] for name in usable}, usable, relations, least_speed)
         for recording in train
@@ -477,8 +513,10 @@ def learn_health(
     turning = (
         joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
     )
-    still = [min(size, 0.1 * largest.get(name, np.inf)) for name, size in STILL.items()]
-    found = HealthModel(
+    standstill_limits = [
+        min(size, 0.1 * largest.get(name, np.inf)) for name, size in STANDSTILL_LIMITS.items()
+    ]
+    health = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
         relations=tuple(relations),
@@ -492,7 +530,7 @@ def learn_health(
             max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz
             for name in names
         ),
-        standstill=(least_speed, still[0], still[1]),
+        standstill=(least_speed, standstill_limits[0], standstill_limits[1]),
         spin=(
             SPIN_MARGIN * largest.get("yaw_rate", 1e9),
             min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9),
@@ -501,7 +539,7 @@ def learn_health(
         levels=_plain(levels),
         stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
-    found = _with_healthy(_with_healthy(found, train), train)
+    health = _with_healthy(_with_healthy(health, train), train)
     filtered = [
         replace(
             recording,
@@ -515,16 +553,16 @@ def learn_health(
         )
         for recording in (*train, *validation)
     ]
-    plain, behind = (block_maxima(found, drives) for drives in ([*train, *validation], filtered))
-    statistics = found.statistics
+    plain, behind = (block_maxima(health, drives) for drives in ([*train, *validation], filtered))
+    statistics = health.statistics
     step = 1.0 / rate_hz
     limits = limits_from(plain, statistics, step)
     limits_behind = limits_from(np.maximum(plain, behind), statistics, step)
-    return replace(found, limits=limits, limits_behind_front_end=limits_behind)
+    return replace(health, limits=limits, limits_behind_front_end=limits_behind)
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:
-    """The autoregression as one of all channels, those that it does not hold being zero in it."""
+    """The autoregression extended to all channels, with zeros for those that it does not model."""
     places = [names.index(name) for name in usable]
     n = len(names)
     constant = np.zeros(n)
@@ -549,7 +587,7 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """With the offset that the likelihood ratio finds over all of training, and `HEAVIEST` times its mean weight."""
+    """Add the mean offset of each channel by the likelihood ratio over all drives, and the largest weight of a sample."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
@@ -559,17 +597,17 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
         state, _ = views(State, memory, model.layout)
         total += state.ratio_sum
         weight += state.ratio_weight
-    found = total / np.maximum(weight, 1e-300)
-    heaviest = HEAVIEST * weight / sum(len(recording) for recording in recordings)
-    return replace(model, healthy=(_plain(found),), heaviest=(_plain(heaviest),))
+    mean_offset = total / np.maximum(weight, 1e-300)
+    heaviest = MAX_RELATIVE_WEIGHT * weight / sum(len(recording) for recording in recordings)
+    return replace(model, healthy=(_plain(mean_offset),), heaviest=(_plain(heaviest),))
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
-    """Largest value of each statistic in blocks of `BLOCK_SECONDS`, (B, K), while nothing limits any."""
+    """Largest value of each of K statistics in B blocks of `BLOCK_SECONDS`, without limits, shape (B, K)."""
     packed = replace(model, limits=()).packed()
     n_statistics = len(model.statistics)
     length = max(round(BLOCK_SECONDS * model.rate_hz), 1)
-    found = []
+    maxima = []
     for recording in recordings:
         state = model.start()
         samples = np.ascontiguousarray(recording.stack(model.channels))
@@ -579,71 +617,115 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
             health_kernel(
                 part, np.isfinite(part), packed, state, np.empty((3, len(part))), statistics
             )
-            found.append(statistics.max(0))
-    return np.array(found)
+            maxima.append(statistics.max(0))
+    return np.array(maxima)
 
 
 def margin(seconds: float, healthy_seconds: float) -> float:
-    """Factor between the largest value of a statistic in ``healthy_seconds`` and the one that is exceeded about once in `HOURS`.
+    """Ratio of a limit to the largest value of a statistic in healthy drives.
 
-    The ratio of the largest of N normal values, √(2 ln N), one each ``seconds``, times `BETWEEN_DRIVES`.
+    The limit is exceeded about once in `HOURS_BETWEEN_FALSE_ALARMS`. The largest of N independent normal
+    values is about √(2 ln N), with one value in each ``seconds``. The ratio of both is multiplied by
+    `DAY_TO_DAY_FACTOR`.
+
+    Parameters
+    ----------
+    seconds : float
+        Time constant of the statistic [s].
+    healthy_seconds : float
+        Length of the healthy drives [s].
     """
-    seen, wanted = (max(time / seconds, LEAST_VALUES) for time in (healthy_seconds, 3600.0 * HOURS))
-    return BETWEEN_DRIVES * max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
+    n_healthy, n_allowed = (
+        max(time / seconds, MIN_INDEPENDENT_VALUES)
+        for time in (healthy_seconds, 3600.0 * HOURS_BETWEEN_FALSE_ALARMS)
+    )
+    return DAY_TO_DAY_FACTOR * max(math.sqrt(math.log(n_allowed) / math.log(n_healthy)), 1.0)
 
 
 def limits_from(
     maxima: FloatArray, statistics: Sequence[Statistic], step: float
 ) -> tuple[float, ...]:
-    """Limits of all K statistics from their largest values in blocks of healthy drives, (B, K), and the sampling interval ``step`` [s].
+    """Limits of all K statistics from healthy drives.
 
-    The largest value times `margin`, where blocks that stand apart from all others by a factor of `APART`, at most `MOST_APART` of them
-    and one from thirty blocks on, do not count: recordings hold faults of their own.
+    A limit is the largest value times `margin`. Blocks that exceed all others by `OUTLIER_FACTOR` are not
+    counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the blocks, and one
+    where there are thirty blocks or more.
+
+    Parameters
+    ----------
+    maxima : ndarray of shape (B, K)
+        Largest value of each statistic in each block, as of `block_maxima`.
+    statistics : sequence of Statistic
+        The K statistics.
+    step : float
+        Sampling interval [s].
     """
     ordered = np.sort(maxima, axis=0)[::-1]
-    set_aside = max(1, int(MOST_APART * len(maxima))) if len(maxima) >= 30 else 0
-    found = []
+    set_aside = max(1, int(MAX_OUTLIER_SHARE * len(maxima))) if len(maxima) >= 30 else 0
+    limits = []
     for column, statistic in zip(ordered.T, statistics, strict=True):
-        apart = [k for k in range(set_aside) if column[k] > APART * column[k + 1]]
-        top = float(column[apart[-1] + 1] if apart else column[0])
+        outlying_blocks = [
+            k for k in range(set_aside) if column[k] > OUTLIER_FACTOR * column[k + 1]
+        ]
+        top = float(column[outlying_blocks[-1] + 1] if outlying_blocks else column[0])
         limit = margin(max(statistic.seconds, step), BLOCK_SECONDS * len(maxima)) * top
         if (
             statistic.rule == "share"
         ):  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
-            limit = min(max(top + 0.15, LEAST_SHARE), 0.5 * (1.0 + min(top, 1.0)))
+            limit = min(max(top + 0.15, MIN_REPEATED_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
-            limit = BETWEEN_DRIVES
+            limit = DAY_TO_DAY_FACTOR
         else:
             limit = (
-                max(limit + 2.0, LEAST_RUN)
+                max(limit + 2.0, MIN_RUN_SAMPLES)
                 if statistic.rule == "run"
-                else max(limit, LEAST[statistic.rule])
+                else max(limit, MIN_LIMITS[statistic.rule])
             )
-        found.append(
+        limits.append(
             limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300
         )
-    return tuple(found)
+    return tuple(limits)
 
 
 def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDArray[np.int64]:
-    """Samples of a drive, channel -> (T,), outside the training's range, (C + 2,): of each channel, of any, and number of all."""
+    """Count the samples of a drive that are outside the range of the training.
+
+    Parameters
+    ----------
+    model : HealthModel
+        Of C channels.
+    samples : mapping
+        Channel -> (T,) in SI units.
+
+    Returns
+    -------
+    ndarray of shape (C + 2,)
+        Samples outside by each channel, samples outside by any, and T.
+    """
     sizes = [
         np.abs(np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0))
         for name in model.channels
     ]
     outside = [
-        size > BETWEEN_DRIVES * largest for size, largest in zip(sizes, model.largest, strict=True)
+        size > DAY_TO_DAY_FACTOR * largest
+        for size, largest in zip(sizes, model.largest, strict=True)
     ]
-    return np.array([*(own.sum() for own in outside), np.any(outside, axis=0).sum(), len(sizes[0])])
+    return np.array(
+        [
+            *(is_outside.sum() for is_outside in outside),
+            np.any(outside, axis=0).sum(),
+            len(sizes[0]),
+        ]
+    )
 
 
 def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
-    """One line on the share of a drive outside the training's range, and by which channels, of `outside_domain`; empty if there is none."""
+    """Describe the share of a drive outside the range of the training, by the counts of `outside_domain`; empty if there is none."""
     *numbers, outside, samples = counts.tolist()
     named = [
-        (own, f"|{name}| above {BETWEEN_DRIVES * largest:.3g} {CHANNELS[name].unit}")
-        for own, name, largest in zip(numbers, model.channels, model.largest, strict=True)
-        if own
+        (n_outside, f"|{name}| above {DAY_TO_DAY_FACTOR * largest:.3g} {CHANNELS[name].unit}")
+        for n_outside, name, largest in zip(numbers, model.channels, model.largest, strict=True)
+        if n_outside
     ]
     if not named:
         return ""

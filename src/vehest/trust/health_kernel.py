@@ -107,9 +107,9 @@ class Settings(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """A value of each statistic, in the order of `HealthModel.statistics`; ``every`` is all of them in one array."""
+    """A value of each statistic, in the order of `HealthModel.statistics`; ``all_values`` is all of them in one array."""
 
-    every: Annotated[FloatArray, "statistics"]
+    all_values: Annotated[FloatArray, "statistics"]
     jump: Annotated[FloatArray, "channels"]  # innovation against its energy in the last half second
     step: Annotated[FloatArray, "channels"]  # likelihood ratio of a step that began p samples ago
     offset: Annotated[FloatArray, "channels"]  # likelihood ratio
@@ -196,7 +196,7 @@ class State(NamedTuple):
         FloatArray, "relations"
     ]  # means of shown times expected, and of both squares
     expected_power: Annotated[FloatArray, "relations"]
-    shown_power: Annotated[FloatArray, "relations"]
+    observed_power: Annotated[FloatArray, "relations"]
     x: Annotated[FloatArray, "channels"]
     y: Annotated[FloatArray, "channels"]
     error: Annotated[FloatArray, "channels"]  # ε
@@ -225,18 +225,18 @@ def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ign
     model = open_views(Model, tables, open_views(Layout, tables, ()))
     state = open_views(State, memory, model.layout)
     for k in range(rows.shape[0]):
-        absent = _receive(k, rows, measured, model, state)
-        still = _describe(model, state)
+        missing_channel = _receive(k, rows, measured, model, state)
+        is_standing = _describe(model, state)
         _predict(model, state)
         _look_at_innovations(model, state)
         _look_for_offsets(model, state)
-        slow = _look_at_values(still, model, state)
-        _look_at_relations(still, model, state)
-        out[0, k], out[1, k], out[2, k] = _decide(absent, slow, model, state)
+        slow = _look_at_values(is_standing, model, state)
+        _look_at_relations(is_standing, model, state)
+        out[0, k], out[1, k], out[2, k] = _decide(missing_channel, slow, model, state)
         for j in range(
             statistics.shape[1] if statistics.shape[0] > 0 else 0
         ):  # a slice would compile for seconds
-            statistics[k, j] = state.statistics.every[j]
+            statistics[k, j] = state.statistics.all_values[j]
         _remember(model, state)
 
 
@@ -248,21 +248,21 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
     """
     first = state.rows[0] == 0.0
     longest = 0.0
-    absent = -1
+    missing_channel = -1
     for i in range(model.layout.channels):
         value = rows[k, i]
-        known = measured[k, i] and abs(value) <= PLAUSIBLE * model.largest[i]  # false for NaN
+        is_usable = measured[k, i] and abs(value) <= PLAUSIBLE * model.largest[i]  # false for NaN
         if first:
-            state.last[i] = value if known else model.usual[i]
-        if known:
-            same = (
+            state.last[i] = value if is_usable else model.usual[i]
+        if is_usable:
+            is_frozen = (
                 model.stops[0, i] < value < model.stops[1, i]
                 and value == state.last[i]
                 and not first
             )
-            state.run[i] = state.run[i] + 1.0 if same else 0.0
+            state.run[i] = state.run[i] + 1.0 if is_frozen else 0.0
             state.share[i] += model.settings.forget_share * (
-                (1.0 if same else 0.0) - state.share[i]
+                (1.0 if is_frozen else 0.0) - state.share[i]
             )
             state.last[i] = value
             state.gap[i] = (
@@ -270,12 +270,12 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
             )
         else:
             state.gap[i] = max(state.gap[i], 0.0) + 1.0
-            beyond = state.gap[i] - model.gap_limit[i]
-            if beyond > longest:
-                longest = beyond
-                absent = i
+            excess = state.gap[i] - model.gap_limit[i]
+            if excess > longest:
+                longest = excess
+                missing_channel = i
         state.x[i] = state.last[i]
-    return absent
+    return missing_channel
 
 
 @part()
@@ -387,11 +387,13 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
             if state.gap[i] > 0.0 and state.rows[0] >= p:
                 state.y[i] = state.error[i]
             state.error[i] = 0.0
-        own = state.error[i] / state.level[i]
+        scaled_error = state.error[i] / state.level[i]
         deviation = model.deviation[i]
-        state.scaled[i] = own
-        state.clipped[i] = min(max(own, -CLIP * deviation), CLIP * deviation)
-        state.innovation[0, i] = min(max(own, -STEP_CLIP * deviation), STEP_CLIP * deviation)
+        state.scaled[i] = scaled_error
+        state.clipped[i] = min(max(scaled_error, -CLIP * deviation), CLIP * deviation)
+        state.innovation[0, i] = min(
+            max(scaled_error, -STEP_CLIP * deviation), STEP_CLIP * deviation
+        )
     for i in range(C):
         score = 0.0
         clipped = 0.0
@@ -410,17 +412,17 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
     """Jumps out of what has been usual for half a second."""
-    found = state.statistics
+    statistics = state.statistics
     for i in range(model.layout.channels):
         z = (
             abs(state.score[i]) / math.sqrt(model.precision[i, i])
             if model.modelled[i] == 1
             else 0.0
         )
-        state.ratio[i], found.jump[i] = z, z / math.sqrt(CALM + state.energy[i])
+        state.ratio[i], statistics.jump[i] = z, z / math.sqrt(CALM + state.energy[i])
         if i == model.layout.yaw_rate:
             state.since_jump[0] = (
-                0.0 if found.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
+                0.0 if statistics.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
             )
         normed = state.innovation[0, i] / model.deviation[i]
         state.energy[i] += model.settings.forget_energy * (normed * normed - state.energy[i])
@@ -449,10 +451,10 @@ def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
     power = 0.0
     for m in range(C):
         if state.slope[m] != 0.0:
-            own = state.slope[m] / state.level[m]
-            step += own * state.stepped[m]
+            slope = state.slope[m] / state.level[m]
+            step += slope * state.stepped[m]
             for j in range(C):
-                power += own * model.step_power[m, j] * state.slope[j] / state.level[j]
+                power += slope * model.step_power[m, j] * state.slope[j] / state.level[j]
     state.statistics.step[i] = abs(step) / math.sqrt(power) if counts and power > 0.0 else 0.0
 
 
@@ -488,7 +490,7 @@ def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
 def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
     """Steps and offsets of each channel."""
     C = model.layout.channels
-    found = state.statistics.offset
+    offset_statistics = state.statistics.offset
     highest = 0.0
     for i in range(C):
         _slope(i, model, state)
@@ -499,35 +501,35 @@ def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
         )
         _look_for_step(i, counts, model, state)
         _look_for_offset(i, counts, model, state)
-        highest = max(highest, found[i] * model.inverse.offset[i])
+        highest = max(highest, offset_statistics[i] * model.inverse.offset[i])
     if highest > CAP:  # all alike, so that they still compare with each other
         for i in range(C):
-            found[i] *= CAP / highest
+            offset_statistics[i] *= CAP / highest
             state.ratio_sum[i] *= CAP / highest
 
 
 @part()
-def _look_at_values(still, model, state):  # type: ignore[no-untyped-def]
+def _look_at_values(is_standing, model, state):  # type: ignore[no-untyped-def]
     """Runs and shares of equal samples, range, slip; returns how many wheels are slow."""
     slow = 0
-    found = state.statistics
+    statistics = state.statistics
     fast = abs(_value(state, model.layout.speed)) > model.settings.least_speed
     for i in range(model.layout.channels):
-        quiet = still or model.rests[i] == 1
-        found.run[i] = 0.0 if quiet else state.run[i]
-        found.share[i] = 0.0 if quiet else state.share[i]
-        found.domain[i] = abs(state.x[i]) / model.largest[i]
-        found.slip[i] = 0.0
+        quiet = is_standing or model.rests[i] == 1
+        statistics.run[i] = 0.0 if quiet else state.run[i]
+        statistics.share[i] = 0.0 if quiet else state.share[i]
+        statistics.domain[i] = abs(state.x[i]) / model.largest[i]
+        statistics.slip[i] = 0.0
         expected = state.x[i] - state.y[i]
         if model.wheel[i] == 1 and state.gap[i] <= 0.0 and fast and expected != 0.0:
             slip = 1.0 - state.x[i] / expected
-            found.slip[i] = abs(slip)
+            statistics.slip[i] = abs(slip)
             slow += 1 if slip > SLIPPING else 0
     return slow
 
 
 @part()
-def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
+def _look_at_relations(is_standing, model, state):  # type: ignore[no-untyped-def]
     """Means of the residuals of relations; that of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f."""
     u = _value(state, model.layout.speed)
     step = model.settings.step
@@ -548,27 +550,27 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         left = target
         small = 0.0
         for f in range(N_FEATURES):
-            own = model.average[j, f] * state.feature[f]
-            left -= own
-            small += own if f >= FIRST_SMALL else 0.0
-        if still:
+            term = model.average[j, f] * state.feature[f]
+            left -= term
+            small += term if f >= FIRST_SMALL else 0.0
+        if is_standing:
             left = 0.0
             small = 0.0
-        gain = 0.0 if still else model.rate_gain[j]
+        gain = 0.0 if is_standing else model.rate_gain[j]
         if complete:
             state.left[j] += short * (
                 left + small - state.left[j]
             )  # a fault of r or ay is no sign or unit of ax
             state.smooth[j] += short * (target - state.smooth[j])
-        shown = state.smooth[j]
+        observed = state.smooth[j]
         expected = (
-            shown
+            observed
             - state.left[j]
             + gain * (u - state.mean_speed[0]) * short / ((1.0 - short) * step)
         )
-        state.product[j] += longer * (shown * expected - state.product[j])
+        state.product[j] += longer * (observed * expected - state.product[j])
         state.expected_power[j] += longer * (expected * expected - state.expected_power[j])
-        state.shown_power[j] += longer * (shown * shown - state.shown_power[j])
+        state.observed_power[j] += longer * (observed * observed - state.observed_power[j])
         if complete:
             state.average[j] += longer * (left - state.average[j])
         change = gain * (u - state.mean_speed[1]) * longer / ((1.0 - longer) * step)
@@ -583,12 +585,12 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
     """Kind, channel and partner of the weightiest statistic beyond its limit, and the largest statistic over its limit."""
-    every = state.statistics.every
+    values = state.statistics.all_values
     highest = 0.0
     weightiest = -1.0
     best = -1
-    for m in range(len(every)):
-        over = every[m] * model.inverse.every[m]
+    for m in range(len(values)):
+        over = values[m] * model.inverse.all_values[m]
         highest = max(highest, over)
         if over >= 1.0:
             weight = model.priority[m] + 0.5 * over / (1.0 + over)
@@ -607,7 +609,7 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
         C = model.layout.channels
         likeliest = -1.0
         for i in range(C):
-            ratio = state.ratio[i] if best < C else every[best // C * C + i]
+            ratio = state.ratio[i] if best < C else values[best // C * C + i]
             if ratio > likeliest:
                 likeliest = ratio
                 channel = i
@@ -623,7 +625,7 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
+def _decide(missing_channel, slow, model, state):  # type: ignore[no-untyped-def]
     """Status and reason from all statistics, and the largest of these over its limit."""
     layout = model.layout
     settings = model.settings
@@ -645,12 +647,14 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
         kind = SPIN
         channel = layout.yaw_rate
         partner = -1
-    if absent >= 0:
+    if missing_channel >= 0:
         level = (
-            2.0 if state.gap[absent] - model.gap_limit[absent] > layout.bridged else max(level, 1.0)
+            2.0
+            if state.gap[missing_channel] - model.gap_limit[missing_channel] > layout.bridged
+            else max(level, 1.0)
         )
         kind = MISSING
-        channel = absent
+        channel = missing_channel
         partner = -1
     reason = 0.0
     if level > 0.0:
@@ -682,15 +686,15 @@ def _relation_kind(j, model, state):  # type: ignore[no-untyped-def]
     """Of the last second: `FREE` if a relation holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small."""
     product = state.product[j]
     expected = state.expected_power[j]
-    shown = state.shown_power[j]
+    observed_power = state.observed_power[j]
     roof = model.limits.relation[j]
-    if max(expected, shown) < roof * roof:
+    if max(expected, observed_power) < roof * roof:
         return -1
-    if expected > LARGER * LARGER * shown or shown > LARGER * LARGER * expected:
+    if expected > LARGER * LARGER * observed_power or observed_power > LARGER * LARGER * expected:
         return UNIT
-    if product < REVERSED * math.sqrt(expected * shown):
+    if product < REVERSED * math.sqrt(expected * observed_power):
         return SIGN
-    return FREE if product > HOLDS * math.sqrt(expected * shown) else -1
+    return FREE if product > HOLDS * math.sqrt(expected * observed_power) else -1
 
 
 @part()
@@ -704,18 +708,20 @@ def _contradiction(model, state):  # type: ignore[no-untyped-def]
     kind = FREE
     failed = -1
     for j in range(model.layout.relations):
-        found = _relation_kind(j, model, state)
-        if found > FREE:
+        relation_kind = _relation_kind(j, model, state)
+        if relation_kind > FREE:
             failed = j if failed < 0 else failed
-            kind = found if kind in (FREE, found) else UNIT
+            kind = relation_kind if kind in (FREE, relation_kind) else UNIT
     if failed < 0:
         return FREE, 0, -1
     for i in range(model.layout.channels):
         explains = True
         for j in range(model.layout.relations):
-            found = _relation_kind(j, model, state)
+            relation_kind = _relation_kind(j, model, state)
             involved = model.involved[j, i]
-            if (found > FREE and involved == 0) or (found == FREE and involved == 1):
+            if (relation_kind > FREE and involved == 0) or (
+                relation_kind == FREE and involved == 1
+            ):
                 explains = False
         if explains:
             suspects = suspects + 1

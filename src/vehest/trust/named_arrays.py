@@ -3,7 +3,7 @@
     fields with shapes + sizes -> views (Python), open_views (compiled)
 
 A field is declared in one place, as ``past_x: Annotated[FloatArray, "order channels"]``: the words are sizes, or numbers. Fields that are
-``int`` or ``float`` are scalars, and a field ``every`` holds all that follow it. A kernel receives the flat array, since handing over
+``int`` or ``float`` are scalars, and a field ``all_values`` holds all that follow it. A kernel receives the flat array, since handing over
 eighty arrays one by one takes longer than a row.
 """
 
@@ -22,37 +22,39 @@ from numba.np.arrayobj import make_array, populate_array
 
 from vehest.constants import FloatArray
 
+ALL_VALUES = "all_values"
+"""Field that has the values of all fields after it, in one array."""
 SCALARS = {int: np.int64, float: np.float64}
 
 
 @cache
 def _fields(kind: Any) -> dict[str, Any]:
     """Field -> a named tuple, or data type and shape, which is None of a scalar."""
-    found: dict[str, Any] = {}
+    declared_fields: dict[str, Any] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if hasattr(hint, "_fields"):
-            found[name] = hint
+            declared_fields[name] = hint
         elif hint in SCALARS:
-            found[name] = SCALARS[hint], None
+            declared_fields[name] = SCALARS[hint], None
         else:
             array, shape = get_args(hint)
-            found[name] = np.float64 if array == FloatArray else np.int64, shape.split()
-    return found
+            declared_fields[name] = np.float64 if array == FloatArray else np.int64, shape.split()
+    return declared_fields
 
 
 def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any, int]:
     """Views of a flat array from ``begin`` on, scalars as arrays without dimensions, and the place behind the last."""
-    found = {}
-    for name, own in _fields(kind).items():
-        if hasattr(own, "_fields"):
-            found[name], begin = views(own, flat, sizes, begin)
+    arrays = {}
+    for name, declared in _fields(kind).items():
+        if hasattr(declared, "_fields"):
+            arrays[name], begin = views(declared, flat, sizes, begin)
             continue
-        dtype, words = own
+        dtype, words = declared
         shape = [int(word) if word.isdigit() else getattr(sizes, word) for word in words or ()]
         end = begin + math.prod(shape)
-        found[name] = flat[begin:end].view(dtype).reshape(shape)
-        begin = begin if name == "every" else end
-    return kind(**found), begin
+        arrays[name] = flat[begin:end].view(dtype).reshape(shape)
+        begin = begin if name == ALL_VALUES else end
+    return kind(**arrays), begin
 
 
 def allocated(kind: Any, sizes: Any) -> FloatArray:
@@ -71,74 +73,76 @@ class Views(types.Type):  # type: ignore[misc]
 
 @register_model(Views)
 class _Model(models.StructModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, own: Views) -> None:
-        super().__init__(manager, own, [("data", types.voidptr), ("sizes", own.sizes)])
+    def __init__(self, manager: Any, view_type: Views) -> None:
+        super().__init__(manager, view_type, [("data", types.voidptr), ("sizes", view_type.sizes)])
 
 
-def _compiled_type(own: Any, sizes: Any) -> Any:
+def _compiled_type(field_type: Any, sizes: Any) -> Any:
     """Type of a field, or of a named tuple, in compiled code; one of scalars is a tuple of numbers."""
-    if hasattr(own, "_fields"):
-        inner = [_compiled_type(field, sizes) for field in _fields(own).values()]
+    if hasattr(field_type, "_fields"):
+        inner = [_compiled_type(field, sizes) for field in _fields(field_type).values()]
         return (
-            types.BaseTuple.from_types(inner, own)
+            types.BaseTuple.from_types(inner, field_type)
             if set(inner) <= {types.int64, types.float64}
-            else Views(own, sizes)
+            else Views(field_type, sizes)
         )
-    scalar = types.int64 if own[0] is np.int64 else types.float64
-    return scalar if own[1] is None else types.Array(scalar, len(own[1]), "C")
+    scalar = types.int64 if field_type[0] is np.int64 else types.float64
+    return scalar if field_type[1] is None else types.Array(scalar, len(field_type[1]), "C")
 
 
 @infer_getattr
 class _Attributes(AttributeTemplate):  # type: ignore[misc]
     key = Views
 
-    def generic_resolve(self, own: Views, name: str) -> Any:
-        return _compiled_type(_fields(own.kind)[name], own.sizes)
+    def generic_resolve(self, view_type: Views, name: str) -> Any:
+        return _compiled_type(_fields(view_type.kind)[name], view_type.sizes)
 
 
 @lower_getattr_generic(Views)  # type: ignore[untyped-decorator]
-def _opened_field(context: Any, builder: Any, own: Views, value: Any, name: str) -> Any:
-    proxy = context.make_helper(builder, own, value)
-    whole = partial(context.get_constant, types.intp)
+def _opened_field(context: Any, builder: Any, view_type: Views, value: Any, name: str) -> Any:
+    proxy = context.make_helper(builder, view_type, value)
+    integer = partial(context.get_constant, types.intp)
 
     def lengths(declared: Any) -> list[Any]:
         words = declared[1] or ()
         return [
-            whole(int(w))
+            integer(int(w))
             if w.isdigit()
-            else builder.extract_value(proxy.sizes, own.sizes.fields.index(w))
+            else builder.extract_value(proxy.sizes, view_type.sizes.fields.index(w))
             for w in words
         ]
 
     def numbers(declared: Any) -> Any:
         """How many a field has."""
         if not hasattr(declared, "_fields"):
-            return reduce(builder.mul, lengths(declared), whole(1))
+            return reduce(builder.mul, lengths(declared), integer(1))
         return reduce(
             builder.add,
-            (numbers(inner) for field, inner in _fields(declared).items() if field != "every"),
-            whole(0),
+            (numbers(inner) for field, inner in _fields(declared).items() if field != ALL_VALUES),
+            integer(0),
         )
 
-    fields = _fields(own.kind)
+    fields = _fields(view_type.kind)
     before = [
         numbers(fields[field])
         for field in list(fields)[: list(fields).index(name)]
-        if field != "every"
+        if field != ALL_VALUES
     ]
-    data = builder.gep(proxy.data, [builder.mul(reduce(builder.add, before, whole(0)), whole(8))])
-    of = _compiled_type(fields[name], own.sizes)
+    data = builder.gep(
+        proxy.data, [builder.mul(reduce(builder.add, before, integer(0)), integer(8))]
+    )
+    of = _compiled_type(fields[name], view_type.sizes)
     if not isinstance(of, types.Array):
         return _loaded(context, builder, of, data, proxy.sizes)
     array = make_array(of)(context, builder)
     shape = lengths(fields[name])
-    strides = list(accumulate(reversed(shape[1:]), builder.mul, initial=whole(8)))[::-1]
+    strides = list(accumulate(reversed(shape[1:]), builder.mul, initial=integer(8)))[::-1]
     populate_array(
         array,
         builder.bitcast(data, context.get_value_type(of.dtype).as_pointer()),
         shape,
         strides,
-        whole(8),
+        integer(8),
         None,
     )
     return array._getvalue()
@@ -161,10 +165,10 @@ def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-de
 def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
     """Views, a tuple of numbers or a number that begins at ``data``."""
     if isinstance(of, Views):
-        own = context.make_helper(builder, of)
-        own.data = data
-        own.sizes = sizes
-        return own._getvalue()
+        opened = context.make_helper(builder, of)
+        opened.data = data
+        opened.sizes = sizes
+        return opened._getvalue()
     if isinstance(of, types.BaseTuple):
         places = [
             builder.gep(data, [context.get_constant(types.intp, 8 * at)]) for at in range(len(of))
@@ -172,7 +176,10 @@ def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
         return context.make_tuple(
             builder,
             of,
-            [_loaded(context, builder, own, at, sizes) for own, at in zip(of, places, strict=True)],
+            [
+                _loaded(context, builder, inner_type, at, sizes)
+                for inner_type, at in zip(of, places, strict=True)
+            ],
         )
     return builder.load(builder.bitcast(data, context.get_value_type(of).as_pointer()))
 

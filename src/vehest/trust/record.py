@@ -58,11 +58,11 @@ class Trust:
                 ("health.channels", self.health.channels, expected[1]),
                 ("health.rate_hz", self.health.rate_hz, expected[2]),
             ]
-        for name, value, needed in differences:
-            if value != needed:
+        for name, value, expected_value in differences:
+            if value != expected_value:
                 raise DataError(
-                    f"{TRUST} belongs to another model: its {name} is {_shown(value)}, that of the "
-                    f"model is {_shown(needed)}; calibrate the model again, or remove {TRUST}"
+                    f"{TRUST} belongs to another model: its {name} is {_abbreviated(value)}, that of the "
+                    f"model is {_abbreviated(expected_value)}; calibrate the model again, or remove {TRUST}"
                 )
 
     def for_settings(self, estimator: Estimator) -> Trust:
@@ -127,15 +127,15 @@ def describe_band(
     cars = ", ".join(names) or ("a car without a name" if bands.vehicles else "many cars")
     basis = f"calibrated on recordings of {cars} ({datasets})"
     if same_vehicle is not None:
-        which = "the same car" if same_vehicle else "another car: band doubled"
-        return f"{basis}; this one is of {which}, as same_vehicle says"
+        answer = "the same car" if same_vehicle else "another car: band doubled"
+        return f"{basis}; this one is of {answer}, as same_vehicle says"
     if difference := bands.difference_to(car):
         remedy = "if it is the same, correct car of the data set, or give same_vehicle=true"
         return f"{basis}; this one is of another car ({difference}): band doubled; {remedy}"
     if is_other_vehicle(trust, vehicle):
         remedy = "if it is the same, give same_vehicle=true, or its name as vehicle of the data set"
-        which = "assumed to be of" if vehicle == UNNAMED_VEHICLE else f"of '{vehicle}',"
-        return f"{basis}; this one is {which} another car: band doubled; {remedy}"
+        answer = "assumed to be of" if vehicle == UNNAMED_VEHICLE else f"of '{vehicle}',"
+        return f"{basis}; this one is {answer} another car: band doubled; {remedy}"
     if names and vehicle in bands.vehicles:
         return f"{basis}; this one is of the same car, by its name"
     remedy = "if it is another, give same_vehicle=false, which doubles the band"
@@ -175,7 +175,7 @@ def read_trust(folder: Path) -> Trust:
         raise DataError(str(error) if str(path) in str(error) else f"'{path}': {error}") from None
 
 
-def _shown(value: object) -> str:
+def _abbreviated(value: object) -> str:
     """A value in a message, short."""
     text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
     return text if len(text) <= 80 else f"{text[:80]} …"

@@ -125,36 +125,36 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
     """Target, partner, features and whether it holds at each instant, of every relation that these channels allow."""
     speed = speed_channel(channels)
     has = set(channels)
-    found: list[tuple[str, str, tuple[str, ...], bool]] = []
+    declared: list[tuple[str, str, tuple[str, ...], bool]] = []
     if speed is None:
-        return found
+        return declared
     if {"ay", "yaw_rate"} <= has:
-        found.append(("ay", "yaw_rate", ("u r", "1"), True))
+        declared.append(("ay", "yaw_rate", ("u r", "1"), True))
     for angle in ("steer", "handwheel"):
         if angle in has and "yaw_rate" in has:
-            found.append((angle, "yaw_rate", ("r/u", "u r", "(u r)³/100", "1"), True))
+            declared.append((angle, "yaw_rate", ("r/u", "u r", "(u r)³/100", "1"), True))
         if angle in has and "ay" in has:
-            found.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
+            declared.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
     if "ax" in has:
         slide = (SLIDE,) if {"ay", "yaw_rate"} <= has else ()
-        found.append(
+        declared.append(
             ("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False)
         )
     for wheel in channels:
         if wheel.startswith(("wheel_speed", "motor_speed")) and wheel != speed:
-            found.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
-    return found
+            declared.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
+    return declared
 
 
 def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[str, FloatArray]:
     """Feature -> (T,), of channels as they are measured; those that need a channel that is not there are of zeros."""
-    some = next(iter(samples.values()))
+    any_samples = next(iter(samples.values()))
     speed = speed_channel(list(samples))
-    r, ay, ax = (samples.get(name, np.zeros_like(some)) for name in ("yaw_rate", "ay", "ax"))
-    u = samples[speed] if speed else np.zeros_like(some)
+    r, ay, ax = (samples.get(name, np.zeros_like(any_samples)) for name in ("yaw_rate", "ay", "ax"))
+    u = samples[speed] if speed else np.zeros_like(any_samples)
     w = np.maximum(np.abs(u), least_speed)
     values = (
-        np.ones_like(some),
+        np.ones_like(any_samples),
         r,
         u,
         u * r,
@@ -183,12 +183,12 @@ def without_spikes(samples: FloatArray) -> FloatArray:
     """NaN for single samples, glitches of the recording, whose second difference exceeds ten times its 99.9 % quantile."""
     if len(samples) < LEAST_ROWS:
         return samples
-    apart = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
-    known = apart[np.isfinite(apart)]
-    if not len(known):
+    deviation = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
+    finite_deviation = deviation[np.isfinite(deviation)]
+    if not len(finite_deviation):
         return samples
-    alone = apart > 10.0 * max(float(np.quantile(known, 0.999)), 1e-12)
-    back = np.abs(samples[2:] - samples[:-2]) < 0.5 * apart
+    alone = deviation > 10.0 * max(float(np.quantile(finite_deviation, 0.999)), 1e-12)
+    back = np.abs(samples[2:] - samples[:-2]) < 0.5 * deviation
     clean = np.array(samples)
     clean[1:-1][alone & back] = np.nan
     return clean
@@ -196,10 +196,10 @@ def without_spikes(samples: FloatArray) -> FloatArray:
 
 def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording:
     """These channels of a drive, NaN where a single sample is a glitch."""
-    own = recording.select(channels)
-    clean = {name: without_spikes(samples) for name, samples in own.channels.items()}
+    selected = recording.select(channels)
+    clean = {name: without_spikes(samples) for name, samples in selected.channels.items()}
     return replace(
-        own,
+        selected,
         channels=clean,
         gappy=frozenset(name for name in channels if np.isnan(clean[name]).any()),
     )
@@ -243,61 +243,68 @@ def learn_relations(
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
     parts = []
-    used = []
+    usable_rows = []
     for recording in recordings:
-        own = {name: _held(recording[name]) for name in channels}
-        known = np.isfinite(recording.stack(channels)).all(1)
+        filled = {name: _fill_gaps(recording[name]) for name in channels}
+        is_usable = np.isfinite(recording.stack(channels)).all(1)
         columns = {
-            **features_of(own, least_speed),
-            **{f"channel {name}": own[name] for name in channels},
+            **features_of(filled, least_speed),
+            **{f"channel {name}": filled[name] for name in channels},
         }
         if speed:
-            known &= np.abs(own[speed]) >= least_speed
-            columns[RATE] = np.concatenate([[0.0], np.diff(own[speed])]) * rate_hz
+            is_usable &= np.abs(filled[speed]) >= least_speed
+            columns[RATE] = np.concatenate([[0.0], np.diff(filled[speed])]) * rate_hz
         parts.append(columns)
-        used.append(known)
+        usable_rows.append(is_usable)
 
     def smoothed(name: str) -> FloatArray:
-        pairs = [(part[name], known) for part, known in zip(parts, used, strict=True)]
+        pairs = [
+            (part[name], is_usable) for part, is_usable in zip(parts, usable_rows, strict=True)
+        ]
         low_pass = partial(scipy.signal.lfilter, [forget], [1.0, forget - 1.0])
         return np.concatenate(
-            [low_pass(values, zi=[(1.0 - forget) * values[0]])[0][known] for values, known in pairs]
+            [
+                low_pass(values, zi=[(1.0 - forget) * values[0]])[0][is_usable]
+                for values, is_usable in pairs
+            ]
         )
 
     joined = {name: smoothed(name) for name in parts[0]}
-    found: list[Relation] = []
+    relations: list[Relation] = []
     for target, partner, features, instant in relations_among(channels):
         if SLIDE in features:
             for part in parts:
                 part[SLIDE] = (
-                    slide_of(part, found[0], rate_hz) if found else np.zeros_like(part["r"])
+                    slide_of(part, relations[0], rate_hz) if relations else np.zeros_like(part["r"])
                 )
             joined[SLIDE] = smoothed(SLIDE)
         free = [name for name in features if name != SLIDE]
-        wanted = joined[f"channel {target}"] + (joined[SLIDE] if SLIDE in features else 0.0)
-        if len(wanted) >= LEAST_ROWS:
+        target_values = joined[f"channel {target}"] + (joined[SLIDE] if SLIDE in features else 0.0)
+        if len(target_values) >= LEAST_ROWS:
             terms = dict(
                 zip(
                     free,
-                    _robust(np.stack([joined[name] for name in free], axis=1), wanted).tolist(),
+                    _robust(
+                        np.stack([joined[name] for name in free], axis=1), target_values
+                    ).tolist(),
                     strict=True,
                 )
             )
-            found.append(
+            relations.append(
                 Relation(
                     target, partner, terms | ({SLIDE: -1.0} if SLIDE in features else {}), instant
                 )
             )
-    return found
+    return relations
 
 
-def _held(samples: FloatArray) -> FloatArray:
+def _fill_gaps(samples: FloatArray) -> FloatArray:
     """The last measured value where there is none, the first one before it."""
-    known = np.flatnonzero(np.isfinite(samples))
-    if not len(known):
+    finite_places = np.flatnonzero(np.isfinite(samples))
+    if not len(finite_places):
         return np.zeros_like(samples)
-    place = np.maximum(np.searchsorted(known, np.arange(len(samples)), side="right") - 1, 0)
-    return samples[known[place]]
+    place = np.maximum(np.searchsorted(finite_places, np.arange(len(samples)), side="right") - 1, 0)
+    return samples[finite_places[place]]
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:

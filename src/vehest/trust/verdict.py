@@ -79,7 +79,7 @@ class Monitor:
         self.largest_vy = bands.largest.get("vy", 0.0) if bands is not None else 0.0
         self.channel_numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
-        self._needed = ~self._skippable
+        self._required = ~self._skippable
         self.starts_anew = starts_anew(estimator)
         self.adapts = bool(getattr(estimator, "adapts", False))
         self.persistent_steps = max(round(PERSISTENT_FAULT_SECONDS * estimator.settings.rate_hz), 1)
@@ -89,10 +89,10 @@ class Monitor:
         """Health of rows (T, C) as received; in ``cleaned``, accused channels are taken out and restarts added, in place."""
         if self.packed_health is None:
             return Health(*np.zeros((3, len(received))))
-        found = health_rows(self.packed_health, received, cleaned.measured, self._state)
+        health = health_rows(self.packed_health, received, cleaned.measured, self._state)
         isolate_rows(
-            found.status,
-            found.reason,
+            health.status,
+            health.reason,
             self.channel_numbers,
             self._skippable,
             self.starts_anew,
@@ -101,7 +101,7 @@ class Monitor:
             *cleaned,
             self._fault,
         )
-        return found
+        return health
 
     def after(
         self,
@@ -123,7 +123,7 @@ class Monitor:
             watched.marks,
             cleaned.flow,
             cleaned.measured,
-            self._needed,
+            self._required,
             self.channel_numbers,
             verdict.status,
             verdict.reason,
@@ -163,16 +163,16 @@ def isolate_rows(  # type: ignore[no-untyped-def]
         status, reason: of health, (T,).
         numbers, skippable: of the channels: number in a code, whether the estimator can do without it, (C,).
         starts_anew: whether the estimator does after a persistent fault.
-        adapts: whether it has adapting states, which go back to fitted values while a needed channel is accused.
+        adapts: whether it has adapting states, which go back to fitted values while a required channel is accused.
         persistent_steps: samples of accusation after which a fault is persistent.
-        state: samples at which any channel was accused since health was last valid, and at which a needed one was, (2,).
+        state: samples at which any channel was accused since health was last valid, and at which a required one was, (2,).
     """
     for k in range(rows.shape[0]):
         kind = int(reason[k]) // 10000
         channel = int(reason[k]) % 10000 // 100
         at_fault = status[k] == INVALID
-        for other in NO_FAULTS:
-            at_fault = at_fault and kind != other
+        for no_fault in NO_FAULTS:
+            at_fault = at_fault and kind != no_fault
         if at_fault:
             state[0] += 1.0
             needs = True
@@ -193,28 +193,28 @@ def isolate_rows(  # type: ignore[no-untyped-def]
 
 
 @entry(nogil=True)
-def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  # type: ignore[no-untyped-def]
+def verdict_rows(vy, marks, flow, measured, required, numbers, status, reason):  # type: ignore[no-untyped-def]
     """Add the findings of guard (``flow``, ``measured``) and watch (``vy``, ``marks``) to ``status, reason`` of health, in place.
 
-    ``needed`` are channels that the estimator cannot do without, ``numbers`` those in codes, (C,).
+    ``required`` are channels that the estimator cannot do without, ``numbers`` those in codes, (C,).
     """
     for k in range(vy.shape[0]):
-        found = int(status[k])
+        status_of_row = int(status[k])
         why = int(reason[k])
         for c in range(measured.shape[1]):
-            if needed[c] and not measured[k, c] and why == 0:
-                found = max(found, DEGRADED)
+            if required[c] and not measured[k, c] and why == 0:
+                status_of_row = max(status_of_row, DEGRADED)
                 why = kernel.MISSING * 10000 + numbers[c] * 100
-        if marks[k] & SPINNING and found == VALID:
-            found = DEGRADED
+        if marks[k] & SPINNING and status_of_row == VALID:
+            status_of_row = DEGRADED
             why = kernel.SPIN * 10000
         if marks[k] & CLIPPED:
-            found = INVALID
+            status_of_row = INVALID
             why = BEYOND_SPEED * 10000 if why == 0 else why
         if marks[k] & EXTRAPOLATED or flow[k] == WAIT or not math.isfinite(vy[k]):
-            found = INVALID
+            status_of_row = INVALID
             why = NO_ESTIMATE * 10000 if why == 0 else why
-        status[k] = found
+        status[k] = status_of_row
         reason[k] = why
 
 
