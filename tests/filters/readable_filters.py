@@ -22,12 +22,12 @@ def sigma_points(rule, mean, factor):
 
 def mean_of(rule, values):
     """Weighted mean of values at the points, (2n + 1, m) -> (m,)."""
-    return rule.centre_mean * values[0] + rule.other * values[1:].sum(0)
+    return rule.centre_mean * values[0] + rule.outer_weight * values[1:].sum(0)
 
 
 def covariance_of(rule, deviations, others):
     """Weighted Σ w d eᵀ of deviations from the mean, (2n + 1, m) and (2n + 1, k) -> (m, k)."""
-    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.other * (
+    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.outer_weight * (
         deviations[1:].mT @ others[1:]
     )
 

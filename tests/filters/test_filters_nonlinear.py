@@ -104,8 +104,8 @@ def test_rules_are_those_of_an_independent_library():
             rule, torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance))
         )
         assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
-        assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
-        assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)
+        assert [rule.centre_mean, *[rule.outer_weight] * 6] == pytest.approx(known.Wm)
+        assert [rule.centre_covariance, *[rule.outer_weight] * 6] == pytest.approx(known.Wc)
 
 
 @pytest.mark.parametrize("name", [*RULES, "extended"])

@@ -25,7 +25,7 @@ class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
 
     is_compiled = True
-    kept = 4
+    scratch_rows = 4
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
