@@ -37,7 +37,7 @@ from vehest.vehicle.dynamics import (
     TyreNetworkCar,
     physical_of,
 )
-from vehest.vehicle.tyres import STILL
+from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
 
 BLOCK = 110  # points at a time
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
@@ -84,7 +84,7 @@ class CompiledPlanarCar(PointModel):
         self.lower = lower
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
-        numbers = [*known, step, TURN, UNSCALED, STILL, flat, GRAVITY]
+        numbers = [*known, step, TURN, UNSCALED, SLIP_SPEED_OFFSET, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
         self.car = (
             (*arrays[:6], *matrices),
