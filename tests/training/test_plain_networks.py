@@ -13,7 +13,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.training.context import FitContext
-from vehest.training.members import _ONE_BY_ONE
+from vehest.training.members import _UNBATCHABLE
 from vehest.training.supervised import SupervisedSettings
 
 WINDOW = 8
@@ -122,7 +122,7 @@ def test_members_equal_training_each_alone(name):
 )
 def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one_by_one):
     members, _ = fit(NETWORKS[name], [0, 1])
-    assert (members[0].network in _ONE_BY_ONE) is one_by_one
+    assert (members[0].network in _UNBATCHABLE) is one_by_one
 
 
 @cache

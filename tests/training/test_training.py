@@ -135,16 +135,22 @@ def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error(
 
 def _plant(monkeypatch, member, bad_above, epoch=5):
     """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger than ``bad_above``."""
-    descend = supervised._Run._descend
+    train_epoch = supervised._Run.train_epoch
+    descend = supervised._Batch.descend
 
-    def spoilt(self, batches):
-        losses = descend(self, batches)
-        rows = (self.active == self.planted).nonzero().flatten()
-        if self.epoch + 1 >= epoch and self._step_size() > bad_above:
-            self.flat.data[rows] = np.nan
-        return losses
+    def spoilt_epoch(self):
+        def spoilt_descend(batch, data, windows):
+            losses = descend(batch, data, windows)
+            rows = [row for row, index in enumerate(self.active) if index == self.planted]
+            if self.epoch + 1 >= epoch and batch.adam.learning_rate > bad_above:
+                batch.weights.data[rows] = np.nan
+            return losses
 
-    monkeypatch.setattr(supervised._Run, "_descend", spoilt)
+        with monkeypatch.context() as patch:
+            patch.setattr(supervised._Batch, "descend", spoilt_descend)
+            train_epoch(self)
+
+    monkeypatch.setattr(supervised._Run, "train_epoch", spoilt_epoch)
     monkeypatch.setattr(supervised._Run, "planted", member, raising=False)
 
 

@@ -340,7 +340,7 @@ def _planted(network, runs, bad_above, **settings):
     phase = _phase(network, "all", max_epochs=40, learning_rate=4e-2, **settings)
 
     def loss(batch):
-        is_bad = runs[-1].now.epochs >= 4 and runs[-1].adam.learning_rate > bad_above
+        is_bad = runs[-1].current.epochs >= 4 and runs[-1].adam.learning_rate > bad_above
         return (network(batch[0]) - batch[1]).square().mean() * (math.nan if is_bad else 1.0)
 
     return replace(phase, loss=loss)
