@@ -13,7 +13,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import figure_intervals, segments_of
-from vehest.evaluation.lever_arm import LONGEST, lever_arm_figures
+from vehest.evaluation.lever_arm import MAX_LEVER_ARM, lever_arm_figures
 from vehest.evaluation.metrics import (
     UNITS,
     Protocol,
@@ -295,7 +295,7 @@ def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
 def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     recording = drive()
     found = figures(recording, recording["vy_ref"] - 1.3 * recording["yaw_rate"])
-    assert found["lever_arm"] == -LONGEST
+    assert found["lever_arm"] == -MAX_LEVER_ARM
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
     assert found["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
     straight = replace(recording, channels={**recording.channels, "yaw_rate": np.zeros(N)})
