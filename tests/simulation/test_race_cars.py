@@ -58,7 +58,7 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
         held = solve_ivp(
             rate, (0.0, times[-1]), [0.0], t_eval=times, max_step=2e-3, rtol=1e-8, atol=1e-10
         ).y[0]
-        ours = np.array([state.held[wheel] for state in states])
+        ours = np.array([state.lateral_ratio[wheel] for state in states])
         assert np.abs(held).max() > 0.2
         np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
 

@@ -447,7 +447,7 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     assert along > 0.0  # downhill
     state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
     held = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
-    assert held.stands
+    assert held.is_standing
     rolls = plant.advance(state, inputs_of(along=along), 1000)
     assert rolls.vx == pytest.approx(along, rel=0.1)
     motion = plant.motion([held], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1)
@@ -460,7 +460,7 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
         lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5),
         12.0,
     )
-    stands = np.array([state.stands for state in states])
+    stands = np.array([state.is_standing for state in states])
     assert np.flatnonzero(stands)[0] == pytest.approx(500, abs=15)
     assert stands[520:700].all()
     assert not motion.ax[520:700].any()
@@ -505,7 +505,7 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     motion, states = spin
     assert states[-1].spun
     assert not states[0].spun
-    assert states[-1].stands
+    assert states[-1].is_standing
     assert math.degrees(np.abs(motion.sideslip[motion.vx**2 + motion.vy**2 > 1.0]).max()) > 60.0
     for name in (
         field.name
