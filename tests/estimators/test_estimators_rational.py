@@ -12,8 +12,9 @@ from rational_drive import CURVES, NOISE, changed, rational_drive
 from single_track_drive import with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
+from vehest.estimators.filtering.rational_fit import BOXES
+from vehest.estimators.filtering.rational_model import KINDS, LEVELS
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
@@ -227,8 +228,8 @@ def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_th
     # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations.
     wide = rational(curves={**CURVES, "deviation": 0.5})
     narrow = rational()
-    assert wide.bounds()[4:] == pytest.approx([1.5] * 4)
-    assert narrow.bounds()[4:] == pytest.approx([np.log(3.0)] * 4)
+    assert wide.model().bounds[4:] == pytest.approx([1.5] * 4)
+    assert narrow.model().bounds[4:] == pytest.approx([np.log(3.0)] * 4)
 
 
 @pytest.mark.parametrize("kind", ["extended", "unscented"])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from vehest.estimators.rational_ekf import LOST, ROLLING
+from vehest.estimators.filtering.rational_model import LOST, ROLLING
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
@@ -213,7 +213,7 @@ def extended_filter(model, measurements, inputs, initial):
 def rational_model(estimator):
     """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
     track = estimator.track()
-    bound = torch.as_tensor(estimator.bounds())
+    bound = torch.as_tensor(estimator.model().bounds)
     car = estimator.car
     n_tyres = len(estimator.adapted)
     levels = estimator.values
@@ -233,7 +233,9 @@ def rational_model(estimator):
         turn = inputs[1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
         motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
         tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
-        spread = torch.as_tensor(estimator.start_tyres()) if diverged else state.covariance[4:, 4:]
+        spread = (
+            torch.as_tensor(estimator.model().start_tyres) if diverged else state.covariance[4:, 4:]
+        )
         return Gaussian(
             torch.cat([motion, tyres]),
             torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread),
