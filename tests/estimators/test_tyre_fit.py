@@ -9,7 +9,12 @@ from refusals import refusal
 
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_motion
+from vehest.estimators.filtering.tyre_fit import (
+    ROAD_TYRE_LOG_C1,
+    axle_force,
+    axle_motion,
+    fit_motion,
+)
 from vehest.vehicle.parameters import SingleTrackParameters
 
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
@@ -106,11 +111,12 @@ def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands
     """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
     fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
     assert (
-        np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]
+        np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - ROAD_TYRE_LOG_C1[0])
+        < 1.0 * ROAD_TYRE_LOG_C1[1]
     ).all()
     found = np.array([fit.front[0], fit.rear[0]])
     interval = fit.interval[:, 0]
-    np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
+    np.testing.assert_allclose(interval / found, 1.96 * ROAD_TYRE_LOG_C1[1], rtol=0.3)
     np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
 
 
