@@ -212,7 +212,9 @@ class DugoffUkf(DugoffFilter):
         self.levels = dict(zip(self.level_names, levels.tolist(), strict=True))
 
     def check(self) -> None:
-        """Raises
+        """Check the thresholds of the non-linear range.
+
+        Raises
         ------
         ConfigurationError
             Thresholds of the non-linear range in the wrong order.

@@ -197,7 +197,9 @@ class RationalFilter(SideslipFilter):
         self.values = {name: math.nan if level is None else level for name, level in levels.items()}
 
     def check(self) -> None:
-        """Raises
+        """Check the gate, and that levels and curves are given together.
+
+        Raises
         ------
         ConfigurationError
             A gate of the unscented filter, or levels or curves that are given in part.
@@ -342,7 +344,9 @@ class RationalFilter(SideslipFilter):
     # Fitted numbers and files
 
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
-        """Raises
+        """Check that curves and levels are given or fitted.
+
+        Raises
         ------
         ConfigurationError
             Curves or levels are neither given nor fitted.

@@ -205,7 +205,9 @@ class Recursive(Estimator):
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
     def require_fitted(self) -> None:
-        """Raises
+        """Check that every number is given or fitted.
+
+        Raises
         ------
         ConfigurationError
             A number is neither given nor fitted.

@@ -59,7 +59,9 @@ def simulate_planar_drive(
     Raises
     ------
     ConfigurationError
-        A value that makes no sense. Raises `SimulationError`: a state is not finite.
+        A value that makes no sense.
+    SimulationError
+        A state is not finite.
     """
     plant = PlanarPlant(car)
     with naming(id, seed):

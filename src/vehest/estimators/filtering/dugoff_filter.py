@@ -93,7 +93,9 @@ class DugoffFilter(SigmaPointEstimator):
     car: LoadedCar
 
     def require_fitted(self) -> None:
-        """Raises
+        """Check that tyres and levels are given or found.
+
+        Raises
         ------
         ConfigurationError
             Tyres or levels are neither given nor found.

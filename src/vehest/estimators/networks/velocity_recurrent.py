@@ -199,7 +199,9 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:
-        """Raises
+        """Check inputs and outputs.
+
+        Raises
         ------
         ConfigurationError
             Inputs or outputs that repeat or are unknown, or a reference among the inputs.

@@ -73,8 +73,10 @@ class WindowedEstimator(Network):
         ------
         DataError
             Recordings are too short or have gaps, the loss is no longer finite, or a model to start
-            from is damaged. Raises `ConfigurationError`: the network cannot be trained so, or a
-            model to start from is of another family or has other settings.
+            from is damaged.
+        ConfigurationError
+            The network cannot be trained so, or a model to start from is of another family or has
+            other settings.
         """
         import torch
 
