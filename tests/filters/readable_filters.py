@@ -25,11 +25,11 @@ def mean_of(rule, values):
     return rule.centre_mean * values[0] + rule.outer_weight * values[1:].sum(0)
 
 
-def covariance_of(rule, deviations, others):
+def covariance_of(rule, deviations, second_deviations):
     """Weighted Σ w d eᵀ of deviations from the mean, (2n + 1, m) and (2n + 1, k) -> (m, k)."""
-    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.outer_weight * (
-        deviations[1:].mT @ others[1:]
-    )
+    return rule.centre_covariance * torch.outer(
+        deviations[0], second_deviations[0]
+    ) + rule.outer_weight * (deviations[1:].mT @ second_deviations[1:])
 
 
 def symmetric(matrix):
@@ -102,17 +102,19 @@ def unscented_filter(model, measurements, inputs, initial, rule):
     if measurements.dim() == 3:
         several = len(measurements)
         n = initial.mean.shape[-1]
-        each = zip(
+        sequences = zip(
             measurements,
             inputs,
             initial.mean.expand(several, n),
             initial.covariance.expand(several, n, n),
             strict=True,
         )
-        found = [unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in each]
-        rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in found]
+        filtered = [
+            unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in sequences
+        ]
+        rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in filtered]
         return NonlinearFiltered(
-            filtered_of(rows), torch.stack([repaired for _, repaired in found])
+            filtered_of(rows), torch.stack([repaired for _, repaired in filtered])
         )
     state = initial
     rows = []
