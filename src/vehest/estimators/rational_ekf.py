@@ -118,38 +118,20 @@ class AxleCurves(Group):
         return self.c2_front is not None
 
 
-class RationalFilter(SideslipFilter):
-    """Kalman filter of sideslip angle, yaw rate, their rates and, if adapted, tyre parameters, over
-    `TyreTrack`.
-
-    Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process
-    noise Δt B Λ Bᵀ comes from the steering angle and the drift of tyre parameters. Below the
-    minimum speed wheels roll without slip, and tyre parameters stay.
+class RationalTrack(SideslipFilter):
+    """A filter over `TyreTrack`: its settings, its model, and how it filters samples.
 
     Attributes
     ----------
     axle_curves : array, shape (4,)
-        c₁ [rad²] and c₂ [N/rad] of the front, then of the rear axle; c₁ is infinite where tyres are linear. NaN before the fit.
+        c₁ [rad²] and c₂ [N/rad] of the front, then of the rear axle, NaN before the fit. c₁ is
+        infinite where tyres are linear.
     curve_covariance : array, shape (4, 4)
         Covariance of their logarithms at the start.
     values : dict
         Noise levels by name (`LEVELS`); NaN before the fit.
-
-    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60. Friction as a state and the unscented
-    filter are not in the paper.
     """
 
-    name = "rational_ekf"
-    title = "EKF with tyres"
-    trials = (
-        Trial(
-            6,
-            "filter whose tyres adapt; a minute",
-            "{car} training.grid=1 training.max_evaluations=40",
-        ),
-    )
-    training_type = NoiseTuningSettings
-    template = "rational_ekf"
     rate_hz: float = rate(20.0)
     tyres: Tyres = setting(
         "rational_adaptive",
@@ -215,8 +197,6 @@ class RationalFilter(SideslipFilter):
                     f"estimator.{group}: give all of {', '.join(names)}, or none of them"
                 )
 
-    # Names
-
     @property
     def kind(self) -> TyreKind:
         """Names and parameters of these tyres."""
@@ -226,53 +206,6 @@ class RationalFilter(SideslipFilter):
     def adapted(self) -> tuple[str, ...]:
         """Tyre parameters that are states."""
         return self.kind.adapted
-
-    @property
-    def variant(self) -> str:
-        """The paper's name of these tyres, then: unscented filter, tyres that stay straight ahead,
-        gate.
-        """
-        filter_suffix = "_ukf" if self.filter == "unscented" else ""
-        stay_suffix = "_held" if self.adapted and self.adapt_above > 0.0 else ""
-        return self.kind.variant + filter_suffix + stay_suffix + self.gate_suffix
-
-    @property
-    def full_title(self) -> str:
-        """The paper's name of these tyres, and the filter."""
-        stay = ", tyres held straight ahead" if self.adapted and self.adapt_above > 0.0 else ""
-        return f"{self.kind.title}, {self.filter} Kalman filter{stay}{self.gate_title}"
-
-    # Fit
-
-    @property
-    def unknown_levels(self) -> tuple[str, ...]:
-        """Noise levels that are not given."""
-        return tuple(name for name in self.kind.level_names if getattr(self.noise, name) is None)
-
-    @property
-    def n_parameters(self) -> int:
-        """Parameters of curves and noise levels that are not given."""
-        n_curves = 0 if self.curves.has_values else len(self.kind.curve_names)
-        return n_curves + len(self.unknown_levels)
-
-    def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` where curves are fitted or levels searched, unless there is a sideslip angle."""
-        is_searched = training.method != "data" and bool(searched_levels(self.unknown_levels))
-        needs_none = self.curves.has_values and not is_searched
-        return () if needs_none or "sideslip_ref" in channels else ("vy_ref",)
-
-    @classmethod
-    def fit_members(
-        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
-    ) -> list[FitRecord]:
-        """Fit axle curves to the reference sideslip of the training recordings, then find the noise
-        levels; see `NoiseTuningSettings`.
-
-        Members of one seed cannot differ, others only by Optuna's trials.
-        """
-        return [_fit(member, data, training, context) for member in members]
-
-    # Model and filter
 
     def model(self) -> RationalModel:
         """The model at the curves that the filter starts with, with limits and start of the filter."""
@@ -341,8 +274,6 @@ class RationalFilter(SideslipFilter):
         """
         return self.model().quantities(states)
 
-    # Fitted numbers and files
-
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
         """Check that curves and levels are given or fitted.
 
@@ -358,6 +289,79 @@ class RationalFilter(SideslipFilter):
                 f"estimator '{self.name}' has no {'axle curves' if has_no_curves else 'noise levels'} yet; "
                 "fit or load it first, or give estimator.curves and estimator.noise"
             )
+
+
+class RationalFilter(RationalTrack):
+    """Kalman filter of sideslip angle, yaw rate, their rates and, if adapted, tyre parameters, over
+    `TyreTrack`.
+
+    Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process
+    noise Δt B Λ Bᵀ comes from the steering angle and the drift of tyre parameters. Below the
+    minimum speed wheels roll without slip, and tyre parameters stay.
+
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60. Friction as a state and the unscented
+    filter are not in the paper.
+    """
+
+    name = "rational_ekf"
+    title = "EKF with tyres"
+    trials = (
+        Trial(
+            6,
+            "filter whose tyres adapt; a minute",
+            "{car} training.grid=1 training.max_evaluations=40",
+        ),
+    )
+    training_type = NoiseTuningSettings
+    template = "rational_ekf"
+    # Names
+
+    @property
+    def variant(self) -> str:
+        """The paper's name of these tyres, then: unscented filter, tyres that stay straight ahead,
+        gate.
+        """
+        filter_suffix = "_ukf" if self.filter == "unscented" else ""
+        stay_suffix = "_held" if self.adapted and self.adapt_above > 0.0 else ""
+        return self.kind.variant + filter_suffix + stay_suffix + self.gate_suffix
+
+    @property
+    def full_title(self) -> str:
+        """The paper's name of these tyres, and the filter."""
+        stay = ", tyres held straight ahead" if self.adapted and self.adapt_above > 0.0 else ""
+        return f"{self.kind.title}, {self.filter} Kalman filter{stay}{self.gate_title}"
+
+    # Fit
+
+    @property
+    def unknown_levels(self) -> tuple[str, ...]:
+        """Noise levels that are not given."""
+        return tuple(name for name in self.kind.level_names if getattr(self.noise, name) is None)
+
+    @property
+    def n_parameters(self) -> int:
+        """Parameters of curves and noise levels that are not given."""
+        n_curves = 0 if self.curves.has_values else len(self.kind.curve_names)
+        return n_curves + len(self.unknown_levels)
+
+    def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
+        """``vy_ref`` where curves are fitted or levels searched, unless there is a sideslip angle."""
+        is_searched = training.method != "data" and bool(searched_levels(self.unknown_levels))
+        needs_none = self.curves.has_values and not is_searched
+        return () if needs_none or "sideslip_ref" in channels else ("vy_ref",)
+
+    @classmethod
+    def fit_members(
+        cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
+    ) -> list[FitRecord]:
+        """Fit axle curves to the reference sideslip of the training recordings, then find the noise
+        levels; see `NoiseTuningSettings`.
+
+        Members of one seed cannot differ, others only by Optuna's trials.
+        """
+        return [_fit(member, data, training, context) for member in members]
+
+    # Files
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Curves, the covariance of their logarithms, and noise levels.
