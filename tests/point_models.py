@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vehest.filters.unscented_scan import CompiledNoise, _apart, _beside
+from vehest.filters.unscented_scan import CompiledNoise, _sequences_first, _sequences_last
 from vehest.filters.unscented_steps import room
 
 
@@ -11,12 +11,12 @@ def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     out = room((points.shape[1], size, len(points)), points.dtype)
     given = []
     learnt = []
-    x = _beside(points)
-    u = _beside(inputs)
+    x = _sequences_last(points)
+    u = _sequences_last(inputs)
     if upstream is not None:
-        given = [_beside(upstream)]
+        given = [_sequences_last(upstream)]
         learnt = [model.learnt(gradients)]
-        u = _beside(np.pad(inputs, ((0, 0), (0, model.kept * points.shape[1]))))
+        u = _sequences_last(np.pad(inputs, ((0, 0), (0, model.scratch_rows * points.shape[1]))))
         model.entries[entry - 2](
             x, u, model.car, np.empty_like(given[0]), 0, len(points)
         )  # leaves what its adjoint takes
@@ -28,8 +28,8 @@ def noise_by(function):
     """Noise that a function of states (B, n) and inputs (B, p) says, (B, k, k)."""
 
     def write(states, inputs, _, out, first, end):
-        out[..., first:end] = _beside(
-            function(_apart(states, first, end), _apart(inputs, first, end))
+        out[..., first:end] = _sequences_last(
+            function(_sequences_first(states, first, end), _sequences_first(inputs, first, end))
         )
 
     return CompiledNoise(write, ())
@@ -38,5 +38,5 @@ def noise_by(function):
 def covariances(noise, states, inputs):
     """What a `CompiledNoise` of `vehest.filters.noise_models` says at states (B, n) under inputs (B, p): (B, k, k)."""
     out = room((*noise.car[0].shape, len(states)), states.dtype)
-    noise.entry(_beside(states), _beside(inputs), noise.car, out, 0, len(states))
+    noise.entry(_sequences_last(states), _sequences_last(inputs), noise.car, out, 0, len(states))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))

@@ -18,8 +18,8 @@ from vehest.vehicle.single_track import lateral_model
 
 
 def new(name, **settings):
-    given = {"rate_hz": 20.0, **({"wheelbase": 2.4} if name == "data_sheet" else {}), **settings}
-    return estimator_class(name).from_config(given)
+    config = {"rate_hz": 20.0, **({"wheelbase": 2.4} if name == "data_sheet" else {}), **settings}
+    return estimator_class(name).from_config(config)
 
 
 def fitted(name, drive, **settings):
@@ -96,8 +96,8 @@ def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_consta
     truth.values = {"time_constant": 1.7}
     drive = planar_drive(60.0)
     vy = truth.estimate([drive.without_references()])[0]["vy"]
-    made = Recording("made", "car", 20.0, 0.0, {**drive.channels, "vy_ref": vy}, "simulated")
-    estimator, record = fitted("kinematic", made)
+    integrated = Recording("made", "car", 20.0, 0.0, {**drive.channels, "vy_ref": vy}, "simulated")
+    estimator, record = fitted("kinematic", integrated)
     assert estimator.values["time_constant"] == pytest.approx(1.7, rel=1e-4)
     assert record.metrics["best_validation_loss"] < 1e-8
 
@@ -115,7 +115,7 @@ def test_zero_is_zero_and_a_map_that_is_not_fitted_or_not_determined_is_refused(
         {**drive.channels, "yaw_rate": np.zeros(len(drive))},
         "simulated",
     )
-    one_speed = Recording(
+    constant_speed = Recording(
         "one speed",
         "car",
         20.0,
@@ -123,6 +123,6 @@ def test_zero_is_zero_and_a_map_that_is_not_fitted_or_not_determined_is_refused(
         {**drive.channels, "vx": np.full(len(drive), 20.0)},
         "simulated",
     )
-    for recording in (straight, one_speed):
+    for recording in (straight, constant_speed):
         with pytest.raises(DataError, match="do not determine a static map"):
             fitted("static_map", recording)

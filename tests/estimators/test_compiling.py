@@ -48,13 +48,13 @@ def test_slow_kernels_are_entries_that_are_there(where):
 @pytest.mark.apart
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
 def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path, kernels):
-    here = Path(__file__).parent
+    folder = Path(__file__).parent
     environment = {
         **os.environ,
         "NUMBA_CACHE_DIR": str(tmp_path),
-        "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)]),
+        "PYTHONPATH": os.pathsep.join([str(folder), str(folder.parent)]),
     }
-    command = [sys.executable, str(here / "digits.py"), kernels]
+    command = [sys.executable, str(folder / "digits.py"), kernels]
     first, second = (
         subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
         for _ in range(2)

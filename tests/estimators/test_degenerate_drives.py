@@ -15,7 +15,7 @@ from vehest.training.context import FitContext
 from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid, optuna_search
 
 STRAIGHT = dict.fromkeys(("yaw_rate", "ay", "steer", "vy_ref", "sideslip_ref", "yaw_rate_ref"), 0.0)
-STANDING = STRAIGHT | dict.fromkeys(("vx", "ax", "vx_ref", "motor_speed", "motor_current"), 0.0)
+AT_REST = STRAIGHT | dict.fromkeys(("vx", "ax", "vx_ref", "motor_speed", "motor_current"), 0.0)
 NO_CURVES = {"rational_ekf": {}}
 
 
@@ -38,7 +38,7 @@ def _shortened(recording, steps):
 
 DRIVES = {
     "straight": lambda drive: _with(drive, STRAIGHT),
-    "standing": lambda drive: _with(drive, STANDING),
+    "standing": lambda drive: _with(drive, AT_REST),
     "constant": lambda drive: _with(
         drive, {name: samples[0] for name, samples in drive.channels.items()}
     ),

@@ -23,7 +23,7 @@ FORCES = {"force_factor": 1.5, "fy_front": 100.0, "fy_rear": 100.0}
 QUICK = IdentificationSettings(method="data", tyres_from="*", restarts=2, generations=40)
 
 
-def given(inputs="full", **settings):
+def estimator_with(inputs="full", **settings):
     """A filter that knows the car it is on."""
     noise = LEVELS | (FORCES if inputs == "full" else {})
     return DugoffUkf.from_config({"inputs": inputs, "tyres": TYRES, "noise": noise, **settings})
@@ -68,7 +68,7 @@ def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
 @pytest.mark.parametrize("inputs", ["full", "imu"])
 def test_the_filter_follows_the_car_and_knows_how_well(inputs):
     drive = dugoff_drive(20.0, 5)
-    estimate = given(inputs).estimate([drive.without_references()])[0]
+    estimate = estimator_with(inputs).estimate([drive.without_references()])[0]
     assert np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)) < np.radians(
         0.2
     ), "after a second"
@@ -83,7 +83,7 @@ def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_wi
         dugoff_drive(seconds, seed).without_references()
         for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))
     ]
-    estimator = given()
+    estimator = estimator_with()
     for together, drive in zip(estimator.estimate(drives), drives, strict=True):
         np.testing.assert_array_equal(together["vy"], estimator.estimate([drive])[0]["vy"])
     assert list(groups_of([3, 5, 3], 10)) == [[1, 0], [2]]
@@ -91,9 +91,9 @@ def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_wi
     ay = np.array([0.0, 3.9, -4.1, 3.5, np.nan, -3.1, 2.9, 3.9, 4.0])
     expected = [False, False, True, True, True, True, False, False, True]
     assert in_nonlinear_range(ay, 4.0, 3.0).tolist() == expected
-    whole = in_nonlinear_range(ay, 4.0, 3.0)
+    nonlinear = in_nonlinear_range(ay, 4.0, 3.0)
     assert all(
-        in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k]
+        in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(nonlinear[k - 1]))[0] == nonlinear[k]
         for k in range(1, len(ay))
     )
     assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
@@ -112,7 +112,7 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
         {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)},
         ("ay", "fy_fl"),
     )
-    estimator = given(inputs)
+    estimator = estimator_with(inputs)
     batch = estimator.estimate([drive.without_references()])[0]
     stepper = estimator.online()
     online = [
@@ -134,11 +134,13 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
 
 def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
     drive = dugoff_drive(2.0, 7).without_references()
-    first = given().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
+    first = estimator_with().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
     assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
-    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
-    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
-    np.testing.assert_array_equal(process, same)
+    white, correlated = (estimator_with(correlated_samples=candidate) for candidate in (1.0, 10.0))
+    (process, once), (correlated_process, tenfold) = (
+        candidate.noise_covariances(candidate.levels) for candidate in (white, correlated)
+    )
+    np.testing.assert_array_equal(process, correlated_process)
     np.testing.assert_allclose(tenfold, 10.0 * once)
 
 
@@ -165,26 +167,26 @@ def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
 
 def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_scored():
     drive = dugoff_drive(12.0, straight=4.0)
-    still = np.arange(1200) >= 700
+    is_standing = np.arange(1200) >= 700
     quiet = {
-        "ay": np.where(still, 0.0, drive["ay"]),
-        "vx": np.where(still, 0.0, drive["vx"]),
-        "steer": np.where(still, 0.0, drive["steer"]),
+        "ay": np.where(is_standing, 0.0, drive["ay"]),
+        "vx": np.where(is_standing, 0.0, drive["vx"]),
+        "steer": np.where(is_standing, 0.0, drive["steer"]),
     }
     record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(
         FitData([changed(drive, quiet)], []), QUICK
     )
     assert record.metrics["noise_ay"] > 0.8 * NOISE["ay"]
-    gap = changed(drive, {"ax": np.where(still, np.nan, drive["ax"])}, ("ax",))
+    gap = changed(drive, {"ax": np.where(is_standing, np.nan, drive["ax"])}, ("ax",))
     assert "recording 'drive': channel 'ax' has gaps" in refusal(
         lambda: DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
     )
     drive = dugoff_drive(3.0)
     data = IdentificationSettings(method="data")
-    other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
+    with_sideslip_error = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
     losses = [
-        given().fit(FitData([], [own]), data).metrics["best_validation_loss"]
-        for own in (drive, other)
+        estimator_with().fit(FitData([], [recording]), data).metrics["best_validation_loss"]
+        for recording in (drive, with_sideslip_error)
     ]
     assert losses[0] == losses[1]
     blind = drive.select([name for name in drive.channels if name != "vy_ref"])

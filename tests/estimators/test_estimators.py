@@ -20,7 +20,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.training.search import DirectSearchSettings
 from vehest.vehicle.parameters import FERRARI_250LM
 
-known = cache(fitted)
+fitted_once = cache(fitted)
 """The same estimator for several tests, which leave it as it is."""
 OF_A_DTYPE = [
     name
@@ -51,10 +51,13 @@ def test_parameter_counts_are_those_of_the_paper():
 @pytest.mark.parametrize("name", estimator_names())
 def test_configuration_file_states_the_defaults(name):
     """What the pages' tables of settings say, from the class, is what `vehest train` takes."""
-    needed = {"wheelbase": 2.7} if name == "data_sheet" else {}
+    required = {"wheelbase": 2.7} if name == "data_sheet" else {}
     family = estimator_class(name)
-    given = compose_config("train", [f"estimator={name}"])["estimator"]
-    assert family.from_config({**given, **needed}).settings == family.from_config(needed).settings
+    composed = compose_config("train", [f"estimator={name}"])["estimator"]
+    assert (
+        family.from_config({**composed, **required}).settings
+        == family.from_config(required).settings
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,17 +68,17 @@ def test_configuration_file_states_the_defaults(name):
     ],
 )
 def test_online_agrees_with_batch(name, dtype, tolerance):
-    estimator = known(name, dtype)
+    estimator = fitted_once(name, dtype)
     drive = drive_for(estimator)
     estimate = estimator.estimate([drive])[0]
     batch = estimate["vy"]
     stepper = estimator.online()
     assert stepper.horizon_steps == estimator.horizon_steps
-    said = [
+    steps = [
         stepper.step({channel: drive[channel][k] for channel in drive.channels})
         for k in range(len(drive))
     ]
-    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in said])[
+    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in steps])[
         : len(drive)
     ]
     assert np.array_equal(np.isnan(online), np.isnan(batch))
@@ -86,23 +89,23 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     if "vy" in estimate.covariance_of:
         row = estimate.covariance_of.index("vy")
         np.testing.assert_allclose(
-            [own["vy_variance"] for own in said],
+            [step["vy_variance"] for step in steps],
             estimate.covariance[:, row, row],
             rtol=10 * tolerance,
         )
     else:
-        assert "vy_variance" not in said[-1]
+        assert "vy_variance" not in steps[-1]
 
 
 @pytest.mark.parametrize("name", estimator_names())
 def test_model_read_back_estimates_the_same(tmp_path, name):
-    estimator = known(name, "float32" if name in OF_A_DTYPE else "float64")
+    estimator = fitted_once(name, "float32" if name in OF_A_DTYPE else "float64")
     save_model(estimator, tmp_path, {"seed": 0})
     loaded = load_model(tmp_path)
     drive = drive_for(estimator)
-    one = estimator.estimate([drive])[0]
-    other = loaded.estimate([drive])[0]
-    assert np.array_equal(one["vy"], other["vy"], equal_nan=True)
+    estimate = estimator.estimate([drive])[0]
+    loaded_estimate = loaded.estimate([drive])[0]
+    assert np.array_equal(estimate["vy"], loaded_estimate["vy"], equal_nan=True)
     assert loaded.settings == estimator.settings
     assert sorted(file.name for file in tmp_path.iterdir()) == ["model.safetensors", "model.yaml"]
 
@@ -110,7 +113,7 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
     assert "holds no model" in refusal(lambda: load_model(tmp_path), MissingError)
-    save_model(known("ksnn", "float64"), tmp_path)
+    save_model(fitted_once("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
     assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
@@ -119,7 +122,7 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
 def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(
     drive,
 ):
-    estimator = known("ksnn", "float64")
+    estimator = fitted_once("ksnn", "float64")
     assert "works at 20 Hz; resample it first" in refusal(
         lambda: estimator.estimate([Resample(10).__call__(drive)])
     )
@@ -141,7 +144,7 @@ def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_
 
 
 def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
-    estimator = known("luenberger", "float64")
+    estimator = fitted_once("luenberger", "float64")
     save_model(estimator, tmp_path)
     description = tmp_path / "model.yaml"
     description.write_text(description.read_text().replace("version: '1'\n", ""))
@@ -165,7 +168,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
 
 def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
     assert "no state to start from" in refusal(
-        lambda: known("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError
+        lambda: fitted_once("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError
     )
     estimator = fitted("luenberger")
     estimator.threshold, drive = 0.0, drive_for(estimator)
@@ -173,13 +176,13 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
     started = estimator.estimate([drive], {"vy": 2.0})[0]["vy"]
     assert abs(started[0] - free[0]) > 1.0
     assert abs(started[-1] - free[-1]) < 0.05, "the observer forgets where it started"
-    estimator = known("luenberger", "float64")
+    estimator = fitted_once("luenberger", "float64")
     states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
-    both = estimator.estimate([drive, drive], states)
-    for state, own in zip(states, both, strict=True):
-        assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
-    one = estimator.estimate([drive, drive], states[0])
-    assert np.array_equal(one[0]["vy"], one[1]["vy"])
+    estimates = estimator.estimate([drive, drive], states)
+    for state, estimate in zip(states, estimates, strict=True):
+        assert np.array_equal(estimate["vy"], estimator.estimate([drive], state)[0]["vy"])
+    from_one_state = estimator.estimate([drive, drive], states[0])
+    assert np.array_equal(from_one_state[0]["vy"], from_one_state[1]["vy"])
     assert "2 initial states for 1 recordings" in refusal(
         lambda: estimator.estimate([drive], states)
     )
@@ -284,7 +287,7 @@ def test_activations_partition_unity_and_end_with_the_last_model():
 
 
 OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=false"]
-STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
+NO_TRAINING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
 def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
@@ -295,10 +298,10 @@ def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_
         "ksnn",
         drives[:1],
         drives[1:],
-        [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"],
+        [*OF_SHIPPED, *NO_TRAINING, f"training.start_from={pretrained_folder()}"],
     )
     assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
-    scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])
+    scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *NO_TRAINING])
     assert np.abs(flat_weights(scratch) - flat_weights(started)).max() > 0.01
 
     with pytest.raises(

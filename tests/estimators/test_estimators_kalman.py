@@ -13,7 +13,7 @@ from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_levels import high_passed_level
 from vehest.training.context import NoTraining
 
-GIVEN = {"noise": {**NOISE, "steer_factor": 1.0}}
+GIVEN_NOISE = {"noise": {**NOISE, "steer_factor": 1.0}}
 
 
 def kalman(**config):
@@ -35,15 +35,15 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
         "kalman",
     )
     drive = linear_drive(30.0, seed=3)[0].without_references()
-    own = kalman(noise={"read_from": "recording"})
+    offline = kalman(noise={"read_from": "recording"})
     trained = kalman()
     trained.fit(FitData([drive], []), NoTraining())
-    one = own.estimate([drive])[0]
-    other = trained.estimate([drive])[0]
-    assert np.array_equal(one["vy"], other["vy"])
-    assert (one.mode, other.mode) == ("offline", "causal")
-    assert (own.learns, own.n_parameters, own.variant) == (False, 0, "kalman_own_noise")
-    assert "cannot run along with a drive" in refusal(lambda: own.online(), ConfigurationError)
+    first = offline.estimate([drive])[0]
+    second = trained.estimate([drive])[0]
+    assert np.array_equal(first["vy"], second["vy"])
+    assert (first.mode, second.mode) == ("offline", "causal")
+    assert (offline.learns, offline.n_parameters, offline.variant) == (False, 0, "kalman_own_noise")
+    assert "cannot run along with a drive" in refusal(lambda: offline.online(), ConfigurationError)
 
 
 def test_levels_that_are_given_are_not_read_and_need_no_training():
@@ -51,7 +51,7 @@ def test_levels_that_are_given_are_not_read_and_need_no_training():
     estimator.fit(FitData([linear_drive(60.0)[0]], []), NoTraining())
     assert estimator.values["ay"] == 0.7
     assert estimator.n_parameters == 2
-    estimator = kalman(**GIVEN)
+    estimator = kalman(**GIVEN_NOISE)
     assert (estimator.learns, estimator.causal, estimator.variant) == (
         False,
         True,
@@ -66,12 +66,12 @@ def test_samples_that_are_missing_are_skipped():
     """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it knows less."""
     drive, states = linear_drive(30.0, seed=5)
     gappy = with_gaps(drive, {"ay": slice(1000, 1200), "yaw_rate": slice(1100, 1200)})
-    estimator = kalman(**GIVEN)
+    estimator = kalman(**GIVEN_NOISE)
     estimate = estimator.estimate([gappy])[0]
-    whole = estimator.estimate([drive])[0]
-    assert np.array_equal(estimate["vy"][:1000], whole["vy"][:1000])
-    assert np.abs(estimate["vy"] - whole["vy"])[2000:].max() < 1e-6, "the gap is forgotten"
-    assert (estimate.covariance[1100:1200, 0, 0] > 1.2 * whole.covariance[1100:1200, 0, 0]).all()
+    complete = estimator.estimate([drive])[0]
+    assert np.array_equal(estimate["vy"][:1000], complete["vy"][:1000])
+    assert np.abs(estimate["vy"] - complete["vy"])[2000:].max() < 1e-6, "the gap is forgotten"
+    assert (estimate.covariance[1100:1200, 0, 0] > 1.2 * complete.covariance[1100:1200, 0, 0]).all()
     error = np.degrees(estimate["sideslip"] - states[:, 0])[1100:1200]
     assert np.abs(error).max() < 2.0
     stepper = estimator.online()
@@ -84,24 +84,26 @@ def test_samples_that_are_missing_are_skipped():
 
 def test_speed_and_steering_may_not_be_missing():
     with pytest.raises(DataError, match="'vx' is nan, which estimator 'kalman' cannot take"):
-        kalman(**GIVEN).online().step({"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0})
+        kalman(**GIVEN_NOISE).online().step(
+            {"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0}
+        )
     with pytest.raises(DataError, match="channel 'steer' has gaps"):
-        kalman(**GIVEN).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
+        kalman(**GIVEN_NOISE).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
     assert "no channel 'steer'" in refusal(
-        lambda: kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
+        lambda: kalman(**GIVEN_NOISE).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
     )
 
 
 def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():
     drive = linear_drive(20.0, seed=6)[0]
     slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
-    estimate = kalman(**GIVEN).estimate(
+    estimate = kalman(**GIVEN_NOISE).estimate(
         [type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)]
     )[0]
     assert np.isfinite(estimate["vy"]).all()
     assert np.isfinite(estimate.covariance).all()
     drive = linear_drive(2.0)[0]
-    estimate = kalman(**GIVEN).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
+    estimate = kalman(**GIVEN_NOISE).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
     assert estimate["vy"][0] == pytest.approx(2.0, abs=1e-3)
     assert estimate["yaw_rate"][0] == pytest.approx(-0.3, abs=1e-6)
 
@@ -151,8 +153,8 @@ def with_planted_offsets(seed, ay, steer):
 
 def augmented(drive, ay, steer, seconds):
     """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
-    A, B, C, D = kalman(**GIVEN).sampled_model(drive["vx"])
-    kept = np.exp(-0.01 / seconds)
+    A, B, C, D = kalman(**GIVEN_NOISE).sampled_model(drive["vx"])
+    decay = np.exp(-0.01 / seconds)
     mean = np.zeros(4)
     covariance = np.diag([1e4, 1e4, ay**2, steer**2])
     R = np.diag([NOISE["ay"] ** 2, NOISE["yaw_rate"] ** 2])
@@ -163,12 +165,12 @@ def augmented(drive, ay, steer, seconds):
             F = np.block(
                 [
                     [A[k - 1], np.zeros((2, 1)), -B[k - 1][:, None]],
-                    [np.zeros((2, 2)), kept * np.eye(2)],
+                    [np.zeros((2, 2)), decay * np.eye(2)],
                 ]
             )
             Q = np.zeros((4, 4))
             Q[:2, :2] = NOISE["steer"] ** 2 * np.outer(B[k - 1], B[k - 1])
-            Q[2:, 2:] = (1.0 - kept**2) * np.diag([ay**2, steer**2])
+            Q[2:, 2:] = (1.0 - decay**2) * np.diag([ay**2, steer**2])
             mean = F @ mean
             mean[:2] += B[k - 1] * drive["steer"][k - 1]
             covariance = F @ covariance @ F.T + Q
@@ -190,13 +192,13 @@ OFFSETS = {"ay": 0.6, "steer": 0.01, "seconds": 100.0}
 def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     drive, _ = with_planted_offsets(3, 0.6, 0.01)
     means, covariances = augmented(drive, **OFFSETS)
-    estimator = kalman(**GIVEN, offsets=OFFSETS)
+    estimator = kalman(**GIVEN_NOISE, offsets=OFFSETS)
     samples = drive.stack(estimator.channels)
-    found = estimator.filter_samples(samples, estimator.first_gaussian(samples[0], {}))
-    assert found.mean == pytest.approx(means, abs=1e-8)
-    assert found.covariance == pytest.approx(covariances[:, :2, :2], abs=1e-8)
+    filtered = estimator.filter_samples(samples, estimator.first_gaussian(samples[0], {}))
+    assert filtered.mean == pytest.approx(means, abs=1e-8)
+    assert filtered.covariance == pytest.approx(covariances[:, :2, :2], abs=1e-8)
     assert estimator.estimate([drive])[0]["yaw_rate"] == pytest.approx(means[:, 1], abs=1e-8)
-    estimator = kalman(**GIVEN, offsets=OFFSETS, gate=5.0)
+    estimator = kalman(**GIVEN_NOISE, offsets=OFFSETS, gate=5.0)
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
     drive, _ = with_planted_offsets(1, 0.6, 0.01)
     stepper = estimator.online()

@@ -12,8 +12,9 @@ from rational_drive import CURVES, NOISE, changed, rational_drive
 from single_track_drive import with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
+from vehest.estimators.filtering.rational_fit import BOXES
+from vehest.estimators.filtering.rational_model import KINDS, LEVELS
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
@@ -53,11 +54,11 @@ def readable(estimator, samples):
 
 def test_slopes_and_peak_of_the_rational_tyre_are_those_of_differentiation_and_closed_form():
     values = torch.tensor([0.06, np.log(0.008), np.log(7e4), np.log(0.7)], dtype=torch.float64)
-    found = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
+    axle_force = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
     slopes = torch.func.jacrev(
         lambda v: rational_axle(v[0], v[1].exp(), v[2].exp(), v[3].exp()).force
     )(values)
-    assert torch.allclose(torch.stack(found[1:]), slopes, rtol=1e-12)
+    assert torch.allclose(torch.stack(axle_force[1:]), slopes, rtol=1e-12)
     assert AxleForce._fields[1:] == ("per_slip", "per_log_c1", "per_log_c2", "per_log_friction")
     slip = np.linspace(0.0, 0.4, 100001)
     force = rational_axle(slip, 0.008, 7e4, 1.0).force
@@ -197,19 +198,19 @@ def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(d
     filtered = estimator.filter_samples(drive.stack(estimator.channels))
     before = filtered.mean[:-1, 4:]
     after = filtered.mean[1:, 4:]
-    held = (before == after).all(axis=1)
+    is_constant = (before == after).all(axis=1)
     bend = np.abs(drive["vx"] * filtered.mean[:, 1])[1:]
-    assert held[bend < 1.5].all()
-    assert not held[bend > 2.5].any()
-    assert 0.1 < held.mean() < 0.9
+    assert is_constant[bend < 1.5].all()
+    assert not is_constant[bend > 2.5].any()
+    assert 0.1 < is_constant.mean() < 0.9
     straight = changed(
         drive, {"steer": np.zeros(800), "yaw_rate": np.zeros(800), "ay": np.full(800, 0.3)}
     )
-    kept, moved = (
+    straight_states, moved = (
         rational(adapt_above=limit).filter_samples(straight.stack(estimator.channels)).last.mean[4:]
         for limit in (2.0, 0.0)
     )
-    assert (kept == 0.0).all()
+    assert (straight_states == 0.0).all()
     assert np.abs(moved).max() > 0.1
     assert (rational(adapt_above=2.0).variant, rational("rational", adapt_above=2.0).variant) == (
         "ratte_held",
@@ -227,8 +228,8 @@ def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_th
     # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations.
     wide = rational(curves={**CURVES, "deviation": 0.5})
     narrow = rational()
-    assert wide.bounds()[4:] == pytest.approx([1.5] * 4)
-    assert narrow.bounds()[4:] == pytest.approx([np.log(3.0)] * 4)
+    assert wide.model().bounds[4:] == pytest.approx([1.5] * 4)
+    assert narrow.model().bounds[4:] == pytest.approx([np.log(3.0)] * 4)
 
 
 @pytest.mark.parametrize("kind", ["extended", "unscented"])
@@ -247,13 +248,13 @@ def test_a_car_that_stands_or_reverses_rolls_without_slip_and_its_tyres_are_held
 
 def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected():
     train = rational_drive(60.0, seed=4)
-    held_out = rational_drive(40.0, seed=5)
+    validation_drive = rational_drive(40.0, seed=5)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
     assert "has no axle curves yet; fit or load it first" in refusal(
         lambda: estimator.online(), ConfigurationError
     )
-    record = estimator.fit(FitData([train], [held_out]), QUICK)
+    record = estimator.fit(FitData([train], [validation_drive]), QUICK)
     for name, value in CURVES.items():
         assert record.metrics[name] == pytest.approx(value, rel=0.15)
         assert 0.0 < record.metrics[f"{name}_interval"] < 0.3 * value
@@ -263,13 +264,18 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     assert np.degrees(np.sqrt(record.metrics["best_validation_loss"])) < 0.15
     assert record.metrics["best_validation_loss"] == pytest.approx(
         np.mean(
-            (estimator.estimate([held_out])[0]["sideslip"] - held_out["sideslip_ref"])[30:] ** 2
+            (
+                estimator.estimate([validation_drive])[0]["sideslip"]
+                - validation_drive["sideslip_ref"]
+            )[30:]
+            ** 2
         )
     )
-    other = estimator_class("rational_ekf").from_config({"tyres": "rational"})
-    other.load_weights(estimator.weights())
+    second_filter = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    second_filter.load_weights(estimator.weights())
     assert np.array_equal(
-        other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"]
+        second_filter.estimate([validation_drive])[0]["vy"],
+        estimator.estimate([validation_drive])[0]["vy"],
     )
 
 
@@ -306,21 +312,21 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
     """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
     train = rational_drive(60.0, seed=4)
     worn = rational_drive(60.0, seed=7, stiffness=0.85)
-    alone, both = (
+    alone, two_drives = (
         estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}})
         for spread in (None, 0.2)
     )
     alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
-    both.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
-    assert np.array_equal(alone.axle_curves, both.axle_curves)
+    two_drives.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
+    assert np.array_equal(alone.axle_curves, two_drives.axle_curves)
     np.testing.assert_allclose(
-        both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12
+        two_drives.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12
     )
     with pytest.raises(
         ConfigurationError,
         match=r"curves_from 'fit_\*' matches no training recording \(rational4\)",
     ):
-        both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
+        two_drives.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
     assert "sideslip_ref" in refusal(
         lambda: rational(noise={"tyres": 0.01}).fit(
             FitData([drive.without_references()], []), QUICK
@@ -348,17 +354,17 @@ def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
 )
 def test_optuna_finds_the_minimum_for_its_seed_and_levels_in_their_box_that_get_better():
     train = rational_drive(30.0, seed=9)
-    few, many = (
+    few_trials, many_trials = (
         estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2)
     )
     records = [
-        own.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n))
-        for own, n in ((few, 3), (many, 25))
+        search.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n))
+        for search, n in ((few_trials, 3), (many_trials, 25))
     ]
     assert [record.metrics["evaluations"] for record in records] == [3, 25]
     assert records[1].metrics["best_train_loss"] <= records[0].metrics["best_train_loss"]
     low, high = BOXES["ay"]
-    assert 10.0**low <= many.values["ay"] / many.values["yaw_rate"] <= 10.0**high
+    assert 10.0**low <= many_trials.values["ay"] / many_trials.values["yaw_rate"] <= 10.0**high
     records = [
         optuna_search(lambda p: float((p[0] - 0.3) ** 2), [(-1.0, 1.0)], 40, 7, FitContext())
         for _ in range(2)

@@ -73,14 +73,17 @@ def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_d
 def test_error_in_dropped_samples_teaches_nothing(name):
     """References that differ only where every possible sequence drops its samples lead to the same weights."""
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
-    whole = _drive(seed=1)
+    complete = _drive(seed=1)
     spoilt = {
-        **whole.channels,
-        "vy_ref": np.where(np.arange(250) < 20, -whole["vy_ref"], whole["vy_ref"]),
+        **complete.channels,
+        "vy_ref": np.where(np.arange(250) < 20, -complete["vy_ref"], complete["vy_ref"]),
     }
     # means and deviations of the references must not move either
     estimators = []
-    for drive in (whole, Recording(whole.id, whole.vehicle, 100.0, 0.0, spoilt, "simulated")):
+    for drive in (
+        complete,
+        Recording(complete.id, complete.vehicle, 100.0, 0.0, spoilt, "simulated"),
+    ):
         estimator = _estimator(name, outputs=["vy"])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(velocity_recurrent.VelocityNetwork, "standardise", lambda *_: None)
@@ -101,8 +104,8 @@ def test_members_train_as_if_alone_and_seeds_differ(name):
 
 
 def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path):
-    whole = _estimator("velocity_gru", dropout=0.3)
-    record = whole.fit(DATA, QUICK)
+    uninterrupted = _estimator("velocity_gru", dropout=0.3)
+    record = uninterrupted.fit(DATA, QUICK)
     stopped = _estimator("velocity_gru", dropout=0.3).fit(
         DATA, QUICK, FitContext([tmp_path], should_stop=stop_after(4))
     )
@@ -110,7 +113,7 @@ def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(t
     assert 0 < stopped.metrics["epochs"] < 3
     resumed = _estimator("velocity_gru", dropout=0.3)
     assert resumed.fit(DATA, QUICK, FitContext([tmp_path])).history == record.history
-    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
+    assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
 def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropout_keeps_the_mean():
@@ -118,7 +121,7 @@ def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropou
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, QUICK, recordings, recordings[:1])
     generator = torch.Generator().manual_seed(0)
-    known = [
+    drive_rows = [
         {tuple(row) for row in _drives(estimator, [recording]).inputs.tolist()}
         for recording in recordings
     ]
@@ -129,7 +132,7 @@ def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropou
         for sequence in sequences:
             rows = {tuple(row) for row in sequence.tolist()}
             assert len(rows) == 60
-            assert sum(rows <= drive for drive in known) == 1
+            assert sum(rows <= drive for drive in drive_rows) == 1
         firsts.append(sorted(sequence[0, 0].item() for sequence in sequences))
     assert firsts[0] != firsts[1] != firsts[2]
     estimator = _estimator("velocity_gru", dropout=0.25, n_states=64)
@@ -159,10 +162,8 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
     lengths = set()
     for seed in range(2):
         batches = list(phase.batches(torch.Generator().manual_seed(seed)))
-        found = [
-            tuple(row) for batch in batches for row in batch.inputs[batch.counted > 0].tolist()
-        ]
-        assert sorted(found) == expected
+        rows = [tuple(row) for batch in batches for row in batch.inputs[batch.counted > 0].tolist()]
+        assert sorted(rows) == expected
         assert not batches[0].goes_on
         assert any(batch.goes_on for batch in batches)
         lengths |= {batch.inputs.shape[1] for batch in batches}
@@ -179,25 +180,25 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
     network = estimator.network
     drive = _drive(0.6, 1)
     phase = _phase(estimator, training, [drive], DATA.validation)
-    whole = _drives(estimator, [drive]).padded(torch.tensor([[0, 60]]), 0)
-    parts = [whole.stretch(0, 30), whole.stretch(30, 60)]
-    together = phase.loss(whole).detach()
-    apart = [phase.loss(part) for part in parts]
+    batch = _drives(estimator, [drive]).padded(torch.tensor([[0, 60]]), 0)
+    parts = [batch.stretch(0, 30), batch.stretch(30, 60)]
+    together = phase.loss(batch).detach()
+    part_losses = [phase.loss(part) for part in parts]
     assert float(together) == pytest.approx(
-        float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4
+        float(sum(part.detach() for part in part_losses)) / 2.0, rel=1e-4
     )
-    gradients = torch.autograd.grad(apart[1], list(network.parameters()), allow_unused=True)
+    gradients = torch.autograd.grad(part_losses[1], list(network.parameters()), allow_unused=True)
     with torch.no_grad():
         _, state = network(parts[0].inputs, network.start(parts[0].starts))
     outputs, _ = network(parts[1].inputs, state)
     weights = torch.tensor([0.2225, 0.5064, 0.1566])
     alone = ((outputs - parts[1].targets).square() @ weights).mean()
-    for one, other in zip(
+    for first, second in zip(
         gradients,
         torch.autograd.grad(alone, list(network.parameters()), allow_unused=True),
         strict=True,
     ):
-        assert torch.allclose(one, other, rtol=1e-3, atol=1e-6)
+        assert torch.allclose(first, second, rtol=1e-3, atol=1e-6)
 
 
 def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
@@ -208,9 +209,11 @@ def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
         iter(_phase(estimator, training, DATA.train[:1], DATA.train[:1]).batches(torch.Generator()))
     )
     signs = {"yaw_rate": -1.0, "ax": 1.0, "ay": -1.0}
-    known = {tuple(row) for row in drives.inputs.tolist()}
-    own = (turned.inputs * torch.tensor([signs[name] for name in INPUTS])).reshape(-1, 3).tolist()
-    assert {tuple(row) for row in own} <= known
+    input_rows = {tuple(row) for row in drives.inputs.tolist()}
+    mirrored_rows = (
+        (turned.inputs * torch.tensor([signs[name] for name in INPUTS])).reshape(-1, 3).tolist()
+    )
+    assert {tuple(row) for row in mirrored_rows} <= input_rows
     row = turned.inputs[0, 0] * torch.tensor([-1.0, 1.0, -1.0])
     place = next(k for k, values in enumerate(drives.inputs) if torch.equal(values, row))
     expected = drives.targets[place] * torch.tensor([1.0, -1.0, -1.0])
@@ -219,15 +222,15 @@ def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
 
 def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not():
     drive = _drive(seed=5).without_references()
-    given = {"vx": 10.0, "vy": 3.0, "yaw_rate": 1.0}
+    initial_state = {"vx": 10.0, "vy": 3.0, "yaw_rate": 1.0}
     measured = {"vx": drive["vx"][0], "vy": 0.0, "yaw_rate": drive["yaw_rate"][0]}
     for name in NAMES:
         estimator = _estimator(name)
         estimator.fit(DATA, QUICK)
-        free, started, told = (
-            estimator.estimate([drive], state)[0] for state in (None, given, measured)
+        free, started, from_state = (
+            estimator.estimate([drive], state)[0] for state in (None, initial_state, measured)
         )
-        assert np.array_equal(free["vy"], told["vy"])
+        assert np.array_equal(free["vy"], from_state["vy"])
         assert np.array_equal(free["vy"], started["vy"]) == (name == "velocity_gru")
         assert abs(free["vy"][-1] - started["vy"][-1]) < 1e-3, "it forgets where it started"
 
@@ -237,11 +240,11 @@ def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name, monk
     estimator = _estimator(name)
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     drive = _drive(seed=5).without_references()
-    whole = estimator.estimate([drive])[0]
+    undivided = estimator.estimate([drive])[0]
     monkeypatch.setattr(velocity_recurrent, "CHUNK", 37)
     pieces = estimator.estimate([drive])[0]
     for quantity in ("vx", "vy", "yaw_rate"):
-        assert np.abs(whole[quantity] - pieces[quantity]).max() < 1e-12
+        assert np.abs(undivided[quantity] - pieces[quantity]).max() < 1e-12
 
 
 def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():

@@ -45,21 +45,21 @@ DRIVES = {
     "cnn_ukf": lambda seed: dugoff_drive(JUMP, seed),
     "learned_ukf": lambda seed: small_car_drive(JUMP, seed),
 }
-EVERY = pytest.mark.parametrize("name", CONFIGS)
+EVERY_FILTER = pytest.mark.parametrize("name", CONFIGS)
 
 
 def estimator(name, gate=None):
     """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
-    made = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
-    made.seed(0)
+    gated = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
+    gated.seed(0)
     if name in ("ensemble_ukf", "cnn_ukf"):
-        network = made.network
+        network = gated.network
         network.double().reset([torch.Generator().manual_seed(0)])
         with torch.no_grad():
             network.get_parameter("bias_3")[0, 1:] = torch.tensor([0.0, -6.0, -6.0])
     if name.startswith("learned_ukf"):
-        made.filter.reset(torch.Generator().manual_seed(0))
-    return made
+        gated.filter.reset(torch.Generator().manual_seed(0))
+    return gated
 
 
 @cache
@@ -77,14 +77,14 @@ def drive(name):
 
 def spoilt(name, value):
     """The drive with one wild sample of ay."""
-    own = drive(name)
-    ay = own["ay"].copy()
-    ay[round(SPIKE * own.rate_hz)] = value
-    return replace(own, channels={**own.channels, "ay": ay})
+    recording = drive(name)
+    ay = recording["ay"].copy()
+    ay[round(SPIKE * recording.rate_hz)] = value
+    return replace(recording, channels={**recording.channels, "ay": ay})
 
 
-def vy(made, recording):
-    return made.estimate([recording])[0]["vy"]
+def vy(gated, recording):
+    return gated.estimate([recording])[0]["vy"]
 
 
 @pytest.mark.parametrize(
@@ -104,26 +104,26 @@ def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
 
 
 def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
-    made = estimator("cnn_ukf", 6.0)
-    own = made.pseudo_of
+    gated = estimator("cnn_ukf", 6.0)
+    pseudo_of = gated.pseudo_of
     at = round(SPIKE * 100.0)
-    sure = lambda inputs: own(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
-    monkeypatch.setattr(made, "pseudo_of", sure)
-    clean = vy(made, drive("cnn_ukf"))
+    sure = lambda inputs: pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
+    monkeypatch.setattr(gated, "pseudo_of", sure)
+    clean = vy(gated, drive("cnn_ukf"))
 
     def wild(inputs):
-        said = sure(inputs)
-        angle = said.sideslip.copy()
+        pseudo = sure(inputs)
+        angle = pseudo.sideslip.copy()
         angle[at] += 1.0
-        return said._replace(sideslip=angle)
+        return pseudo._replace(sideslip=angle)
 
-    monkeypatch.setattr(made, "pseudo_of", wild)
-    assert np.abs(vy(made, drive("cnn_ukf")) - clean).max() < 0.1
-    made.settings = replace(made.settings, gate=None)
-    assert np.abs(vy(made, drive("cnn_ukf")) - clean).max() > 0.5
+    monkeypatch.setattr(gated, "pseudo_of", wild)
+    assert np.abs(vy(gated, drive("cnn_ukf")) - clean).max() < 0.1
+    gated.settings = replace(gated.settings, gate=None)
+    assert np.abs(vy(gated, drive("cnn_ukf")) - clean).max() > 0.5
 
 
-@EVERY
+@EVERY_FILTER
 def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name):
     gated = vy(estimator(name, 6.0), drive(name))
     free = vy(estimator(name), drive(name))
@@ -132,7 +132,7 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
     assert np.sqrt(np.mean((gated - free)[back:] ** 2)) < 0.02 * max(size, 1.0)
 
 
-@EVERY
+@EVERY_FILTER
 def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(
     name,
 ):
@@ -148,12 +148,12 @@ def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_
     )
 
 
-@EVERY
+@EVERY_FILTER
 def test_online_with_a_gate_is_batch_with_a_gate(name):
     recording = spoilt(name, 1e4)
-    made = estimator(name, 4.0)
-    batch = vy(made, recording)
-    stepper = made.online()
+    gated = estimator(name, 4.0)
+    batch = vy(gated, recording)
+    stepper = gated.online()
     online = [
         stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"]
         for k in range(len(recording))
@@ -162,8 +162,8 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
         1e-6 if name.startswith("learned_ukf") else 1e-9
     )
     if name != "factor_graph":
-        taken = made.estimate([recording])[0]["nis_dof"]
-        assert taken[round(SPIKE * recording.rate_hz)] < taken.max()
+        n_accepted = gated.estimate([recording])[0]["nis_dof"]
+        assert n_accepted[round(SPIKE * recording.rate_hz)] < n_accepted.max()
 
 
 def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
@@ -184,19 +184,19 @@ FILTERS = (
     "cnn_ukf",
     "learned_ukf",
 )
-OTHERS = [
+UNGATED = [
     name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")
 ]  # whose stepper is that of cnn_ukf
-known = cache(fitted)
+fitted_once = cache(fitted)
 
 
 def ready(name):
     """Filters as they start to learn, the others fitted."""
     if name not in FILTERS:
-        return known(name)
-    made = estimator(name, 5.0)
-    made.seed(0)
-    return made
+        return fitted_once(name)
+    gated = estimator(name, 5.0)
+    gated.seed(0)
+    return gated
 
 
 def rows(name):
@@ -226,20 +226,20 @@ def motion(steps):
 @pytest.mark.parametrize(
     ("name", "wrong"),
     [
-        *product((*FILTERS, *OTHERS), (missing, none)),
+        *product((*FILTERS, *UNGATED), (missing, none)),
         *product(FILTERS, (infinite,)),
     ],  # others take an infinite value
 )
 def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
-    made = ready(name)
+    stepper = ready(name)
     samples = rows(name)
-    calm = made.online()
-    disturbed = made.online()
+    calm = stepper.online()
+    disturbed = stepper.online()
     expected = motion([calm.step(row) for row in samples])
-    found = []
+    estimates = []
     for k, row in enumerate(samples):
         if k in (0, 1, 20, 21, 40):
             with pytest.raises((DataError, TypeError)):
                 disturbed.step(wrong(row))
-        found.append(disturbed.step(row))
-    assert np.array_equal(motion(found), expected, equal_nan=True)
+        estimates.append(disturbed.step(row))
+    assert np.array_equal(motion(estimates), expected, equal_nan=True)

@@ -80,7 +80,7 @@ def test_threads_do_not_change_a_bit_of_the_ksnn(dtype):
         together = value_and_gradient(True)
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
+    assert all(torch.equal(first, second) for first, second in zip(alone, together, strict=True))
 
 
 def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
@@ -207,15 +207,15 @@ def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshol
 
 
 def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch, tmp_path):
-    seen = []
+    n_threads = []
 
     def threads():
         return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
     job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train", output=tmp_path))
-    monkeypatch.setattr(group, "find", lambda *_: seen.extend(threads()) or job)
+    monkeypatch.setattr(group, "find", lambda *_: n_threads.extend(threads()) or job)
     monkeypatch.setattr(group, "_member", lambda *_: None)
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with
         group.Group([job], SimpleNamespace()).run(lambda: False, lambda progress: None)
-        assert set(seen) == {1}
+        assert set(n_threads) == {1}
         assert set(threads()) == {2}

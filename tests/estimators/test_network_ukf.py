@@ -16,7 +16,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import EndToEnd, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.ensemble_ukf import EnsembleSettings, scaled_variance
-from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter, error_over
+from vehest.estimators.filtering.track_filter import EXACT_STATE_DEVIATION, TrackFilter, error_over
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
@@ -177,7 +177,7 @@ def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_wher
 def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch):
     """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
     monkeypatch.setattr(
-        cnn_ukf, "START", (KNOWN, KNOWN)
+        cnn_ukf, "START", (EXACT_STATE_DEVIATION, EXACT_STATE_DEVIATION)
     )  # as precise as a state that is handed over
     estimator, training = end_to_end()
     recording = DATA.train[1]

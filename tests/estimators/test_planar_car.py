@@ -91,25 +91,30 @@ def through_the_filter(car, compiled, dtype):
 @pytest.mark.parametrize("kind", CARS)
 def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
     car = a_car(kind)
-    (known, gradients), (mean, own) = (
+    (readable_mean, gradients), (mean, compiled_gradients) = (
         through_the_filter(car, compiled, torch.float64) for compiled in (False, True)
     )
-    assert torch.allclose(mean, known, rtol=0, atol=1e-10)
-    assert gradients.keys() == own.keys()
+    assert torch.allclose(mean, readable_mean, rtol=0, atol=1e-10)
+    assert gradients.keys() == compiled_gradients.keys()
     for name, gradient in gradients.items():
         assert torch.allclose(
-            own[name], gradient, rtol=0, atol=1e-8 * float(gradient.abs().max()) + 1e-14
+            compiled_gradients[name],
+            gradient,
+            rtol=0,
+            atol=1e-8 * float(gradient.abs().max()) + 1e-14,
         ), name
         assert float(gradient.abs().max()) > 0, name
 
 
 def test_in_single_precision_values_agree_and_gradients_survive_a_crawl():
     car = a_car(dtype=torch.float32)
-    mean, own = through_the_filter(car, True, torch.float32)
-    known, gradients = through_the_filter(car.double(), False, torch.float64)
-    assert mean.double() == pytest.approx(known, abs=1e-4)
+    mean, single_gradients = through_the_filter(car, True, torch.float32)
+    double_mean, gradients = through_the_filter(car.double(), False, torch.float64)
+    assert mean.double() == pytest.approx(double_mean, abs=1e-4)
     for name, gradient in gradients.items():
-        assert float((own[name].double() - gradient).norm() / gradient.norm()) < 1e-3, name
+        assert (
+            float((single_gradients[name].double() - gradient).norm() / gradient.norm()) < 1e-3
+        ), name
     # At 5 cm/s and sliding: squashed values have reached their ends, and what rounding leaves of their slopes must not count.
     car = a_car("NNTF in SI units")
     states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(
@@ -119,7 +124,7 @@ def test_in_single_precision_values_agree_and_gradients_survive_a_crawl():
     slopes = []
     for dtype in (torch.float64, torch.float32):
         model = CompiledPlanarCar(car.to(dtype), STEP, LOWER, dtype)
-        points, own = (
+        points, single_gradients = (
             part.to(dtype).reshape(20, 10, -1).contiguous().numpy() for part in (states, inputs)
         )
         gradients = [np.zeros(parameter.shape, points.dtype) for parameter in model.parameters]
@@ -128,7 +133,7 @@ def test_in_single_precision_values_agree_and_gradients_survive_a_crawl():
                 model,
                 3,
                 points,
-                np.ascontiguousarray(own[:, 0]),
+                np.ascontiguousarray(single_gradients[:, 0]),
                 5,
                 np.ones((20, 10, 4), points.dtype),
                 gradients,

@@ -49,24 +49,24 @@ def test_short_training_of_the_linear_ksnn_beats_the_luenberger_observer(ferrari
     assert figures["fvu"] < 0.10
 
 
-def _over_the_whole_drive(name, recording, **config):
+def _estimate_of_drive(name, recording, **config):
     """Figures over the whole recording by the common protocol; nothing of it was learnt from or tuned on."""
     estimator = estimator_class(name).from_config(config)
     assert not estimator.learns
-    whole = Span(SPAN.dataset, SPAN.recording)
+    span = Span(SPAN.dataset, SPAN.recording)
     estimate = estimator.estimate([recording.without_references()])[0]
-    return accuracy([score(estimate, Resample(20.0)(recording), whole, Protocol(20.0))])
+    return accuracy([score(estimate, Resample(20.0)(recording), span, Protocol(20.0))])
 
 
 def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(
     ferrari,
 ):
     """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""
-    assert _over_the_whole_drive("kalman", ferrari, noise={"read_from": "recording"})[
+    assert _estimate_of_drive("kalman", ferrari, noise={"read_from": "recording"})[
         "rmse_sideslip"
     ] == pytest.approx(0.87, abs=0.05)
     # Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter.
-    batch = _over_the_whole_drive("factor_graph", ferrari)["rmse_sideslip"]
-    window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
+    batch = _estimate_of_drive("factor_graph", ferrari)["rmse_sideslip"]
+    window = _estimate_of_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
     assert batch == pytest.approx(0.57, abs=0.02)
     assert batch < window < 0.87

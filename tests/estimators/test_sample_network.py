@@ -41,10 +41,10 @@ DATA = FitData([loaded_drive(seed=1), loaded_drive(4.0, seed=2)], [loaded_drive(
 
 
 def network(outputs, members=3):
-    made = SampleNetwork(5, (11, 6), outputs, members).double()
-    made.reset([torch.Generator().manual_seed(member) for member in range(members)])
+    sample_network = SampleNetwork(5, (11, 6), outputs, members).double()
+    sample_network.reset([torch.Generator().manual_seed(member) for member in range(members)])
     with torch.no_grad():
-        for name, parameter in made.named_parameters():
+        for name, parameter in sample_network.named_parameters():
             if name.startswith("bias"):
                 parameter.copy_(
                     0.1
@@ -54,10 +54,10 @@ def network(outputs, members=3):
                         dtype=torch.float64,
                     )
                 )
-    return made
+    return sample_network
 
 
-def kept(seed, layer, shape, dropout):
+def active_mask(seed, layer, shape, dropout):
     """Which values of a hidden layer (0 or 1) a member's mask leaves, (B, H)."""
     ones = np.ones(shape, np.float32)
     _activate(ones, np.zeros(shape[1], np.float32), seed, layer, round(LEVELS * dropout))
@@ -72,7 +72,7 @@ def readable(inputs, parameters, member, dropout):
         hidden = torch.relu(
             hidden @ parameters[2 * layer][member] + parameters[2 * layer + 1][member]
         )
-        mask = kept(int(SEEDS[member]), layer, (len(hidden), hidden.shape[1]), dropout)
+        mask = active_mask(int(SEEDS[member]), layer, (len(hidden), hidden.shape[1]), dropout)
         hidden = hidden * torch.as_tensor(mask) * scale
     return hidden @ parameters[4][member] + parameters[5][member]
 
@@ -96,16 +96,17 @@ def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout):
     table, _, rows = samples()
     parameters = list(network(2).parameters())
     weights = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    found = outputs_of(table[rows], parameters, SEEDS, dropout)
+    outputs = outputs_of(table[rows], parameters, SEEDS, dropout)
     expected = torch.stack(
         [readable(table[rows[member]], parameters, member, dropout) for member in range(3)]
     )
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(outputs, expected, rtol=1e-12, atol=1e-12)
     gradients = [
-        torch.autograd.grad((outcome * weights).sum(), parameters) for outcome in (found, expected)
+        torch.autograd.grad((outcome * weights).sum(), parameters)
+        for outcome in (outputs, expected)
     ]
-    for own, other in zip(*gradients, strict=True):
-        torch.testing.assert_close(own, other, rtol=1e-10, atol=1e-12)
+    for compiled_gradient, readable_gradient in zip(*gradients, strict=True):
+        torch.testing.assert_close(compiled_gradient, readable_gradient, rtol=1e-10, atol=1e-12)
 
 
 def test_losses_and_their_gradients_are_those_of_the_formulas():
@@ -114,24 +115,26 @@ def test_losses_and_their_gradients_are_those_of_the_formulas():
         parameters = list(network(outputs).parameters())
         expected = []
         for member in range(3):
-            said = readable(table[rows[member]], parameters, member, 0.2)
-            wanted = targets[rows[member]]
+            readable_outputs = readable(table[rows[member]], parameters, member, 0.2)
+            member_targets = targets[rows[member]]
             if outputs == 1:
-                expected.append((said[:, 0] - wanted).square().mean())
+                expected.append((readable_outputs[:, 0] - member_targets).square().mean())
             else:
-                variance = torch.nn.functional.softplus(said[:, 1]) + 1e-6
+                variance = torch.nn.functional.softplus(readable_outputs[:, 1]) + 1e-6
                 expected.append(
-                    torch.nn.functional.gaussian_nll_loss(said[:, 0], wanted, variance, eps=1e-12)
+                    torch.nn.functional.gaussian_nll_loss(
+                        readable_outputs[:, 0], member_targets, variance, eps=1e-12
+                    )
                 )
-        found = losses_of(table, targets, rows, parameters, SEEDS, 0.2, criterion)
-        torch.testing.assert_close(found, torch.stack(expected), rtol=1e-10, atol=1e-12)
+        compiled_losses = losses_of(table, targets, rows, parameters, SEEDS, 0.2, criterion)
+        torch.testing.assert_close(compiled_losses, torch.stack(expected), rtol=1e-10, atol=1e-12)
         scale = torch.tensor([1.0, 2.0, -1.0], dtype=torch.float64)
         gradients = [
             torch.autograd.grad((losses * scale).sum(), parameters)
-            for losses in (found, torch.stack(expected))
+            for losses in (compiled_losses, torch.stack(expected))
         ]
-        for own, other in zip(*gradients, strict=True):
-            torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-12)
+        for compiled_gradient, readable_gradient in zip(*gradients, strict=True):
+            torch.testing.assert_close(compiled_gradient, readable_gradient, rtol=1e-9, atol=1e-12)
 
 
 def test_a_member_learns_the_same_alone():
@@ -140,19 +143,19 @@ def test_a_member_learns_the_same_alone():
     alone = [parameter[1:2].detach().clone().requires_grad_() for parameter in together]
     losses_of(table, targets, rows, together, SEEDS, 0.2, squared_error).sum().backward()
     losses_of(table, targets, rows[1:2], alone, SEEDS[1:2], 0.2, squared_error).sum().backward()
-    for both, own in zip(together, alone, strict=True):
-        assert torch.equal(both.grad[1:2], own.grad)
+    for joint, single in zip(together, alone, strict=True):
+        assert torch.equal(joint.grad[1:2], single.grad)
 
 
 def test_masks_hide_their_share_and_follow_from_the_seed_and_what_is_missing_is_said():
-    mask = kept(1, 0, (400, 250), 0.2)
+    mask = active_mask(1, 0, (400, 250), 0.2)
     assert abs(mask.mean() - 205 / 256) < 3 * np.sqrt(0.2 * 0.8 / mask.size)
-    assert np.array_equal(mask, kept(1, 0, (400, 250), 0.2))
-    for other in (
-        kept(2, 0, (400, 250), 0.2),
-        kept(1, 1, (400, 250), 0.2),
+    assert np.array_equal(mask, active_mask(1, 0, (400, 250), 0.2))
+    for changed_mask in (
+        active_mask(2, 0, (400, 250), 0.2),
+        active_mask(1, 1, (400, 250), 0.2),
     ):  # as often alike as masks that know nothing of each other
-        assert (mask == other).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
+        assert (mask == changed_mask).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
     drive = dugoff_drive(2.0)
     with pytest.raises(
         DataError,

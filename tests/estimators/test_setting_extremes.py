@@ -51,10 +51,10 @@ def _start_of(drive):
 def _with_weights(estimator, weights):
     """The estimator with the weights of another one but for the numbers that its settings give."""
     numbers = getattr(estimator, "values", {})
-    given = {name: value for name, value in numbers.items() if not math.isnan(value)}
+    finite_numbers = {name: value for name, value in numbers.items() if not math.isnan(value)}
     estimator.load_weights(weights)
-    if given:
-        estimator.values |= given
+    if finite_numbers:
+        estimator.values |= finite_numbers
     return estimator
 
 

@@ -9,7 +9,12 @@ from refusals import refusal
 
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_motion
+from vehest.estimators.filtering.tyre_fit import (
+    ROAD_TYRE_LOG_C1,
+    axle_force,
+    axle_motion,
+    fit_motion,
+)
 from vehest.vehicle.parameters import SingleTrackParameters
 
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
@@ -22,8 +27,8 @@ CURVES = {
 @cache
 def car(kind, seconds, rate_hz, size):
     """What a single track with these curves does, integrated at 200 Hz."""
-    every = round(200.0 / rate_hz)
-    step = 1.0 / (every * rate_hz)
+    stride = round(200.0 / rate_hz)
+    step = 1.0 / (stride * rate_hz)
     time = np.arange(round(seconds / step)) * step
     speed = 12.0 + 4.0 * np.sin(0.11 * time)
     angle = size * (0.10 * np.sin(0.5 * time) + 0.06 * np.sin(0.83 * time))
@@ -43,7 +48,7 @@ def car(kind, seconds, rate_hz, size):
     return dict(
         zip(
             ("yaw_rate", "ay", "steer", "sideslip_ref", "vx"),
-            np.array(rows)[::every].T,
+            np.array(rows)[::stride].T,
             strict=True,
         )
     )
@@ -64,9 +69,9 @@ def drive(kind="rational", seed=0, noise=1.0, seconds=100.0, rate_hz=50.0, size=
 @pytest.mark.parametrize("kind", ["linear", "rational"])
 def test_fit_finds_the_curves_of_a_car_that_has_such_curves(kind):
     fit = fit_motion(axle_motion([drive(kind, seconds=200.0)], TRUCK), kind)
-    found = np.stack([fit.front, fit.rear])
-    np.testing.assert_allclose(found, CURVES[kind], rtol=0.03)
-    assert (np.abs(found - CURVES[kind]) < 2.0 * fit.interval).all()
+    parameters = np.stack([fit.front, fit.rear])
+    np.testing.assert_allclose(parameters, CURVES[kind], rtol=0.03)
+    assert (np.abs(parameters - CURVES[kind]) < 2.0 * fit.interval).all()
     assert (fit.interval / CURVES[kind] < 0.1).all()
 
 
@@ -78,15 +83,19 @@ def test_without_noise_the_forces_are_those_of_the_car_and_refusals_say_what_to_
             np.sqrt(np.mean((axle_force("rational", curve, slip) - force) ** 2))
             < 0.005 * np.abs(force).max()
         )
-    own = drive()
-    assert "100 are needed" in refusal(lambda: axle_motion([own.cut(0.0, 1.0)], TRUCK))
+    recording = drive()
+    assert "100 are needed" in refusal(lambda: axle_motion([recording.cut(0.0, 1.0)], TRUCK))
     with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
         fit_motion(
             axle_motion(
                 [
                     replace(
-                        own,
-                        channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]},
+                        recording,
+                        channels={
+                            **recording.channels,
+                            "ay": -recording["ay"],
+                            "yaw_rate": -recording["yaw_rate"],
+                        },
                     )
                 ],
                 TRUCK,
@@ -106,42 +115,48 @@ def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands
     """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
     fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
     assert (
-        np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]
+        np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - ROAD_TYRE_LOG_C1[0])
+        < 1.0 * ROAD_TYRE_LOG_C1[1]
     ).all()
-    found = np.array([fit.front[0], fit.rear[0]])
+    c1 = np.array([fit.front[0], fit.rear[0]])
     interval = fit.interval[:, 0]
-    np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
+    np.testing.assert_allclose(interval / c1, 1.96 * ROAD_TYRE_LOG_C1[1], rtol=0.3)
     np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
 
 
 def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
-    own = drive(noise=0.0)
+    recording = drive(noise=0.0)
     wheels = {
-        f"fy_{wheel}": np.full(len(own), value)
+        f"fy_{wheel}": np.full(len(recording), value)
         for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))
     }
     motion = axle_motion(
-        [replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True
+        [replace(recording, channels={**recording.channels, **wheels})], TRUCK, measured_forces=True
     )
     np.testing.assert_allclose(
         motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1)
     )
-    both = fit_motion(axle_motion([drive(seed=1), drive(seed=2)], TRUCK))
-    assert both.slip.shape[1] == 2 * fit_motion(axle_motion([drive(seed=1)], TRUCK)).slip.shape[1]
-    own = drive()
-    slow = np.array(own["vx"])
-    unknown = np.array(own["ay"])
+    two_drives = fit_motion(axle_motion([drive(seed=1), drive(seed=2)], TRUCK))
+    assert (
+        two_drives.slip.shape[1]
+        == 2 * fit_motion(axle_motion([drive(seed=1)], TRUCK)).slip.shape[1]
+    )
+    recording = drive()
+    slow = np.array(recording["vx"])
+    unknown = np.array(recording["ay"])
     slow[:500] = 1.0
     unknown[1000:1100] = np.nan
     motion = axle_motion(
         [
             replace(
-                own, channels={**own.channels, "vx": slow, "ay": unknown}, gappy=frozenset({"ay"})
+                recording,
+                channels={**recording.channels, "vx": slow, "ay": unknown},
+                gappy=frozenset({"ay"}),
             )
         ],
         TRUCK,
     )
     assert motion.slip.shape == motion.force.shape == (2, len(motion.block))
     assert (
-        len(motion.block) == len(own) - 500 - 100 - 24 - 12
+        len(motion.block) == len(recording) - 500 - 100 - 24 - 12
     )  # the smoothing reaches 12 samples to either side

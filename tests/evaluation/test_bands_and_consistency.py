@@ -64,9 +64,9 @@ def test_interval_score_of_a_gaussian_is_its_closed_form_and_lowest_at_the_true_
     for level in (0.5, 0.9):
         z = stats.norm.ppf(0.5 + 0.5 * level)
         expected = 2.0 * z + 2.0 / (1.0 - level) * 2.0 * (stats.norm.pdf(z) - z * stats.norm.sf(z))
-        found = interval_score(errors, np.full_like(errors, z), level)
-        assert found.mean() == pytest.approx(
-            expected, abs=4.0 * found.std() / math.sqrt(len(found))
+        score = interval_score(errors, np.full_like(errors, z), level)
+        assert score.mean() == pytest.approx(
+            expected, abs=4.0 * score.std() / math.sqrt(len(score))
         )
     errors = np.random.default_rng(1).standard_normal(100_000)
     scores = [
@@ -80,11 +80,11 @@ def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
     """Sample by sample against σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) (Gneiting & Raftery 2007, Eq. 21)."""
     z = np.linspace(-5.0, 5.0, 2001)
     exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
-    found = crps_of_levels(z, np.tile(GAUSSIAN, (len(z), 1)), LEVELS)
-    np.testing.assert_allclose(found[np.abs(z) < 2.0], exact[np.abs(z) < 2.0], atol=0.045)
+    scores = crps_of_levels(z, np.tile(GAUSSIAN, (len(z), 1)), LEVELS)
+    np.testing.assert_allclose(scores[np.abs(z) < 2.0], exact[np.abs(z) < 2.0], atol=0.045)
     weight = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
     assert weight @ exact == pytest.approx(1.0 / math.sqrt(math.pi), rel=1e-3)
-    assert weight @ found == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
+    assert weight @ scores == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
     levels = np.arange(0.002, 0.9999, 0.002)
     z = np.linspace(-2.0, 2.0, 41)
     exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
@@ -106,13 +106,13 @@ def test_intraclass_correlation_of_planted_variances():
 def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
     """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
     rng = np.random.default_rng(3)
-    held = 0
+    n_covered = 0
     for _ in range(2000):
         sizes = rng.integers(50, 150, 12).astype(float)
         sums = rng.binomial(sizes.astype(int), rng.beta(4.5, 0.5, 12)).astype(float)
         low, high = proportion_interval(sums, sizes)
-        held += low <= 0.9 <= high
-    assert held / 2000 >= 0.95 - 0.015
+        n_covered += low <= 0.9 <= high
+    assert n_covered / 2000 >= 0.95 - 0.015
 
 
 def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count():
@@ -129,9 +129,9 @@ def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count
 def test_true_bands_cover_what_they_say():
     rng = np.random.default_rng(4)
     parts = [part_of(rng), part_of(rng)]
-    own = banded(parts, BANDS)
+    banded_errors = banded(parts, BANDS)
     turns = [np.sin(part.time) for part in parts]
-    figures = band_figures(own, parts, turns, 20.0)
+    figures = band_figures(banded_errors, parts, turns, 20.0)
     assert set(figures) <= set(UNITS)
     for suffix in ("", "_vy"):
         for level in LEVELS:
@@ -143,7 +143,7 @@ def test_true_bands_cover_what_they_say():
         math.degrees(figures["width_90_vy"] / 20.0), rel=1e-3
     )
     assert figures["crps_vy"] == pytest.approx(0.1 / math.sqrt(math.pi), rel=0.05)
-    intervals = coverage_intervals(own, parts, 20.0)
+    intervals = coverage_intervals(banded_errors, parts, 20.0)
     assert set(intervals) == {
         f"coverage_{100 * level:.0f}{suffix}" for level in LEVELS for suffix in ("", "_vy")
     }
@@ -159,20 +159,26 @@ def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
     sideslip = np.where(is_scored, part.sideslip, 3.0)
     stopping = replace(part, sideslip=sideslip, is_sideslip_scored=is_scored)
     moving = replace(part.at(slice(half)), bands={q: b[:half] for q, b in part.bands.items()})
-    found = []
-    for own in (moving, stopping):
-        within = banded([own], BANDS)
-        figures = band_figures(within, [own], [None], 20.0)
-        found.append((figures, coverage_intervals(within, [own], 20.0)))
+    figures_of_parts = []
+    for drive in (moving, stopping):
+        within = banded([drive], BANDS)
+        figures = band_figures(within, [drive], [None], 20.0)
+        figures_of_parts.append((figures, coverage_intervals(within, [drive], 20.0)))
     for name in ("coverage_90", "width_90", "interval_score", "crps"):
-        assert found[1][0][name] == pytest.approx(found[0][0][name], rel=1e-12)
-    assert found[1][0]["coverage_90"] == pytest.approx(0.9, abs=0.03)
-    assert found[1][1]["coverage_90"] == pytest.approx(found[0][1]["coverage_90"], rel=1e-12)
-    assert found[1][0]["width_90_vy"] == pytest.approx(2.0 * 0.1 * GAUSSIAN[2], rel=1e-12)
+        assert figures_of_parts[1][0][name] == pytest.approx(
+            figures_of_parts[0][0][name], rel=1e-12
+        )
+    assert figures_of_parts[1][0]["coverage_90"] == pytest.approx(0.9, abs=0.03)
+    assert figures_of_parts[1][1]["coverage_90"] == pytest.approx(
+        figures_of_parts[0][1]["coverage_90"], rel=1e-12
+    )
+    assert figures_of_parts[1][0]["width_90_vy"] == pytest.approx(
+        2.0 * 0.1 * GAUSSIAN[2], rel=1e-12
+    )
     nothing = replace(part, is_sideslip_scored=np.zeros(len(part.time), dtype=bool))
     within = banded([nothing], BANDS)
     assert set(band_figures(within, [nothing], [None], 20.0)) == {
-        name for name in found[0][0] if name.endswith("_vy")
+        name for name in figures_of_parts[0][0] if name.endswith("_vy")
     }
 
 
@@ -185,16 +191,16 @@ def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
         "ay_6_": (6.0, math.inf),
     }
     masks = {name: (part.ay >= low) & (part.ay < high) for name, (low, high) in names.items()}
-    found = figures_by_regime(banded([part], BANDS), [masks], 20.0)
-    assert set(found) == {"ay_0_2", "ay_2_4", "ay_4_6"}
-    assert found["ay_0_2"]["coverage_90"] == pytest.approx(0.9, abs=0.05)
+    figures = figures_by_regime(banded([part], BANDS), [masks], 20.0)
+    assert set(figures) == {"ay_0_2", "ay_2_4", "ay_4_6"}
+    assert figures["ay_0_2"]["coverage_90"] == pytest.approx(0.9, abs=0.05)
 
 
 def flags(length, *spans):
-    found = np.zeros(length, bool)
+    flagged = np.zeros(length, bool)
     for begin, end in spans:
-        found[begin:end] = True
-    return found
+        flagged[begin:end] = True
+    return flagged
 
 
 def test_delays_and_errors_of_detections_count_from_the_fault_to_the_flag():

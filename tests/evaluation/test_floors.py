@@ -159,27 +159,31 @@ def test_bound_is_that_of_tichavsky_and_others():
     bound = posterior_bound(model, prior)
     inverse_Q = np.linalg.inv(model.process_noise)
     inverse_R = np.diag(1.0 / model.observation_noise)
-    told = [C.T @ inverse_R @ C for C in model.observation]
-    information = np.linalg.inv(prior) + told[0]
+    measured_information = [C.T @ inverse_R @ C for C in model.observation]
+    information = np.linalg.inv(prior) + measured_information[0]
     for k in range(200):
         assert np.allclose(bound[k], np.linalg.inv(information), rtol=1e-8)
         if k < 199:
             A = model.transition[k]
             D11 = A.T @ inverse_Q @ A
             D12 = -A.T @ inverse_Q
-            information = inverse_Q + told[k + 1] - D12.T @ np.linalg.solve(information + D11, D12)
+            information = (
+                inverse_Q
+                + measured_information[k + 1]
+                - D12.T @ np.linalg.solve(information + D11, D12)
+            )
 
 
 def test_long_drives_are_bounded_in_chunks_of_the_same_outcome_and_gaps_and_standstill_finitely(
     monkeypatch,
 ):
     drive = drive_of(single_track_drive(60.0), Span("d", "track"), PROTOCOL)
-    whole = cramer_rao_floor([drive], SETS[-1])
+    undivided = cramer_rao_floor([drive], SETS[-1])
     monkeypatch.setattr(floors, "CHUNK", 97)
     chunks = cramer_rao_floor([drive], SETS[-1])
     assert (chunks.vy, chunks.sideslip) == (
-        pytest.approx(whole.vy, rel=1e-9),
-        pytest.approx(whole.sideslip, rel=1e-9),
+        pytest.approx(undivided.vy, rel=1e-9),
+        pytest.approx(undivided.sideslip, rel=1e-9),
     )
     drive = single_track_drive(60.0)
     vx = drive["vx"].copy()
@@ -198,30 +202,30 @@ def test_white_and_slow_noise_are_told_apart_and_their_times_found():
     """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2 that lasts 8 s."""
     generator = np.random.default_rng(4)
     n = 48_000
-    found = split_noise([markov(generator, n, 0.2, 8.0) + 0.3 * generator.standard_normal(n)], RATE)
-    assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
-    assert found.deviation == pytest.approx(0.2, rel=0.1)
-    assert found.time_constant == pytest.approx(8.0, rel=0.35)
-    found = split_noise([0.3 * np.random.default_rng(5).standard_normal(48_000)], RATE)
-    assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
-    assert found.deviation < 0.02
-    found = gauss_markov([markov(np.random.default_rng(6), 48_000, 0.7, 2.5)], RATE)
-    assert found == Noise(0.0, pytest.approx(0.7, rel=0.1), pytest.approx(2.5, rel=0.2))
+    noise = split_noise([markov(generator, n, 0.2, 8.0) + 0.3 * generator.standard_normal(n)], RATE)
+    assert noise.density == pytest.approx(0.3**2 / RATE, rel=0.15)
+    assert noise.deviation == pytest.approx(0.2, rel=0.1)
+    assert noise.time_constant == pytest.approx(8.0, rel=0.35)
+    noise = split_noise([0.3 * np.random.default_rng(5).standard_normal(48_000)], RATE)
+    assert noise.density == pytest.approx(0.3**2 / RATE, rel=0.15)
+    assert noise.deviation < 0.02
+    noise = gauss_markov([markov(np.random.default_rng(6), 48_000, 0.7, 2.5)], RATE)
+    assert noise == Noise(0.0, pytest.approx(0.7, rel=0.1), pytest.approx(2.5, rel=0.2))
 
 
 def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_reference():
     drives = [drive_of(single_track_drive(), Span("d", "track"), PROTOCOL)]
     spread = reference_spread(drives)
     for car in (False, True):
-        found = {frozenset(inputs): cramer_rao_floor(drives, inputs, car=car) for inputs in SETS}
-        assert all(floor.vy <= spread.vy * (1 + 1e-6) for floor in found.values())
-        same_a = [inputs for inputs in found if "ay" in inputs]
+        floors = {frozenset(inputs): cramer_rao_floor(drives, inputs, car=car) for inputs in SETS}
+        assert all(floor.vy <= spread.vy * (1 + 1e-6) for floor in floors.values())
+        same_a = [inputs for inputs in floors if "ay" in inputs]
         for fewer in same_a:
             for more in same_a:
                 if fewer < more:
-                    assert found[more].vy <= found[fewer].vy * (1 + 1e-9), (fewer, more)
+                    assert floors[more].vy <= floors[fewer].vy * (1 + 1e-9), (fewer, more)
         if car:
-            assert found[frozenset({"vx", "yaw_rate"})].vy < 0.5 * spread.vy
+            assert floors[frozenset({"vx", "yaw_rate"})].vy < 0.5 * spread.vy
 
 
 def test_kinematics_tell_v_by_accelerations_in_bends_alone():
@@ -256,18 +260,18 @@ def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
     ]
     decay = math.exp(-step / 3.0)
     slow = math.exp(-step / 10.0)
-    own = KalmanFilter(dim_x=3, dim_z=1)  # v, v a sample earlier, offset
-    own.x = np.zeros((3, 1))
-    own.P = np.diag([0.8**2, 0.8**2, 0.15**2])
-    own.F = np.array([[decay, 0, 0], [1, 0, 0], [0, 0, slow]])
-    own.Q = np.diag([0.8**2 * (1 - decay**2), 0.0, 0.15**2 * (1 - slow**2)])
-    own.H = np.array([[RATE, -RATE, -1.0]])
-    own.R = np.array([[white**2]])
+    kalman = KalmanFilter(dim_x=3, dim_z=1)  # v, v a sample earlier, offset
+    kalman.x = np.zeros((3, 1))
+    kalman.P = np.diag([0.8**2, 0.8**2, 0.15**2])
+    kalman.F = np.array([[decay, 0, 0], [1, 0, 0], [0, 0, slow]])
+    kalman.Q = np.diag([0.8**2 * (1 - decay**2), 0.0, 0.15**2 * (1 - slow**2)])
+    kalman.H = np.array([[RATE, -RATE, -1.0]])
+    kalman.R = np.array([[white**2]])
     errors = []
     for k in range(n):
-        own.predict()
-        own.update(ay[k])
-        errors.append(own.x[1, 0] - v[k])
+        kalman.predict()
+        kalman.update(ay[k])
+        errors.append(kalman.x[1, 0] - v[k])
     assert cramer_rao_floor(drives, SETS[1], car=False).vy == pytest.approx(
         np.sqrt(np.mean(np.square(errors))), rel=0.1
     )

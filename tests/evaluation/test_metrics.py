@@ -13,7 +13,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import figure_intervals, segments_of
-from vehest.evaluation.lever_arm import LONGEST, lever_arm_figures
+from vehest.evaluation.lever_arm import MAX_LEVER_ARM, lever_arm_figures
 from vehest.evaluation.metrics import (
     UNITS,
     Protocol,
@@ -106,9 +106,11 @@ def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
 
 def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_have_their_states():
     zero = np.zeros(2)
-    others = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
+    other_states = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
     is_scored = np.ones(2, dtype=bool)
-    part = Scored(np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, is_scored, others)
+    part = Scored(
+        np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, is_scored, other_states
+    )
     figures = accuracy([part])
     absolute = [0.2225, 3 * 0.5064 + 2 * 0.1566]
     assert figures["mse_weighted"] == pytest.approx((0.2225 + 9 * 0.5064 + 4 * 0.1566) / 2)
@@ -136,9 +138,9 @@ def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
     assert scored.time[-1] == pytest.approx(19.95)
     assert np.allclose(scored.vy, scored.time, atol=1e-9)
     slow = _estimate(times[::50], times[::50].copy(), 2.0, 0.0)
-    held = score(slow, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
-    assert np.allclose(held.vy, np.floor(held.time * 2 + 1e-6) / 2)
-    assert (held.vy <= held.time + 1e-9).all()
+    slow_score = score(slow, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
+    assert np.allclose(slow_score.vy, np.floor(slow_score.time * 2 + 1e-6) / 2)
+    assert (slow_score.vy <= slow_score.time + 1e-9).all()
 
 
 def stopping(drive):
@@ -152,29 +154,29 @@ def stopping(drive):
 
 def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_not(drive):
     """An error of 0.1 m/s everywhere; at 0.0003 m/s it would be a sideslip of 90 degrees."""
-    own = stopping(drive)
-    estimate = _estimate(own.time, own["vy_ref"] + 0.1, 20.0, 0.0)
+    recording = stopping(drive)
+    estimate = _estimate(recording.time, recording["vy_ref"] + 0.1, 20.0, 0.0)
     everywhere, moving = (
-        accuracy([score(estimate, own, Span("d", "drive"), protocol)])
+        accuracy([score(estimate, recording, Span("d", "drive"), protocol)])
         for protocol in (Protocol(min_sideslip_speed=0.0), Protocol())
     )
-    kept = (own.time >= 1.5) & (own["vx"] > 1.0)
-    true = np.arctan2(own["vy_ref"], own["vx"])
-    error = np.degrees(np.arctan2(own["vy_ref"] + 0.1, own["vx"]) - true)[kept]
+    is_scored = (recording.time >= 1.5) & (recording["vx"] > 1.0)
+    true = np.arctan2(recording["vy_ref"], recording["vx"])
+    error = np.degrees(np.arctan2(recording["vy_ref"] + 0.1, recording["vx"]) - true)[is_scored]
     assert everywhere["max_error_sideslip"] > 80.0
     assert moving["max_error_sideslip"] == pytest.approx(np.abs(error).max())
     assert moving["rmse_sideslip"] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert moving["share_below_min_speed"] == pytest.approx(10 / (own.time >= 1.5).sum())
+    assert moving["share_below_min_speed"] == pytest.approx(10 / (recording.time >= 1.5).sum())
     assert everywhere["share_below_min_speed"] == 0.0
     assert moving["rmse_vy"] == everywhere["rmse_vy"] == pytest.approx(0.1)
     assert moving["mse_sideslip"] == everywhere["mse_sideslip"]  # of a paper: all samples
 
 
 def test_a_car_that_stands_throughout_has_no_sideslip_error_but_one_of_lateral_velocity(drive):
-    standing = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
-    own = replace(drive, channels={**drive.channels, **standing})
-    estimate = _estimate(own.time, np.full(len(own), 0.1), 20.0, 0.0)
-    part = score(estimate, own, Span("d", "drive"), Protocol())
+    at_rest = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
+    recording = replace(drive, channels={**drive.channels, **at_rest})
+    estimate = _estimate(recording.time, np.full(len(recording), 0.1), 20.0, 0.0)
+    part = score(estimate, recording, Span("d", "drive"), Protocol())
     figures = accuracy([part])
     assert (figures["rmse_vy"], figures["share_below_min_speed"]) == (pytest.approx(0.1), 1.0)
     for name in ("rmse_sideslip", "max_error_sideslip", "p99_sideslip"):
@@ -192,8 +194,8 @@ def test_speed_from_which_sideslip_is_scored_follows_the_wheelbase_unless_it_is_
     speeds = [by_car.min_sideslip_speed_on(name) for name in ("car", "model", "unknown", "other")]
     assert speeds == [1.0, 0.5, 1.0, 1.0]
     assert by_car.describe_min_sideslip_speed(["car", "model"]) == "1 m/s (car), 0.5 m/s (model)"
-    given = Protocol(min_sideslip_speed=0.1).with_wheelbases({"car": 2.7})
-    assert given.min_sideslip_speed_on("car") == 0.1
+    protocol = Protocol(min_sideslip_speed=0.1).with_wheelbases({"car": 2.7})
+    assert protocol.min_sideslip_speed_on("car") == 0.1
 
 
 def test_an_estimate_with_holes_has_no_score(drive):
@@ -207,14 +209,14 @@ def test_an_estimate_with_holes_has_no_score(drive):
 def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(drive):
     without = drive.select([name for name in drive.channels if name != "ay"])
     estimate = _estimate(drive.time, drive["vy_ref"] + 0.1 * np.sin(drive.time), 20.0, 0.0)
-    figures, known = (
-        accuracy([score(estimate, own, Span("d", "drive", 10.0, 30.0), Protocol())])
-        for own in (without, drive)
+    figures, expected = (
+        accuracy([score(estimate, recording, Span("d", "drive", 10.0, 30.0), Protocol())])
+        for recording in (without, drive)
     )
     blank = {"mse_sideslip_nonlinear", "max_error_sideslip_nonlinear"}
     assert all(math.isnan(figures[name]) for name in blank)
     assert {name: value for name, value in figures.items() if name not in blank} == {
-        name: value for name, value in known.items() if name not in blank
+        name: value for name, value in expected.items() if name not in blank
     }
     part = score(
         _estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0),
@@ -263,9 +265,9 @@ def figures(recording, vy):
 def test_a_planted_lever_arm_is_found_and_leaves_no_error_and_nothing_is_given_where_the_point_is_known_or_undeclared():
     recording = drive()
     for x in (-0.4, 0.0, 0.27):
-        found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
-        assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
-        assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx(
+        values = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
+        assert values["lever_arm"] == pytest.approx(x, abs=1e-12)
+        assert [values[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx(
             [0.0, 0.0, 0.0], abs=1e-9
         )
     for recording in (drive(None), drive({"x": 0.0, "y": 0.0})):
@@ -286,21 +288,21 @@ def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
         bounds=(-0.5, 0.5),
         method="bounded",
     )
-    found = figures(recording, vy)
-    assert found["lever_arm"] == pytest.approx(searched.x, abs=1e-4)
-    assert found["rmse_vy"] ** 2 == pytest.approx(searched.fun, rel=1e-6)
-    assert found["rmse_vy"] < accuracy([part])["rmse_vy"]
+    best = figures(recording, vy)
+    assert best["lever_arm"] == pytest.approx(searched.x, abs=1e-4)
+    assert best["rmse_vy"] ** 2 == pytest.approx(searched.fun, rel=1e-6)
+    assert best["rmse_vy"] < accuracy([part])["rmse_vy"]
 
 
 def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     recording = drive()
-    found = figures(recording, recording["vy_ref"] - 1.3 * recording["yaw_rate"])
-    assert found["lever_arm"] == -LONGEST
+    values = figures(recording, recording["vy_ref"] - 1.3 * recording["yaw_rate"])
+    assert values["lever_arm"] == -MAX_LEVER_ARM
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
-    assert found["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
+    assert values["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
     straight = replace(recording, channels={**recording.channels, "yaw_rate": np.zeros(N)})
-    found = figures(straight, recording["vy_ref"] + 0.1)
-    assert (found["lever_arm"], found["rmse_vy"]) == (0.0, pytest.approx(0.1))
+    values = figures(straight, recording["vy_ref"] + 0.1)
+    assert (values["lever_arm"], values["rmse_vy"]) == (0.0, pytest.approx(0.1))
 
 
 def driven_by(errors_deg, ay):
@@ -348,11 +350,11 @@ def test_manoeuvres_are_recordings_grouped_by_their_names():
 
 
 def test_distribution_counts_errors_in_bins_of_a_quarter_of_a_degree():
-    found = error_distribution(
+    distribution = error_distribution(
         [driven_by([0.6, -0.6, 0.1, 0.7], [0.0, 5.0, -6.0, 1.0])], nonlinear_only=False
     )
-    np.testing.assert_allclose(found.edges, [-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75])
-    np.testing.assert_array_equal(found.counts, [1, 0, 0, 1, 0, 2])
+    np.testing.assert_allclose(distribution.edges, [-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75])
+    np.testing.assert_array_equal(distribution.counts, [1, 0, 0, 1, 0, 2])
     hard = error_distribution([CALM, HARD])
     assert (hard.counts.sum(), hard.mean, hard.deviation) == (
         2,

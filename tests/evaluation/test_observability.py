@@ -30,11 +30,13 @@ def along(observation, *, transition=moved, states=None, sizes=(1.0, 1.0), noise
 def test_singular_values_of_a_linear_model_in_closed_form_with_units_and_blindness():
     # OᵀO = [[2, τ], [τ, τ²]]
     root = np.sqrt((2 - STEP**2) ** 2 + 4 * STEP**2)
-    seen = along(lambda x, u: x[:1])
-    np.testing.assert_allclose(seen.smallest, np.sqrt((2 + STEP**2 - root) / 2), rtol=1e-12)
+    observability = along(lambda x, u: x[:1])
+    np.testing.assert_allclose(
+        observability.smallest, np.sqrt((2 + STEP**2 - root) / 2), rtol=1e-12
+    )
     # two positions with noise 1: the first is known to 1, their difference over τ to √2/τ
     np.testing.assert_allclose(
-        seen.deviation, np.tile([1.0, np.sqrt(2) / STEP], (4, 1)), rtol=1e-12
+        observability.deviation, np.tile([1.0, np.sqrt(2) / STEP], (4, 1)), rtol=1e-12
     )
     blind = along(lambda x, u: x[1:])
     assert (blind.smallest == 0.0).all()

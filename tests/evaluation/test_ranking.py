@@ -75,7 +75,7 @@ def with_stop(part, seconds=12.0):
     n = round(seconds * RATE)
     columns = {"vy": 0.0, "vy_ref": 0.0, "sideslip": np.pi / 2, "sideslip_ref": 0.0, "ay": 0.0}
     stopped = {
-        name: np.append(getattr(part, name), np.full(n, own)) for name, own in columns.items()
+        name: np.append(getattr(part, name), np.full(n, value)) for name, value in columns.items()
     }
     return Scored(
         time=np.arange(len(part.time) + n) / RATE,
@@ -89,14 +89,24 @@ def test_a_stop_changes_no_ranking_and_no_interval_of_sideslip():
     errors = {"zero": 0.5, "static_map": 0.4, "good": 0.05}
     parts = {name: scored(size * coloured(generator, 2000)) for name, size in errors.items()}
     rankings = [
-        rank({(name, ""): [segments_of([own], RATE)] for name, own in those.items()}, RATE)
-        for those in (parts, {name: with_stop(own) for name, own in parts.items()})
+        rank(
+            {
+                (name, ""): [segments_of([scored_part], RATE)]
+                for name, scored_part in candidates.items()
+            },
+            RATE,
+        )
+        for candidates in (
+            parts,
+            {name: with_stop(scored_part) for name, scored_part in parts.items()},
+        )
     ]
     assert rankings[0] == rankings[1]
     assert rankings[1].winner == ("good", "")
     part = parts["zero"]
     moving, stopping = (
-        figure_intervals(segments_of([own], RATE)) for own in (part, with_stop(part))
+        figure_intervals(segments_of([scored_part], RATE))
+        for scored_part in (part, with_stop(part))
     )
     assert stopping["rmse_sideslip"] == moving["rmse_sideslip"]
     assert stopping["rmse_vy"] != moving["rmse_vy"]
@@ -119,14 +129,14 @@ def test_block_length_is_that_of_another_library(memory):
 
 def test_many_ranges_are_blocks_few_are_cut_and_equal_values_are_blocks_of_their_own():
     generator = np.random.default_rng(1)
-    many = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
-    assert list(block_labels(many, many.squared_error_vy[None])) == [
+    many_ranges = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
+    assert list(block_labels(many_ranges, many_ranges.squared_error_vy[None])) == [
         label for label in range(9) for _ in range(5)
     ]
-    few = segments_of([scored(coloured(generator, 4000)) for _ in range(2)], RATE)
-    labels = block_labels(few, few.squared_error_vy[None])
+    few_ranges = segments_of([scored(coloured(generator, 4000)) for _ in range(2)], RATE)
+    labels = block_labels(few_ranges, few_ranges.squared_error_vy[None])
     assert 2 < labels.max() + 1 < 400
-    assert not set(labels[few.piece == 0]) & set(labels[few.piece == 1])
+    assert not set(labels[few_ranges.piece == 0]) & set(labels[few_ranges.piece == 1])
     assert politis_white_length([np.ones(50)]) == 1.0
 
 
@@ -137,12 +147,12 @@ def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
     for _ in range(200):
         segments = segments_of([scored(coloured(generator, 6000, memory))], RATE)
         labels = block_labels(segments, segments.squared_error_vy[None])
-        found = root_interval(
+        interval = root_interval(
             block_sums(segments.squared_error_vy[None], labels),
             block_sums(segments.samples, labels),
             n_resamples=400,
         )
-        covered.append(found.low <= 1.0 <= found.high)
+        covered.append(interval.low <= 1.0 <= interval.high)
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
@@ -165,24 +175,26 @@ def candidates(generator, **levels):
 
 
 def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
-    found = rank(
+    ranking = rank(
         candidates(np.random.default_rng(3), good=0.1, other=0.3, zero=2.0, static_map=1.0), RATE
     )
-    assert found.winner == ("good", "good")
-    assert found.order[0] == ("good", "good")
-    assert found.beats(("other", "other"), "zero")
-    assert found.pairs[found.order[0], ("other", "other")].high < 0.0
-    low, high = found.intervals[("good", "good")]
-    assert low < found.rmse[("good", "good")] < high
+    assert ranking.winner == ("good", "good")
+    assert ranking.order[0] == ("good", "good")
+    assert ranking.beats(("other", "other"), "zero")
+    assert ranking.pairs[ranking.order[0], ("other", "other")].high < 0.0
+    low, high = ranking.intervals[("good", "good")]
+    assert low < ranking.rmse[("good", "good")] < high
     wrongly = 0
     generator = np.random.default_rng(4)
     for _ in range(10):
-        found = rank(candidates(generator, a=0.2, b=0.2, c=0.2, zero=2.0, static_map=1.0), RATE)
-        wrongly += found.winner is not None
+        ranking = rank(candidates(generator, a=0.2, b=0.2, c=0.2, zero=2.0, static_map=1.0), RATE)
+        wrongly += ranking.winner is not None
     assert wrongly <= 1
-    found = rank(candidates(np.random.default_rng(5), a=1.0, b=3.0, zero=5.0, static_map=1.0), RATE)
-    assert found.winner is None
-    assert found.beats(("b", "b"), "static_map") is False
+    ranking = rank(
+        candidates(np.random.default_rng(5), a=1.0, b=3.0, zero=5.0, static_map=1.0), RATE
+    )
+    assert ranking.winner is None
+    assert ranking.beats(("b", "b"), "static_map") is False
     without = rank(candidates(np.random.default_rng(5), a=0.1, b=3.0, zero=5.0), RATE)
     assert without.winner is None
     assert without.missing_baselines == ["static_map"]
@@ -190,7 +202,7 @@ def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
         name: [segments_of([scored(0.1 * np.ones(40))], RATE)]
         for name in (("a", "a"), ("zero", "zero"))
     }
-    found = rank(short, RATE)
-    assert found.n_blocks < 3
-    assert found.winner is None
-    assert not found.intervals
+    ranking = rank(short, RATE)
+    assert ranking.n_blocks < 3
+    assert ranking.winner is None
+    assert not ranking.intervals

@@ -55,10 +55,10 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
 
 
 def test_regimes_of_a_range_are_those_of_the_whole_drive_and_slopes_are_known_across_a_gap():
-    whole = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
+    regimes = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     cut = regimes_of(stepped_drive(), Span("d", "steps", 5.0, 20.5), Protocol(RATE, 0.0, 1.5))
     for name, mask in cut.items():
-        assert np.array_equal(mask, whole[name][130:410]), name
+        assert np.array_equal(mask, regimes[name][130:410]), name
     ramp = 3.0 * np.arange(200) / RATE
     assert np.allclose(slope(ramp, RATE), 3.0)
     ramp[50:60] = np.nan
@@ -69,15 +69,15 @@ def test_errors_of_regimes_make_up_the_error_of_all_samples():
     drive = stepped_drive()
     error = np.where(drive.time < 15, 0.1, 0.3)
     part = score(estimate_with(drive, error), drive, Span("d", "steps"), ALL)
-    found = errors_by_regime([part], [regimes_of(drive, Span("d", "steps"), ALL)], RATE)
-    assert found["straight"]["rmse_vy"] == pytest.approx(0.1)
-    assert found["ay_6_"]["rmse_vy"] == pytest.approx(0.3)
-    whole = accuracy([part])
+    errors = errors_by_regime([part], [regimes_of(drive, Span("d", "steps"), ALL)], RATE)
+    assert errors["straight"]["rmse_vy"] == pytest.approx(0.1)
+    assert errors["ay_6_"]["rmse_vy"] == pytest.approx(0.3)
+    overall = accuracy([part])
     for group in (("straight", "turning"), ("transient", "steady")):
-        assert sum(found[name]["share"] for name in group) == pytest.approx(1.0)
+        assert sum(errors[name]["share"] for name in group) == pytest.approx(1.0)
         for metric in ("rmse_vy", "rmse_sideslip"):
-            together = sum(found[name]["share"] * found[name][metric] ** 2 for name in group)
-            assert together == pytest.approx(whole[metric] ** 2)
+            together = sum(errors[name]["share"] * errors[name][metric] ** 2 for name in group)
+            assert together == pytest.approx(overall[metric] ** 2)
 
 
 def test_short_regimes_and_missing_channels_have_no_errors():
@@ -118,7 +118,7 @@ def test_the_speed_of_a_test_follows_the_car_of_its_data_set_and_another_car_eva
     for wheelbase in (None, 10.8, 1e-1):
         if wheelbase is not None:
             file = place.folder / "conf" / "dataset" / "mine.yaml"
-            lines = [own for own in file.read_text().splitlines() if not own.startswith("car:")]
+            lines = [line for line in file.read_text().splitlines() if not line.startswith("car:")]
             file.write_text("\n".join([*lines, f"car: {{wheelbase: {wheelbase}}}"]) + "\n")
         printed = json.loads(place.done("eval", *run, "--json")[0])
         folders.append(printed["folder"])

@@ -21,7 +21,7 @@ PAPER = {
     "sequence_seconds": 10,
     "initial_state": True,
 }
-GIVEN = [
+INITIAL_STATES = [
     "estimator=kalman",
     "estimator.noise.yaw_rate=0.01",
     "estimator.noise.ay=0.5",
@@ -39,27 +39,27 @@ def recording(seconds, start_time=100.0):
 
 
 def test_ranges_are_cut_from_their_starts_where_the_reference_state_is_taken_and_remainders_left_out():
-    own = recording(35.0)
+    drive = recording(35.0)
     spans = [Span("d", "r"), Span("d", "r", 103.0, 114.0), Span("d", "r", 100.0, 105.0)]
-    pieces = sequences(spans, lambda span: own, Protocol(sequence_seconds=10.0, rate_hz=100.0))
+    pieces = sequences(spans, lambda span: drive, Protocol(sequence_seconds=10.0, rate_hz=100.0))
     assert [(piece.start, piece.stop) for piece in pieces] == [
         (100.0, 110.0),
         (110.0, 120.0),
         (120.0, 130.0),
         (103.0, 113.0),
     ]
-    assert {len(own.cut(piece.start, piece.stop)) for piece in pieces} == {1000}
+    assert {len(drive.cut(piece.start, piece.stop)) for piece in pieces} == {1000}
     with pytest.raises(DataError, match="lasts as long as a sequence of 10 s"):
-        sequences(spans[2:], lambda span: own, Protocol(sequence_seconds=10.0, rate_hz=100.0))
-    own = recording(5.0)
-    state = reference_state(own, Span("d", "r", 101.0, 103.0))
+        sequences(spans[2:], lambda span: drive, Protocol(sequence_seconds=10.0, rate_hz=100.0))
+    drive = recording(5.0)
+    state = reference_state(drive, Span("d", "r", 101.0, 103.0))
     assert state == {
-        "vx": own["vx_ref"][100],
-        "vy": own["vy_ref"][100],
-        "yaw_rate": own["yaw_rate_ref"][100],
+        "vx": drive["vx_ref"][100],
+        "vy": drive["vy_ref"][100],
+        "yaw_rate": drive["yaw_rate_ref"][100],
     }
     with pytest.raises(DataError, match="recording 'r' has no 'yaw_rate_ref' at 100 s"):
-        reference_state(own.select(["vx_ref", "vy_ref"]), Span("d", "r"))
+        reference_state(drive.select(["vx_ref", "vy_ref"]), Span("d", "r"))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def steered(place):
 
 
 def test_each_sequence_is_estimated_anew_from_its_true_state(steered):
-    arguments = [*GIVEN, "split=whole", "tracking=none"]
+    arguments = [*INITIAL_STATES, "split=whole", "tracking=none"]
     assert steered("train", *arguments)[0] == 0
     code, _, err = steered(
         "eval", *arguments, *(f"evaluation.{key}={value}" for key, value in PAPER.items())
@@ -108,13 +108,13 @@ def test_each_sequence_is_estimated_anew_from_its_true_state(steered):
     estimates = [
         read_estimate(metrics.parent / "test" / f"{position}.parquet") for position in range(4)
     ]
-    assert [(len(own), own.start_time) for own in estimates] == [
+    assert [(len(estimate), estimate.start_time) for estimate in estimates] == [
         (1000, 0.0),
         (1000, 10.0),
         (1000, 20.0),
         (1000, 5.0),
     ]
-    for own in estimates:
-        assert np.sqrt(own.covariance[0].diagonal()).max() < 1e-3, (
+    for estimate in estimates:
+        assert np.sqrt(estimate.covariance[0].diagonal()).max() < 1e-3, (
             "the state was known at the first sample"
         )

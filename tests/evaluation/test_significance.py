@@ -22,9 +22,9 @@ N_SEQUENCES = 16
 LENGTH = 100
 
 
-def losses(generator, n_seeds, seed_level=0.0, own_noise=False):
+def losses(generator, n_seeds, seed_level=0.0, has_seed_noise=False):
     """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own, and a level of each seed."""
-    white = generator.standard_normal((n_seeds if own_noise else 1, N_SEQUENCES, LENGTH))
+    white = generator.standard_normal((n_seeds if has_seed_noise else 1, N_SEQUENCES, LENGTH))
     noise = signal.lfilter([1.0], [1.0, -0.95], white, axis=2)
     return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
 
@@ -69,24 +69,24 @@ def test_one_seed_and_white_noise_are_a_paired_t_test():
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
     result = compared(first, second, [1] * 60, n_resamples=40_000)
-    known = stats.ttest_rel(first[0], second[0])
-    low, high = known.confidence_interval()
+    expected = stats.ttest_rel(first[0], second[0])
+    low, high = expected.confidence_interval()
     assert result.root.dof == pytest.approx(59.0)
     assert result.mean.value == pytest.approx(first.mean() - second.mean())
     assert (result.mean.low, result.mean.high) == (
         pytest.approx(low, abs=0.01),
         pytest.approx(high, abs=0.01),
     )
-    assert result.mean.p_value == pytest.approx(known.pvalue, rel=0.1)
+    assert result.mean.p_value == pytest.approx(expected.pvalue, rel=0.1)
 
 
 def test_equal_losses_do_not_differ_and_one_block_is_refused():
-    same = np.arange(10.0)[None]
-    result = compared(same, same, [2, 1, 2, 2, 2, 1])
+    losses_of_both = np.arange(10.0)[None]
+    result = compared(losses_of_both, losses_of_both, [2, 1, 2, 2, 2, 1])
     assert result.mean.dof == 6 - 1
     assert (result.mean.value, result.mean.p_value) == (0.0, 1.0)
     with pytest.raises(DataError, match="1 blocks to resample"):
-        compared(same, same, [10])
+        compared(losses_of_both, losses_of_both, [10])
 
 
 def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch):
@@ -94,11 +94,11 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
     generator = np.random.default_rng(2)
     sizes = generator.uniform(20.0, 40.0, 12)
     sums = [sizes * generator.gamma(2.0, 1.0, (seeds, 12)) for seeds in (3, 3, 1, 2)]
-    pairs = [(sums[0], other) for other in (*sums[1:], 1.1 * sums[0])]
+    pairs = [(sums[0], second) for second in (*sums[1:], 1.1 * sums[0])]
     assert differences_of_blocks(pairs, sizes, n_resamples=400) == [
         difference_of_blocks(*pair, sizes, n_resamples=400) for pair in pairs
     ]
-    assert root_intervals(sums, sizes) == [root_interval(own, sizes) for own in sums]
+    assert root_intervals(sums, sizes) == [root_interval(candidate, sizes) for candidate in sums]
 
 
 def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone():
@@ -112,15 +112,15 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides
         39.0
     )
     generator = np.random.default_rng(1)
-    sizes, own, other = generator.uniform(0.5, 1.5, 40), *generator.standard_normal((2, 40))
-    a = float(np.var((own - other) / sizes.mean(), ddof=1)) / 40.0
+    sizes, first, second = generator.uniform(0.5, 1.5, 40), *generator.standard_normal((2, 40))
+    a = float(np.var((first - second) / sizes.mean(), ddof=1)) / 40.0
     b = 1.0 / 3.0
-    found = _degrees_of_freedom(
-        [np.tile(2.0 * sizes + own, (3, 1)), np.tile(other, (3, 1))],
+    degrees = _degrees_of_freedom(
+        [np.tile(2.0 * sizes + first, (3, 1)), np.tile(second, (3, 1))],
         sizes,
         [seeds[0] + 2.0, seeds[1]],
     )
-    assert found == pytest.approx((a + 2.0 * b) ** 2 / (a**2 / 39.0 + 2.0 * b**2 / 2.0))
+    assert degrees == pytest.approx((a + 2.0 * b) ** 2 / (a**2 / 39.0 + 2.0 * b**2 / 2.0))
 
 
 def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
@@ -184,9 +184,9 @@ def test_power_is_that_of_the_noncentral_t_and_grows_with_blocks():
     assert contrast.dof == pytest.approx(0.044**2 / (0.04**2 / 11.0 + 0.004**2 / 2.0))
     expected = stats.nct.sf(stats.t.ppf(0.975, contrast.dof), contrast.dof, 0.5 / math.sqrt(0.044))
     assert contrast.power(-0.5) == pytest.approx(expected)
-    needed = contrast.blocks_needed(0.5, 0.8)
-    assert contrast.with_blocks(needed).power(0.5) >= 0.8
-    assert contrast.with_blocks(needed - 1).power(0.5) < 0.8
+    n_blocks = contrast.blocks_needed(0.5, 0.8)
+    assert contrast.with_blocks(n_blocks).power(0.5) >= 0.8
+    assert contrast.with_blocks(n_blocks - 1).power(0.5) < 0.8
     assert contrast.blocks_needed(0.1, 0.8) is None  # the seeds' variance alone is too large
 
 
@@ -195,5 +195,7 @@ def test_degrees_of_freedom_are_at_least_those_of_two_seeds():
     rng = np.random.default_rng(0)
     contrasts = [mean_contrast(rng.normal(size=(3, 14))) for _ in range(300)]
     assert min(contrast.dof for contrast in contrasts) == 1.0
-    covered = [low <= 0.0 <= high for low, high in (own.interval() for own in contrasts)]
+    covered = [
+        low <= 0.0 <= high for low, high in (candidate.interval() for candidate in contrasts)
+    ]
     assert 0.93 < np.mean(covered) <= 1.0

@@ -21,9 +21,9 @@ RATE = 20.0
 def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_any_colour():
     """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
-    own = periodogram([noise], RATE)
-    assert own.density[1:-1].mean() == pytest.approx(
-        0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * own.n_segments)
+    density = periodogram([noise], RATE)
+    assert density.density[1:-1].mean() == pytest.approx(
+        0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * density.n_segments)
     )
     # Parseval: for noise of any colour, up to what the segments' ends weigh.
     noise = np.random.default_rng(1).standard_normal(80_000)
@@ -33,18 +33,21 @@ def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_
 
 def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
     hz = 30 / 25.6
-    own = periodogram([1.5 * np.sin(2 * np.pi * hz * np.arange(4096) / RATE)], RATE)
-    assert own.frequency[np.argmax(own.density)] == pytest.approx(hz)
-    assert own.power == pytest.approx(1.5**2 / 2, rel=1e-6)
-    assert own.density[np.abs(own.frequency - hz) > 2.5 / 25.6].max() < 1e-6 * own.density.max()
+    density = periodogram([1.5 * np.sin(2 * np.pi * hz * np.arange(4096) / RATE)], RATE)
+    assert density.frequency[np.argmax(density.density)] == pytest.approx(hz)
+    assert density.power == pytest.approx(1.5**2 / 2, rel=1e-6)
+    assert (
+        density.density[np.abs(density.frequency - hz) > 2.5 / 25.6].max()
+        < 1e-6 * density.density.max()
+    )
     generator = np.random.default_rng(2)
     long = generator.standard_normal(512 * 4)
     short = 3.0 * generator.standard_normal(512)
-    apart = [periodogram([samples], RATE) for samples in (long, short)]
+    separate = [periodogram([samples], RATE) for samples in (long, short)]
     together = periodogram([long, short], RATE)
-    assert [own.n_segments for own in (*apart, together)] == [7, 1, 8]
+    assert [density.n_segments for density in (*separate, together)] == [7, 1, 8]
     np.testing.assert_allclose(
-        together.density, (7 * apart[0].density + apart[1].density) / 8, rtol=1e-12
+        together.density, (7 * separate[0].density + separate[1].density) / 8, rtol=1e-12
     )
 
 
@@ -68,20 +71,22 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
     drive = planar_drive(seconds=600.0)
     noise = 0.4 * np.random.default_rng(3).standard_normal(len(drive))
     noisy = replace(drive, channels={**drive.channels, "ay": drive["ay"] + noise})
-    own = periodogram([process_noise(noisy)], RATE)
-    assert own.level(1.0) == pytest.approx(0.4**2 / 10.0, rel=4 / np.sqrt(6 * own.n_segments))
+    density = periodogram([process_noise(noisy)], RATE)
+    assert density.level(1.0) == pytest.approx(
+        0.4**2 / 10.0, rel=4 / np.sqrt(6 * density.n_segments)
+    )
 
 
 def test_level_is_the_mean_of_a_third_of_an_octave_and_what_cannot_be_read_is_refused():
-    own = periodogram([np.random.default_rng(4).standard_normal(2048)], RATE)
+    spectrum = periodogram([np.random.default_rng(4).standard_normal(2048)], RATE)
     inside = [
         density
-        for hz, density in zip(own.frequency, own.density, strict=True)
+        for hz, density in zip(spectrum.frequency, spectrum.density, strict=True)
         if 0.8909 <= hz <= 1.1225
     ]
-    assert own.level(1.0) == pytest.approx(np.mean(inside))
-    assert decibels(10.0 * own.level(1.0), own.level(1.0)) == pytest.approx(10.0)
-    assert "has no line at 15 Hz" in refusal(lambda: own.level(15.0))
+    assert spectrum.level(1.0) == pytest.approx(np.mean(inside))
+    assert decibels(10.0 * spectrum.level(1.0), spectrum.level(1.0)) == pytest.approx(10.0)
+    assert "has no line at 15 Hz" in refusal(lambda: spectrum.level(15.0))
     assert "series 1 lasts 25.0 s" in refusal(
         lambda: periodogram([np.zeros(600), np.zeros(500)], RATE)
     )

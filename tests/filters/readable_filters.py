@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from vehest.estimators.rational_ekf import LOST, ROLLING
+from vehest.estimators.filtering.rational_model import LOST, ROLLING
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
@@ -22,14 +22,14 @@ def sigma_points(rule, mean, factor):
 
 def mean_of(rule, values):
     """Weighted mean of values at the points, (2n + 1, m) -> (m,)."""
-    return rule.centre_mean * values[0] + rule.other * values[1:].sum(0)
+    return rule.centre_mean * values[0] + rule.outer_weight * values[1:].sum(0)
 
 
-def covariance_of(rule, deviations, others):
+def covariance_of(rule, deviations, second_deviations):
     """Weighted Σ w d eᵀ of deviations from the mean, (2n + 1, m) and (2n + 1, k) -> (m, k)."""
-    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.other * (
-        deviations[1:].mT @ others[1:]
-    )
+    return rule.centre_covariance * torch.outer(
+        deviations[0], second_deviations[0]
+    ) + rule.outer_weight * (deviations[1:].mT @ second_deviations[1:])
 
 
 def symmetric(matrix):
@@ -102,17 +102,19 @@ def unscented_filter(model, measurements, inputs, initial, rule):
     if measurements.dim() == 3:
         several = len(measurements)
         n = initial.mean.shape[-1]
-        each = zip(
+        sequences = zip(
             measurements,
             inputs,
             initial.mean.expand(several, n),
             initial.covariance.expand(several, n, n),
             strict=True,
         )
-        found = [unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in each]
-        rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in found]
+        filtered = [
+            unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in sequences
+        ]
+        rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in filtered]
         return NonlinearFiltered(
-            filtered_of(rows), torch.stack([repaired for _, repaired in found])
+            filtered_of(rows), torch.stack([repaired for _, repaired in filtered])
         )
     state = initial
     rows = []
@@ -213,7 +215,7 @@ def extended_filter(model, measurements, inputs, initial):
 def rational_model(estimator):
     """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
     track = estimator.track()
-    bound = torch.as_tensor(estimator.bounds())
+    bound = torch.as_tensor(estimator.model().bounds)
     car = estimator.car
     n_tyres = len(estimator.adapted)
     levels = estimator.values
@@ -233,7 +235,9 @@ def rational_model(estimator):
         turn = inputs[1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
         motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
         tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
-        spread = torch.as_tensor(estimator.start_tyres()) if diverged else state.covariance[4:, 4:]
+        spread = (
+            torch.as_tensor(estimator.model().start_tyres) if diverged else state.covariance[4:, 4:]
+        )
         return Gaussian(
             torch.cat([motion, tyres]),
             torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread),

@@ -49,7 +49,7 @@ def tensors(parts):
     return type(parts)(*map(torch.from_numpy, parts))
 
 
-def dense_posterior(model, measurements, initial, seen):
+def dense_posterior(model, measurements, initial, n_seen):
     """Mean and covariance of all states at once, given the measurements of the first samples; and their log-density.
 
     Written down as one normal distribution of x[0], w[0], w[1], … and v[0], v[1], …: no recursion.
@@ -70,9 +70,9 @@ def dense_posterior(model, measurements, initial, seen):
     H = block_diag(*C)
     y_mean = H @ f + d.ravel()
     y_cov = H @ prior @ H.T + np.diag(R.ravel())
-    known = ~np.isnan(measurements)
-    known[seen:] = False
-    rows = np.flatnonzero(known.ravel())
+    is_measured = ~np.isnan(measurements)
+    is_measured[n_seen:] = False
+    rows = np.flatnonzero(is_measured.ravel())
     S = y_cov[np.ix_(rows, rows)]
     cross = (prior @ H.T)[:, rows]
     error = measurements.ravel()[rows] - y_mean[rows]

@@ -77,8 +77,8 @@ def test_state_dependent_noise_is_the_formula_written_out_and_factors_of_zero_le
 def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     root = torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
-    for own, value in zip(covariance, entropy(covariance), strict=True):
-        assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
+    for matrix, value in zip(covariance, entropy(covariance), strict=True):
+        assert float(value) == pytest.approx(multivariate_normal(cov=matrix.numpy()).entropy())
     small = 1e-4 * torch.eye(5, dtype=torch.float64)
     large = 10.0 * torch.eye(5, dtype=torch.float64)
     small[0, 1] = small[1, 0] = 5e-5
@@ -97,16 +97,16 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     noise.begin(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.2]).diag(), 10.0, torch.tensor([2.0, 0.5, 1.0]))
     noise.to(dtype)
     states = torch.randn(7, 3, generator=generator).to(dtype)
-    known = noise(states, states).detach()
-    floor = float(entropy(known).median())
-    for expected, own in (
-        (known, compiled_noise(noise)),
-        (with_entropy(known, floor), compiled_noise(noise, floor)),
+    readable = noise(states, states).detach()
+    floor = float(entropy(readable).median())
+    for expected, compiled in (
+        (readable, compiled_noise(noise)),
+        (with_entropy(readable, floor), compiled_noise(noise, floor)),
     ):
-        assert covariances(own, states.numpy(), states.numpy()) == pytest.approx(
+        assert covariances(compiled, states.numpy(), states.numpy()) == pytest.approx(
             expected.numpy(), rel=tolerance, abs=tolerance
         )
-    assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"
+    assert float((with_entropy(readable, floor) - readable).abs().max()) > 0.01, "the floor is met"
 
 
 def test_level_of_white_noise_is_its_share_above_the_cutoff_without_slow_signals_offsets_gaps_and_ends():

@@ -98,21 +98,25 @@ def test_rules_are_those_of_an_independent_library():
         "symmetric": filterpy.JulierSigmaPoints(3, 0.5),
         "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0),
     }
-    for name, known in theirs.items():
+    for name, library_points in theirs.items():
         rule = RULES[name]
         points = sigma_points(
             rule, torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance))
         )
-        assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
-        assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
-        assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)
+        assert points.numpy() == pytest.approx(
+            library_points.sigma_points(mean, covariance), abs=1e-12
+        )
+        assert [rule.centre_mean, *[rule.outer_weight] * 6] == pytest.approx(library_points.Wm)
+        assert [rule.centre_covariance, *[rule.outer_weight] * 6] == pytest.approx(
+            library_points.Wc
+        )
 
 
 @pytest.mark.parametrize("name", [*RULES, "extended"])
 @pytest.mark.parametrize("missing", [0.0, 0.4])
 def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
     model, measurements, initial = example(30, missing=missing)
-    known = kalman_scan(model, measurements, initial)
+    kalman = kalman_scan(model, measurements, initial)
     y = torch.from_numpy(measurements)
     inputs = torch.arange(30, dtype=torch.float64).unsqueeze(-1)
     nonlinear = linear_as_nonlinear(tensors(model))
@@ -123,10 +127,10 @@ def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
         else unrepaired(nonlinear, y, inputs, first, RULES[name])
     )
     for part in ("predicted", "filtered"):
-        for own, theirs in zip(arrays(getattr(ours, part)), getattr(known, part), strict=True):
-            assert np.allclose(own, theirs, rtol=1e-9, atol=1e-9)
+        for values, theirs in zip(arrays(getattr(ours, part)), getattr(kalman, part), strict=True):
+            assert np.allclose(values, theirs, rtol=1e-9, atol=1e-9)
     for part in ("innovation", "innovation_covariance"):
-        assert np.allclose(getattr(ours, part), getattr(known, part), atol=1e-9)
+        assert np.allclose(getattr(ours, part), getattr(kalman, part), atol=1e-9)
 
 
 def unrepaired(*arguments):
@@ -151,7 +155,7 @@ def test_unscented_filter_is_that_of_an_independent_library(rule, points):
     ours = unscented_filter(model, measurements[0], inputs[0], initial, rule).steps
 
     def as_numpy(function):
-        return lambda x, *rest, u: function(
+        return lambda x, *arguments, u: function(
             torch.from_numpy(np.asarray(x)), torch.from_numpy(u)
         ).numpy()
 

@@ -48,32 +48,35 @@ def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
         torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64)
         for size in ((3,), (3, 3))
     ]
-    least = torch.tensor(lower, dtype=torch.float64)
+    lower_bound = torch.tensor(lower, dtype=torch.float64)
     pairs = []
     for way in (by_the_filter, by_the_scan):
         parameters = learnt(first)
         measurements = measurements.detach().requires_grad_()
-        filtered = way(parameters, rule, measurements, inputs, least, share)
+        filtered = way(parameters, rule, measurements, inputs, lower_bound, share)
         state = filtered.steps.filtered
         loss = (state.mean * weights[0]).sum() + (state.covariance * weights[1]).sum()
         pairs.append((filtered, torch.autograd.grad(loss, (*parameters, measurements))))
     return pairs
 
 
-def by_the_filter(p, rule, measurements, inputs, least, _):
+def by_the_filter(p, rule, measurements, inputs, lower_bound, _):
     model = dataclasses.replace(
         pendulum_with_radar(),
         transition=partial(swung, p.gravity),
         process_noise=constant(p.process),
         observation_noise=constant(p.observation),
-        constrain=lambda x: torch.where(x >= least, x, least),
+        constrain=lambda x: torch.where(x >= lower_bound, x, lower_bound),
     )
     return unscented_filter(model, measurements, inputs, Gaussian(p.mean, p.covariance), rule)
 
 
-def by_the_scan(p, rule, measurements, inputs, least, share):
+def by_the_scan(p, rule, measurements, inputs, lower_bound, share):
     model = TorchModel(
-        partial(swung, p.gravity), pendulum_with_radar().observation, [p.gravity], least.tolist()
+        partial(swung, p.gravity),
+        pendulum_with_radar().observation,
+        [p.gravity],
+        lower_bound.tolist(),
     )
     return unscented_scan(
         model,
@@ -99,23 +102,31 @@ def swung(gravity, x, u):
     )
 
 
-def assert_equal(one, other):
+def assert_equal(first, second):
     for name in ("filtered", "predicted"):
-        for a, b in zip(getattr(one.steps, name), getattr(other.steps, name), strict=True):
+        for a, b in zip(getattr(first.steps, name), getattr(second.steps, name), strict=True):
             assert torch.allclose(a, b, rtol=0, atol=1e-11, equal_nan=True), name
     for name in ("innovation", "innovation_covariance"):
         assert torch.allclose(
-            getattr(one.steps, name), getattr(other.steps, name), rtol=0, atol=1e-11, equal_nan=True
+            getattr(first.steps, name),
+            getattr(second.steps, name),
+            rtol=0,
+            atol=1e-11,
+            equal_nan=True,
         ), name
-    assert torch.equal(one.steps.measured, other.steps.measured)
-    assert torch.equal(one.repaired, other.repaired)
+    assert torch.equal(first.steps.measured, second.steps.measured)
+    assert torch.equal(first.repaired, second.repaired)
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
-    (filtered, gradients), (scanned, own) = both_ways(RULES[name], *measured_pendulum(30, 4))
+    (filtered, gradients), (scanned, scan_gradients) = both_ways(
+        RULES[name], *measured_pendulum(30, 4)
+    )
     assert_equal(filtered, scanned)
-    for field, a, b in zip((*Learnt._fields, "measurements"), gradients, own, strict=True):
+    for field, a, b in zip(
+        (*Learnt._fields, "measurements"), gradients, scan_gradients, strict=True
+    ):
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max())), field
         assert a.abs().sum() > 0, field
 
@@ -123,15 +134,15 @@ def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
 def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     measurements, inputs, first = measured_pendulum(30, 3)
     measurements[0, 3, 0] = measurements[1, 5] = measurements[2, 10:20, 1] = torch.nan
-    (filtered, gradients), (scanned, own) = both_ways(
+    (filtered, gradients), (scanned, scan_gradients) = both_ways(
         RULES["symmetric"], measurements, inputs, first
     )
     assert_equal(filtered, scanned)
-    for a, b in zip(gradients, own, strict=True):
+    for a, b in zip(gradients, scan_gradients, strict=True):
         assert torch.isfinite(b).all()
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
     lower = [-1e9, 0.05, 0.25]
-    (filtered, gradients), (scanned, own) = both_ways(
+    (filtered, gradients), (scanned, scan_gradients) = both_ways(
         RULES["scaled"], *measured_pendulum(30, 4), lower=lower
     )
     assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"
@@ -140,7 +151,7 @@ def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     )
     assert (scanned.steps.filtered.mean[..., 2] >= 0.25).all()
     assert_equal(filtered, scanned)
-    for a, b in zip(gradients, own, strict=True):
+    for a, b in zip(gradients, scan_gradients, strict=True):
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
@@ -192,7 +203,7 @@ def squares(way, repair=True):
 
 def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
     (filtered, slopes) = squares("filter")
-    (scanned, own) = squares("scan")
+    (scanned, scan_gradients) = squares("scan")
     assert_equal(filtered, scanned)
     ways = [
         [False] * 3,
@@ -203,7 +214,7 @@ def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
         [True, False, False],
     ]
     assert scanned.repaired.tolist() == ways
-    for a, b in zip(slopes, own, strict=True):
+    for a, b in zip(slopes, scan_gradients, strict=True):
         assert torch.allclose(
             a, b, rtol=1e-9, atol=1e-10
         )  # the fourth is conditioned like the margin of a repair, 1e6
@@ -252,13 +263,13 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
     readable = dataclasses.replace(model, process_noise=process, observation_noise=observation)
     filtered = unscented_filter(readable, measurements, inputs, first, RULES["symmetric"])
     start = Gaussian(first.mean.clone().requires_grad_(), first.covariance)
-    own = [noise_by(noise(base.detach().numpy())) for base in (p.process, p.observation)]
+    noises = [noise_by(noise(base.detach().numpy())) for base in (p.process, p.observation)]
     scanned = unscented_scan(
         TorchModel(model.transition, model.observation),
         measurements,
         inputs,
         start,
-        *own,
+        *noises,
         RULES["symmetric"],
     )
     assert torch.allclose(
@@ -319,12 +330,12 @@ def test_one_step_alone_is_the_model():
 )
 def test_shapes_that_do_not_fit_are_refused(wrong, message):
     model = pendulum_with_radar()
-    known = ANY | {"initial": Gaussian(torch.zeros(3), torch.eye(3))} | wrong
+    arguments = ANY | {"initial": Gaussian(torch.zeros(3), torch.eye(3))} | wrong
     points = TorchModel(model.transition, model.observation)
     with pytest.raises(ValueError, match=message):
         unscented_scan(
             points,
-            **known,
+            **arguments,
             process_noise=torch.eye(3),
             observation_noise=torch.eye(2),
             rule=RULES["cubature"],

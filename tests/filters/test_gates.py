@@ -62,9 +62,9 @@ def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
     model, first = walk(steps)
     truth = np.cumsum(0.1 * generator.standard_normal(steps))
     y = truth[:, None] + generator.standard_normal((steps, 2))
-    taken = kalman_scan(model, y, first, Gate(2.0, 10**9)).measured
+    is_accepted = kalman_scan(model, y, first, Gate(2.0, 10**9)).measured
     share = 2.0 * norm.sf(2.0)
-    assert 1.0 - taken.mean() == pytest.approx(
+    assert 1.0 - is_accepted.mean() == pytest.approx(
         share, abs=5.0 * math.sqrt(share / (2 * steps)) + 0.002
     )
 
@@ -77,12 +77,12 @@ def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it():
     for size in (60.0, -1e6, np.inf):
         y[20, 0] = size
         gated = kalman_scan(model, y, first, Gate(5.0, PATIENCE))
-        known = kalman_scan(model, missing, first)
+        without_outlier = kalman_scan(model, missing, first)
         assert np.argwhere(~gated.measured).tolist() == [[20, 0]]
         for name in ("filtered", "predicted"):
-            for a, b in zip(getattr(gated, name), getattr(known, name), strict=True):
+            for a, b in zip(getattr(gated, name), getattr(without_outlier, name), strict=True):
                 assert np.array_equal(a, b)
-        assert np.array_equal(gated.innovation_covariance, known.innovation_covariance)
+        assert np.array_equal(gated.innovation_covariance, without_outlier.innovation_covariance)
 
 
 def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back():
@@ -149,27 +149,30 @@ def test_gradients_through_a_gate_are_those_of_missing_measurements():
     y, u, first = outliers(30, 2)
     model = pendulum_with_radar()
     weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    taken = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps.measured
-    assert not taken.all()
-    found = []
-    for measurements, gate in ((y, Gate(4.0, PATIENCE)), (torch.where(taken, y, torch.nan), None)):
-        own = [part.clone().requires_grad_() for part in (measurements, *first)]
+    is_accepted = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps.measured
+    assert not is_accepted.all()
+    gradients = []
+    for measurements, gate in (
+        (y, Gate(4.0, PATIENCE)),
+        (torch.where(is_accepted, y, torch.nan), None),
+    ):
+        leaves = [part.clone().requires_grad_() for part in (measurements, *first)]
         noises = [
             noise(NOTHING, NOTHING).clone().requires_grad_()
             for noise in (model.process_noise, model.observation_noise)
         ]
         points = TorchModel(model.transition, model.observation)
         scanned = unscented_scan(
-            points, own[0], u, Gaussian(*own[1:]), *noises, RULES["symmetric"], gate=gate
+            points, leaves[0], u, Gaussian(*leaves[1:]), *noises, RULES["symmetric"], gate=gate
         )
-        found.append(
-            torch.autograd.grad((scanned.steps.filtered.mean * weights).sum(), (*own, *noises))
+        gradients.append(
+            torch.autograd.grad((scanned.steps.filtered.mean * weights).sum(), (*leaves, *noises))
         )
-    for a, b in zip(*found, strict=True):
+    for a, b in zip(*gradients, strict=True):
         assert torch.isfinite(a).all()
         assert torch.equal(a, b)
-    assert (found[0][0][~taken] == 0.0).all(), "what is refused teaches nothing"
-    readable = torch.where(taken, y, torch.nan).requires_grad_()
+    assert (gradients[0][0][~is_accepted] == 0.0).all(), "what is refused teaches nothing"
+    readable = torch.where(is_accepted, y, torch.nan).requires_grad_()
     mean = by_the_filter(u, first, RULES["symmetric"], readable).filtered.mean
     (theirs,) = torch.autograd.grad((mean * weights).sum(), readable)
-    assert torch.allclose(theirs, found[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))
+    assert torch.allclose(theirs, gradients[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))

@@ -669,7 +669,7 @@ def test_losses_of_a_sequence_are_those_of_a_hand_calculation():
         sideslip_ref=np.radians([0.0, -179.0]),
         ay=np.zeros(2),
         is_sideslip_scored=np.array([False, True]),
-        others=others,
+        other_states=others,
     )
     found = {name: (value, size) for name, value, size in block_errors.losses_of(scored)}
     weighted = 0.2225 * 4.0 + 0.5064 * 0.25 + 0.1566 * 0.02

@@ -42,25 +42,27 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     inputs = np.zeros((len(states), 5))
     _, forces = plain.evaluate(states, inputs)
     steer = np.array([state.steer for state in states])
-    asked = (
+    demanded = (
         forces[:, 1] * np.cos(steer[:, None] * np.array([1, 1, 0, 0]))
         - forces[:, 0] * np.sin(steer[:, None] * np.array([1, 1, 0, 0]))
     ) / forces[:, 2]
-    asked = asked[:, [1, 0, 3, 2]]  # motion.WHEELS in the library's order
+    demanded = demanded[:, [1, 0, 3, 2]]  # motion.WHEELS in the library's order
     times = np.arange(len(states)) / 1000.0
     speed = np.array([state.vx for state in states])
     for wheel in (0, 3):
         length = LENGTHS[wheel // 2]
 
         def rate(t, q, wheel=wheel, length=length):
-            return np.interp(t, times, speed) / length * (np.interp(t, times, asked[:, wheel]) - q)
+            return (
+                np.interp(t, times, speed) / length * (np.interp(t, times, demanded[:, wheel]) - q)
+            )
 
-        held = solve_ivp(
+        relaxed = solve_ivp(
             rate, (0.0, times[-1]), [0.0], t_eval=times, max_step=2e-3, rtol=1e-8, atol=1e-10
         ).y[0]
-        ours = np.array([state.held[wheel] for state in states])
-        assert np.abs(held).max() > 0.2
-        np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
+        ours = np.array([state.lateral_ratio[wheel] for state in states])
+        assert np.abs(relaxed).max() > 0.2
+        np.testing.assert_allclose(ours, relaxed, atol=0.01 * np.abs(relaxed).max())
 
 
 def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_refused():
@@ -121,9 +123,9 @@ def test_tyres_warm_up_and_wear_which_the_plant_feels_and_the_driver_does_not_kn
 def test_corrections_have_their_size_and_their_band():
     hands = Hands(0.8, np.random.default_rng(0))
     times = np.arange(0.0, 400.0, 0.01)
-    asked = np.array([hands.at(time, 1.0) for time in times])
-    assert np.sqrt(np.mean(asked**2)) == pytest.approx(0.8, rel=0.05)
-    frequency, density = welch(asked, 100.0, nperseg=4000)
+    corrections = np.array([hands.at(time, 1.0) for time in times])
+    assert np.sqrt(np.mean(corrections**2)) == pytest.approx(0.8, rel=0.05)
+    frequency, density = welch(corrections, 100.0, nperseg=4000)
     inside = (frequency > 0.9 * LOWEST_CORRECTION) & (frequency < 1.1 * HIGHEST_CORRECTION)
     assert density[inside].sum() > 0.98 * density.sum()
     assert hands.at(1.0, 0.0) == pytest.approx(hands.at(1.0, 1.0) / 3.0)
@@ -137,18 +139,18 @@ def test_installations_have_a_gain_a_bias_and_a_speed_of_wheels():
     steer = np.concatenate([np.zeros(80), np.full(20, 0.1)])
     wheels = np.full((100, 4), 30.0 / 0.32)
     wheels[90:] *= 0.8  # locking
-    shown = measure(
+    channels = measure(
         motion_of(100, vx=30.0, steer=steer, wheel_speed=wheels), only(speed_of_wheels=True), 0
     )["vx"]
-    np.testing.assert_allclose(shown[:80], 30.0)
-    np.testing.assert_allclose(shown[90:], 24.0)
+    np.testing.assert_allclose(channels[:80], 30.0)
+    np.testing.assert_allclose(channels[90:], 24.0)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
 def test_roll_leaks_by_its_share_and_sign(share):
     motion = motion_of(10, roll=0.03)
-    shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
-    np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
+    ay = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
+    np.testing.assert_allclose(ay, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_cho
     seeds = {source("sim_bmw_unseen").seed_of(name) for name in new}
     assert not seeds & {source().seed_of(name) for name in old}
     assert len(seeds) == len(new) == 94
-    known = {
+    seeds_of = {
         str({key: value for key, value in drive.manoeuvre.items() if key != "laps"})
         for drive in old.values()
     }
@@ -116,7 +116,7 @@ def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_cho
         for name, drive in new.items()
         if "unseen" in name
     }
-    assert tested == known
+    assert tested == seeds_of
     full = split("sim_bmw_unseen")
     limited = split("sim_bmw_unseen_limited")
     assert full.train == split("sim_bmw").train
@@ -131,16 +131,19 @@ def test_new_tests_and_splits_share_ranges_and_no_seed_and_test_on_none_that_cho
 def five_seconds(name, channels):
     """A recording beyond 7 m/s² from 2.5 s on, and slower than 5 m/s from 4.5 s on."""
     sample = np.arange(500)
-    made = {"ay": np.where(sample < 250, -6.0, -8.0), "vx": np.where(sample < 450, 15.0, 4.0)}
-    made["sideslip_ref"] = np.where(sample < 400, 0.1, -0.5)
-    return Recording(name, "bmw_545i", 100.0, 0.0, made).select(channels)
+    columns = {"ay": np.where(sample < 250, -6.0, -8.0), "vx": np.where(sample < 450, 15.0, 4.0)}
+    columns["sideslip_ref"] = np.where(sample < 400, 0.1, -0.5)
+    return Recording(name, "bmw_545i", 100.0, 0.0, columns).select(channels)
 
 
 @cache
 def split(name):
     return split_from_config(
         configuration("split", name),
-        lambda dataset: {own: partial(five_seconds, own) for own in source(dataset).ids()},
+        lambda dataset: {
+            recording_id: partial(five_seconds, recording_id)
+            for recording_id in source(dataset).ids()
+        },
     )
 
 

@@ -100,9 +100,9 @@ def test_courses_do_not_come_near_themselves(name):
     course = course_by_name(name)
     places = np.stack([course.x, course.y], axis=1)[:-1]
     pairs = cKDTree(places).query_pairs(14.0, output_type="ndarray")
-    apart = np.abs(pairs[:, 0] - pairs[:, 1])
+    spacing = np.abs(pairs[:, 0] - pairs[:, 1])
     assert (
-        np.minimum(apart, len(places) - apart).max() < 60
+        np.minimum(spacing, len(places) - spacing).max() < 60
     )  # samples, a metre each: neighbours along the road only
 
 
@@ -183,9 +183,9 @@ def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_
     assert 0.85 < scale.max() <= 1.0
     edges = np.flatnonzero(np.diff(scale) != 0.0)
     assert np.diff(edges)[np.diff(edges) > 3].min() >= 15  # patches of 20 m, less their two edges
-    own = surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7})
+    surface = surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7})
     places = np.arange(1000.0)
-    np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
+    np.testing.assert_array_equal(surface.along(places, 1), surface.along(places, 2))
 
 
 def test_surfaces_and_drives_that_make_no_sense_are_refused():
@@ -214,9 +214,9 @@ def test_smoothest_line_agrees_with_a_general_solver():
     for place in (5, 12, 20, 31):
         lower[place], upper[place] = np.sort(generator.uniform(-2.0, 2.0, 2))
     reference = lsq_linear(rows, np.zeros(len(rows)), (lower, upper), tol=1e-12).x
-    found = least_within(rows.T @ rows, lower, upper)
-    np.testing.assert_allclose(found, reference, atol=5e-3)  # of bounds two metres wide
-    assert np.clip(found, lower, upper) == pytest.approx(found, abs=2e-4)
+    solution = least_within(rows.T @ rows, lower, upper)
+    np.testing.assert_allclose(solution, reference, atol=5e-3)  # of bounds two metres wide
+    assert np.clip(solution, lower, upper) == pytest.approx(solution, abs=2e-4)
 
 
 def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
@@ -243,8 +243,8 @@ def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
 def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippery_road():
     driver = Driver()
     car = car_of(MultiBodyPlant(LOWERED))
-    used = np.full_like(HANDLING.curvature, 8.0)
-    speed = speed_profile(HANDLING.curvature, used, HANDLING.arc_length[1], car, driver)
+    max_grip = np.full_like(HANDLING.curvature, 8.0)
+    speed = speed_profile(HANDLING.curvature, max_grip, HANDLING.arc_length[1], car, driver)
     lateral = speed**2 * HANDLING.curvature
     longitudinal = np.diff(speed**2) / (2.0 * HANDLING.arc_length[1])
     # Braking is planned with the air's help at the speed after it.
@@ -255,12 +255,12 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert speed.max() <= car.top_speed
     assert np.isclose(np.abs(lateral), 8.0).sum() > 5  # and uses all of it in the corners
     curvature = np.full(200, 0.02)
-    used = np.full(200, 8.0)
-    speed = speed_profile(curvature, used, 1.0, car, driver)[100]
-    helped = speed_profile(curvature, used, 1.0, car, driver, bank=np.full(200, -0.1))[
+    max_grip = np.full(200, 8.0)
+    speed = speed_profile(curvature, max_grip, 1.0, car, driver)[100]
+    helped = speed_profile(curvature, max_grip, 1.0, car, driver, bank=np.full(200, -0.1))[
         100
     ]  # a left turn, its inner side lower
-    slippery = speed_profile(curvature, 0.5 * used, 1.0, car, driver)[100]
+    slippery = speed_profile(curvature, 0.5 * max_grip, 1.0, car, driver)[100]
     # A little of the grip goes into keeping the speed against the air.
     assert speed**2 * 0.02 == pytest.approx(8.0, rel=3e-3)
     assert helped**2 * 0.02 == pytest.approx(8.0 + 9.81 * math.sin(0.1), rel=3e-3)
@@ -268,8 +268,8 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
 
 
 def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_when():
-    own = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
-    car = car_of(MultiBodyPlant(own))
+    vehicle = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
+    car = car_of(MultiBodyPlant(vehicle))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
     for wrong, complaint in (
         ({"grip": -1.0}, "grip"),
@@ -344,8 +344,8 @@ def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
     assert not any((wet.flags.spun, wet.flags.left_road, patchy.flags.spun, patchy.flags.left_road))
     place, _ = places_on(HANDLING, patchy.motion.x, patchy.motion.y)
     expected = surface_from_config("patchy").along(HANDLING.arc_length, 3, HANDLING.length)
-    apart = np.abs(patchy.motion.friction - np.interp(place, HANDLING.arc_length, expected))
-    assert np.quantile(apart, 0.9) < 1e-9  # but at the edges of a patch
+    difference = np.abs(patchy.motion.friction - np.interp(place, HANDLING.arc_length, expected))
+    assert np.quantile(difference, 0.9) < 1e-9  # but at the edges of a patch
     assert np.ptp(patchy.motion.friction) > 0.3
 
 

@@ -203,8 +203,8 @@ def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand
         0.5 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06
     )
     assert np.ptp(motion.steer[at_brakes + 5 :]) < 1e-9  # the steering is held
-    standing = np.flatnonzero(np.hypot(motion.vx, motion.vy) > 0.01)[-1]
-    assert (len(motion) - 1 - standing) / 100.0 == pytest.approx(1.0, abs=0.05)
+    last_moving = np.flatnonzero(np.hypot(motion.vx, motion.vy) > 0.01)[-1]
+    assert (len(motion) - 1 - last_moving) / 100.0 == pytest.approx(1.0, abs=0.05)
 
 
 def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
@@ -334,8 +334,8 @@ def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
     assert flags.stability_share is None
     speed = np.hypot(motion.vx, motion.vy)
     assert speed[0] > 25.0
-    standing = np.flatnonzero(speed > 0.01)[-1]
-    assert (len(motion) - 1 - standing) / 100.0 == pytest.approx(1.0, abs=0.05)
+    last_moving = np.flatnonzero(speed > 0.01)[-1]
+    assert (len(motion) - 1 - last_moving) / 100.0 == pytest.approx(1.0, abs=0.05)
     for values in (
         getattr(motion, entry.name)
         for entry in fields(motion)
@@ -346,12 +346,12 @@ def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
 
 @pytest.mark.parametrize("seed", [1, 2])  # to the right and to the left
 def test_stability_control_prevents_that_spin(seed):
-    held = go(oversteering(), seed, stability_control=True, **SPINNING)
-    assert (held.flags.spun, held.flags.completed) == (False, True)
+    trip = go(oversteering(), seed, stability_control=True, **SPINNING)
+    assert (trip.flags.spun, trip.flags.completed) == (False, True)
     # The car alone turns right around; as far as 10 degrees a driver would still be at ease.
-    assert held.flags.largest_sideslip < math.radians(10.0)
-    assert held.flags.stability_share > 0.1
-    assert held.motion.vx[-1] > 10.0  # it was not simply stopped
+    assert trip.flags.largest_sideslip < math.radians(10.0)
+    assert trip.flags.stability_share > 0.1
+    assert trip.motion.vx[-1] > 10.0  # it was not simply stopped
 
 
 def test_drives_that_are_cut_off_or_leave_the_road_are_flagged():

@@ -47,7 +47,7 @@ EVEN = replace(
 )  # all tyres alike
 
 
-def held(car, seconds, speed=0.0, **inputs):
+def coasted(car, seconds, speed=0.0, **inputs):
     """The state after some time with constant inputs."""
     plant = PlanarPlant(car)
     return plant.advance(plant.initial_state(speed), Inputs(**inputs), round(1000 * seconds))
@@ -61,7 +61,7 @@ def freestyle(seed=1, rate_hz=1000.0):
 def test_slow_motors_and_locked_wheels_have_the_forces_of_the_closed_form():
     car = replace(CAR, air_drag=1.0)
     current = 1.15 * CAR.coulomb_torque / CAR.torque_constant
-    state = held(car, 30.0, speed=1.0, current=current)
+    state = coasted(car, 30.0, speed=1.0, current=current)
     speed = state[VX]
     wheels = state[FIRST_WHEEL : FIRST_WHEEL + 4].mean()
     torque = car.torque_constant * current - car.coulomb_torque - car.viscous_torque * wheels
@@ -90,7 +90,7 @@ def test_slow_circle_is_that_of_the_axles_geometry(steer):
     rolls_freely = replace(
         CAR, coulomb_torque=0.0, viscous_torque=0.0, axle_lock=0.0, centre_lock=0.0
     )
-    state = held(rolls_freely, 1.0, speed=0.6, steer=steer)
+    state = coasted(rolls_freely, 1.0, speed=0.6, steer=steer)
     assert 0.4 < state[VX] < 0.6
     expected = state[VX] * math.tan(steer) / CAR.wheelbase
     assert state[YAW_RATE] == pytest.approx(
@@ -141,7 +141,7 @@ def test_a_drive_is_consistent_in_forces_kinematics_and_friction():
         < 0.02 * np.abs(moment).max()
     )
     rate = 1000.0
-    for shown, expected in (
+    for channel, expected in (
         (np.gradient(motion.vx) * rate - motion.vy * motion.yaw_rate, motion.ax),
         (np.gradient(motion.vy) * rate + motion.vx * motion.yaw_rate, motion.ay),
         (np.gradient(motion.yaw) * rate, motion.yaw_rate),
@@ -154,7 +154,7 @@ def test_a_drive_is_consistent_in_forces_kinematics_and_friction():
             motion.vx * np.sin(motion.yaw) + motion.vy * np.cos(motion.yaw),
         ),
     ):
-        assert np.quantile(np.abs(shown - expected)[1:-1], 0.999) < 0.02 * np.abs(expected).max()
+        assert np.quantile(np.abs(channel - expected)[1:-1], 0.999) < 0.02 * np.abs(expected).max()
     force = np.hypot(motion.tyre_fx, motion.tyre_fy)
     relative = motion.tyre_fz / (0.25 * CAR.mass * GRAVITY) - 1.0
     assert (
@@ -222,11 +222,11 @@ def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate):
 
 
 def test_a_car_at_rest_stays_at_rest_and_a_slippery_floor_lowers_what_is_reached():
-    state = held(CAR, 2.0, steer=0.4)
+    state = coasted(CAR, 2.0, steer=0.4)
     assert state[STEER] == pytest.approx(0.4)
     np.testing.assert_array_equal(state[:STEER], 0.0)
-    assert held(CAR, 2.0, current=0.5 * CAR.coulomb_torque / CAR.torque_constant)[VX] < 0.06
-    assert held(CAR, 2.0, current=30.0)[VX] > 2.0
+    assert coasted(CAR, 2.0, current=0.5 * CAR.coulomb_torque / CAR.torque_constant)[VX] < 0.06
+    assert coasted(CAR, 2.0, current=30.0)[VX] > 2.0
     floors = {
         name: drive_freely(
             PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]

@@ -141,7 +141,7 @@ class TwoTyres:
 def in_python(function):
     """A compiled function as plain Python, with all it calls: Python's sines are those of the library."""
     plain = function.py_func
-    used = {
+    functions = {
         name: plain.__globals__[name]
         for name in plain.__code__.co_names
         if name in plain.__globals__
@@ -150,7 +150,7 @@ def in_python(function):
         plain.__code__,
         {
             name: in_python(value) if isinstance(value, Dispatcher) else value
-            for name, value in used.items()
+            for name, value in functions.items()
         },
     )
 
@@ -215,11 +215,11 @@ def test_published_derivatives_are_reproduced():
     inputs = inputs_of(*PUBLISHED_INPUTS)
     state = PlantState(np.array(PUBLISHED_STATE), Regime.ROLLING)
     derivatives, _ = MultiBodyPlant(AS_PUBLISHED).evaluate([state], inputs[None])
-    same = np.setdiff1d(
+    compared = np.setdiff1d(
         np.arange(29), [25, 26]
     )  # one driven wheel spins at 200 rad/s: the plant's engine has no such power
     np.testing.assert_allclose(
-        derivatives[0, same], np.array(PUBLISHED_DERIVATIVES)[same], rtol=0.0, atol=5e-8
+        derivatives[0, compared], np.array(PUBLISHED_DERIVATIVES)[compared], rtol=0.0, atol=5e-8
     )
 
 
@@ -446,11 +446,13 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     along = road_gravity(bank=0.0, grade=0.1)[0]
     assert along > 0.0  # downhill
     state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
-    held = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
-    assert held.stands
+    stopped = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
+    assert stopped.is_standing
     rolls = plant.advance(state, inputs_of(along=along), 1000)
     assert rolls.vx == pytest.approx(along, rel=0.1)
-    motion = plant.motion([held], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1)
+    motion = plant.motion(
+        [stopped], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1
+    )
     assert motion.tyre_fx[0].sum() == pytest.approx(-plant.parameters.m * along)
     assert motion.grade[0] == 0.1
     plant = MultiBodyPlant(TRUCK)
@@ -460,9 +462,9 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
         lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5),
         12.0,
     )
-    stands = np.array([state.stands for state in states])
-    assert np.flatnonzero(stands)[0] == pytest.approx(500, abs=15)
-    assert stands[520:700].all()
+    is_standing = np.array([state.is_standing for state in states])
+    assert np.flatnonzero(is_standing)[0] == pytest.approx(500, abs=15)
+    assert is_standing[520:700].all()
     assert not motion.ax[520:700].any()
     assert not motion.wheel_speed[600:700].any()
     assert np.abs(motion.pitch[600:700]).max() < 1e-3  # the last nod is over
@@ -505,7 +507,7 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     motion, states = spin
     assert states[-1].spun
     assert not states[0].spun
-    assert states[-1].stands
+    assert states[-1].is_standing
     assert math.degrees(np.abs(motion.sideslip[motion.vx**2 + motion.vy**2 > 1.0]).max()) > 60.0
     for name in (
         field.name

@@ -119,31 +119,36 @@ def only(**levels):
     return replace(PRESETS["ideal"], **levels)
 
 
-def different(one, other):
-    assert one.keys() == other.keys()
-    return {name for name in one if not np.array_equal(one[name], other[name])}
+def differing_channels(first, second):
+    assert first.keys() == second.keys()
+    return {name for name in first if not np.array_equal(first[name], second[name])}
 
 
 def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of_the_body():
     motion = weaving()
-    shown = measure(motion, PRESETS["ideal"], seed=3)
+    channels = measure(motion, PRESETS["ideal"], seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
-        np.testing.assert_array_equal(shown[name], getattr(motion, name), err_msg=name)
+        np.testing.assert_array_equal(channels[name], getattr(motion, name), err_msg=name)
     for place, wheel in enumerate(WHEELS):
-        np.testing.assert_array_equal(shown[f"wheel_speed_{wheel}"], motion.wheel_speed[:, place])
+        np.testing.assert_array_equal(
+            channels[f"wheel_speed_{wheel}"], motion.wheel_speed[:, place]
+        )
         for axis in "xyz":
             np.testing.assert_array_equal(
-                shown[f"f{axis}_{wheel}"], getattr(motion, f"tyre_f{axis}")[:, place]
+                channels[f"f{axis}_{wheel}"], getattr(motion, f"tyre_f{axis}")[:, place]
             )
     for name in ("vx", "vy", "yaw_rate"):
-        np.testing.assert_array_equal(shown[f"{name}_ref"], getattr(motion, name))
-    np.testing.assert_array_equal(shown["sideslip_ref"], motion.sideslip)
-    shown = measure(weaving(1.0), SensorLevels(), seed=0)
-    assert set(shown) <= set(CHANNELS)
-    assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
-    assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
+        np.testing.assert_array_equal(channels[f"{name}_ref"], getattr(motion, name))
+    np.testing.assert_array_equal(channels["sideslip_ref"], motion.sideslip)
+    channels = measure(weaving(1.0), SensorLevels(), seed=0)
+    assert set(channels) <= set(CHANNELS)
+    assert {"roll", "pitch", "handwheel"}.isdisjoint(channels)
+    assert len(channels) == 2 + 5 + 4 + 12 + 2 + 4
     nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
-    assert different(measure(motion, nothing, 0), measure(motion, PRESETS["ideal"], 1)) == set()
+    assert (
+        differing_channels(measure(motion, nothing, 0), measure(motion, PRESETS["ideal"], 1))
+        == set()
+    )
 
 
 def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_none():
@@ -171,7 +176,11 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
         20_000, wheel_speed=np.repeat(np.linspace(0.0, 100.0, 20_000)[:, None], 4, axis=1)
     )
     shaken = measure(motion, only(vibration=Vibration(yaw_rate=0.01, ax=0.1, ay=0.2)), seed=3)
-    assert different(shaken, measure(motion, PRESETS["ideal"], seed=3)) == {"yaw_rate", "ax", "ay"}
+    assert differing_channels(shaken, measure(motion, PRESETS["ideal"], seed=3)) == {
+        "yaw_rate",
+        "ax",
+        "ay",
+    }
     for name, per_speed in (("yaw_rate", 0.01), ("ax", 0.1), ("ay", 0.2)):
         for part in (slice(1_000, 3_000), slice(17_000, 19_000)):
             expected = per_speed * np.sqrt((motion.wheel_speed[part, 0] ** 2).mean())
@@ -183,15 +192,17 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
 def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz):
     # 20,000 samples: the standard deviation is known to 0.5 %, a correlation to 0.007; four of either are allowed.
-    shown = measure(motion_of(20_000, rate_hz, vx=20.0), only(ay=SensorLevel(noise=0.01)), seed=5)
-    assert np.std(shown["ay"]) == pytest.approx(0.01 * math.sqrt(rate_hz / 2.0), rel=0.02)
-    frequency, power = signal.welch(shown["ay"], rate_hz, nperseg=256)
+    channels = measure(
+        motion_of(20_000, rate_hz, vx=20.0), only(ay=SensorLevel(noise=0.01)), seed=5
+    )
+    assert np.std(channels["ay"]) == pytest.approx(0.01 * math.sqrt(rate_hz / 2.0), rel=0.02)
+    frequency, power = signal.welch(channels["ay"], rate_hz, nperseg=256)
     low = power[(frequency > 0) & (frequency < rate_hz / 4)].mean()
     high = power[frequency > rate_hz / 4].mean()
     assert math.sqrt(low) == pytest.approx(0.01, rel=0.05)
     assert math.sqrt(high) == pytest.approx(0.01, rel=0.05)
-    assert abs(np.corrcoef(shown["ay"][1:], shown["ay"][:-1])[0, 1]) < 0.03
-    assert stats.kstest(shown["ay"] / np.std(shown["ay"]), "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(channels["ay"][1:], channels["ay"][:-1])[0, 1]) < 0.03
+    assert stats.kstest(channels["ay"] / np.std(channels["ay"]), "norm").pvalue > 1e-3
 
 
 def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel():
@@ -230,12 +241,12 @@ def test_drift_is_a_stationary_gauss_markov_process():
 
 def test_quantisation_error_is_uniform_within_half_a_step():
     ramp = np.linspace(0.0, 1.0, 50_001) ** 2
-    shown = measure(
+    values = measure(
         motion_of(len(ramp), steer=ramp), only(steer=SensorLevel(quantisation=0.001)), seed=0
     )["steer"]
-    steps = shown / 0.001
+    steps = values / 0.001
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    error = shown - ramp
+    error = values - ramp
     assert np.abs(error).max() <= 0.0005 + 1e-12
     assert np.std(error) == pytest.approx(0.001 / math.sqrt(12.0), rel=0.02)
     assert stats.kstest(error[::7], stats.uniform(-0.0005, 0.001).cdf).pvalue > 1e-3
@@ -245,21 +256,21 @@ def test_quantisation_error_is_uniform_within_half_a_step():
 def test_delay_of_a_sine_is_its_phase(delay):
     # At 5 Hz and 100 Hz sampling the cubic between samples loses up to 3/128 (2π·0.05)⁴ = 0.02 % of the amplitude.
     t = np.arange(1000) / 100.0
-    shown = measure(
+    values = measure(
         motion_of(1000, yaw_rate=np.sin(2.0 * np.pi * 5.0 * t)),
         only(yaw_rate=SensorLevel(delay=delay)),
         seed=0,
     )["yaw_rate"]
     late = math.ceil(delay * 100.0) + 1
     np.testing.assert_allclose(
-        shown[late:-1], np.sin(2.0 * np.pi * 5.0 * (t[late:-1] - delay)), atol=3e-4
+        values[late:-1], np.sin(2.0 * np.pi * 5.0 * (t[late:-1] - delay)), atol=3e-4
     )
 
 
 def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
     ramp = 5.0 + np.arange(50.0)
-    whole = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.03)), seed=0)["vx"]
-    np.testing.assert_array_equal(whole, np.concatenate([[5.0, 5.0, 5.0], ramp[:-3]]))
+    delayed_ramp = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.03)), seed=0)["vx"]
+    np.testing.assert_array_equal(delayed_ramp, np.concatenate([[5.0, 5.0, 5.0], ramp[:-3]]))
     parts = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.034)), seed=0)["vx"]
     np.testing.assert_allclose(parts[6:-1], ramp[6:-1] - 3.4, atol=1e-12)
     assert parts[0] == parts[2] == 5.0
@@ -271,9 +282,9 @@ def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
     ("angle", "ax", "ay"), [("roll", 0, 1), ("bank", 0, 1), ("pitch", -1, 0), ("grade", -1, 0)]
 )
 def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, ax, ay):
-    shown = measure(motion_of(3, **{angle: 0.05}), only(tilt=Tilt()), seed=0)
-    np.testing.assert_allclose(shown["ax"], ax * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(shown["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
+    channels = measure(motion_of(3, **{angle: 0.05}), only(tilt=Tilt()), seed=0)
+    np.testing.assert_allclose(channels["ax"], ax * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(channels["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
 
 
 def test_specific_force_and_gyros_are_those_of_turned_axes():
@@ -285,14 +296,14 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
-    shown = body_rates(motion, Tilt())
+    rates = body_rates(motion, Tilt())
     t = 3.21
     h = 1e-5
     k = 321
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
     at = lambda s: _turn_z(yaw(s)) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s))  # noqa: E731
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
-    np.testing.assert_allclose(shown[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
+    np.testing.assert_allclose(rates[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][
         0
     ] == pytest.approx(0.6 * math.sin(0.05))
@@ -316,16 +327,16 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
 def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
     # Yaw rate 0.5 t about the centre: tangential 0.5 l, centripetal (0.5 t)² l; central differences of a line are exact.
     t = np.arange(200) / 100.0
-    shown = measure(
+    channels = measure(
         motion_of(200, yaw_rate=0.5 * t), only(imu=Mounting(lever_x=1.2, lever_y=-0.4)), seed=0
     )
-    np.testing.assert_allclose(shown["ax"], 0.5 * 0.4 - (0.5 * t) ** 2 * 1.2, atol=1e-12)
-    np.testing.assert_allclose(shown["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
+    np.testing.assert_allclose(channels["ax"], 0.5 * 0.4 - (0.5 * t) ** 2 * 1.2, atol=1e-12)
+    np.testing.assert_allclose(channels["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
     # Place R(t) l by differentiation, with all three rates at work; differences over 10 ms are good to 1e-3 of the amplitude.
     motion = weaving()
     lever = np.array([1.0, -0.6, 0.8])
     levels = only(imu=Mounting(*lever), tilt=Tilt(bank=False, grade=False))
-    shown = measure(motion, levels, 0)
+    channels = measure(motion, levels, 0)
     bare = measure(motion, only(tilt=levels.tilt), 0)
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
     place = lambda s: (  # noqa: E731
@@ -337,18 +348,18 @@ def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
         axes = _turn_z(yaw(t)) @ _rotation(motion.roll[k], motion.pitch[k])
         expected = axes.T @ (place(t + h) - 2.0 * place(t) + place(t - h)) / h**2
         np.testing.assert_allclose(
-            [shown["ax"][k] - bare["ax"][k], shown["ay"][k] - bare["ay"][k]],
+            [channels["ax"][k] - bare["ax"][k], channels["ay"][k] - bare["ay"][k]],
             expected[:2],
             atol=1e-3,
         )
 
 
 def test_misalignment_lever_and_heading_errors_have_their_size():
-    shown = [
+    values = [
         measure(motion_of(1), only(imu=Mounting(misalignment=0.01)), seed) for seed in range(400)
     ]
     for name in ("ax", "ay"):
-        assert np.std([drive[name][0] for drive in shown]) == pytest.approx(
+        assert np.std([drive[name][0] for drive in values]) == pytest.approx(
             G * 0.01, rel=0.14
         )  # 400 draws
     motion = motion_of(10, vx=20.0, yaw_rate=0.5)
@@ -370,35 +381,35 @@ def test_misalignment_lever_and_heading_errors_have_their_size():
 
 def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity():
     motion = replace(weaving(), roll_rate=np.zeros(2000), pitch_rate=np.zeros(2000))
-    shown = measure(
+    channels = measure(
         motion, only(reference=Reference("optical", lever_x=2.0, lever_y=0.4, lever_z=-0.2)), seed=0
     )
-    np.testing.assert_allclose(shown["vx_ref"], motion.vx, atol=1e-12)
-    np.testing.assert_allclose(shown["vy_ref"], motion.vy, atol=1e-12)
-    shown = measure(
+    np.testing.assert_allclose(channels["vx_ref"], motion.vx, atol=1e-12)
+    np.testing.assert_allclose(channels["vy_ref"], motion.vy, atol=1e-12)
+    channels = measure(
         motion_of(5, vx=20.0, roll_rate=0.2, pitch_rate=0.1),
         only(reference=Reference("optical", lever_z=-0.3)),
         seed=0,
     )
     np.testing.assert_allclose(
-        shown["vy_ref"], 0.2 * 0.3
+        channels["vy_ref"], 0.2 * 0.3
     )  # left side going up: what is below goes left
     np.testing.assert_allclose(
-        shown["vx_ref"], 20.0 - 0.1 * 0.3
+        channels["vx_ref"], 20.0 - 0.1 * 0.3
     )  # nose going down: what is below goes back
 
 
 def test_reference_and_car_err_apart():
-    shown = measure(
+    channels = measure(
         motion_of(20_000, vx=20.0),
         only(vx=LOUD, yaw_rate=LOUD, reference=Reference("gnss", vx=LOUD, yaw_rate=LOUD)),
         seed=1,
     )
     for name in ("vx", "yaw_rate"):
-        errors = np.diff(shown[name]), np.diff(shown[f"{name}_ref"])
+        errors = np.diff(channels[name]), np.diff(channels[f"{name}_ref"])
         assert np.abs(np.corrcoef(*errors)[0, 1]) < 0.03  # 20,000 samples: 0.007
     motion = weaving()
-    changed = different(
+    changed = differing_channels(
         measure(motion, PRESETS["default"], 1),
         measure(motion, replace(PRESETS["default"], reference=Reference()), 1),
     )
@@ -419,12 +430,12 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     levels = replace(SensorLevels(), **dict.fromkeys(SENSORS, LOUD))
     all_on = measure(motion, levels, seed=7)
     for kind in KINDS:
-        assert different(
+        assert differing_channels(
             all_on, measure(motion, switched_off(levels, f"{sensor}.{kind}"), seed=7)
         ) == channels_of(sensor), kind
     silent = switched_off(levels, sensor)
     assert getattr(silent, sensor) == SensorLevel(drift_time=LOUD.drift_time)
-    assert different(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
+    assert differing_channels(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
 def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_other():
@@ -443,10 +454,10 @@ def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_oth
     for kind in ("offset", "drift", "noise"):
         quiet = {name: _alone(level)[kind] for name, level in levels.items()}
         reference = Reference("gnss", vx=quiet["vx"], vy=quiet["vx"], yaw_rate=quiet["vx"])
-        shown = measure(motion_of(1), only(**quiet, reference=reference), seed=0)
+        channels = measure(motion_of(1), only(**quiet, reference=reference), seed=0)
         first += [
             samples[0] / (math.sqrt(50.0) if kind == "noise" else 1.0)
-            for name, samples in shown.items()
+            for name, samples in channels.items()
             if name != "sideslip_ref"
         ]
     assert len({round(value, 9) for value in first}) == len(first) == 3 * 28
@@ -479,9 +490,9 @@ def test_switching_off_what_there_is_not_names_what_there_is(name):
 
 def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
     motion = weaving()
-    one, again, other = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
-    assert different(one, again) == set()
-    assert different(one, other) == set(one)
+    first, again, second = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
+    assert differing_channels(first, again) == set()
+    assert differing_channels(first, second) == set(first)
     short, long = (measure(motion_of(n, vx=20.0), SensorLevels(), seed=3) for n in (500, 900))
     for name in short:
         np.testing.assert_array_equal(short[name], long[name][:500], err_msg=name)
@@ -566,17 +577,17 @@ def test_reading_a_simulated_race_car_gives_its_levels_back(seed):
         ax=replace(race.ax, drift=0.1, drift_time=2.0),
         ay=replace(race.ay, drift=0.2, drift_time=6.0),
     )
-    found = read_off(measure(swerving(1500.0), levels, seed), 100.0)
+    levels_read = read_off(measure(swerving(1500.0), levels, seed), 100.0)
     for sensor in ("ax", "ay"):
         for kind, rel in (("noise", 0.05), ("delay", 0.2), ("drift", 0.2), ("drift_time", 0.4)):
-            assert found[f"{sensor}.{kind}"] == pytest.approx(
+            assert levels_read[f"{sensor}.{kind}"] == pytest.approx(
                 getattr(getattr(levels, sensor), kind), rel=rel
             ), (sensor, kind)
-    assert found["yaw_rate.noise"] == pytest.approx(levels.yaw_rate.noise, rel=0.05)
-    assert found["yaw_rate.delay"] == pytest.approx(levels.yaw_rate.delay, rel=0.3)
-    assert found["steer.quantisation"] == pytest.approx(levels.steer.quantisation, rel=1e-6)
-    assert found["roll_gradient"] == pytest.approx(0.0021, rel=0.3)
-    assert found["pitch_gradient"] == pytest.approx(0.0042, rel=0.3)
+    assert levels_read["yaw_rate.noise"] == pytest.approx(levels.yaw_rate.noise, rel=0.05)
+    assert levels_read["yaw_rate.delay"] == pytest.approx(levels.yaw_rate.delay, rel=0.3)
+    assert levels_read["steer.quantisation"] == pytest.approx(levels.steer.quantisation, rel=1e-6)
+    assert levels_read["roll_gradient"] == pytest.approx(0.0021, rel=0.3)
+    assert levels_read["pitch_gradient"] == pytest.approx(0.0042, rel=0.3)
 
 
 def test_race_levels_are_those_of_the_ferrari_recording(data_root):
@@ -590,15 +601,15 @@ def test_race_levels_are_those_of_the_ferrari_recording(data_root):
         "vx_ref": "vx",
         "vy_ref": "vy",
     }
-    found = read_off(
+    levels_read = read_off(
         {name: np.loadtxt(folder / f"{file}.txt") for name, file in files.items()}, 100.0
     )
     levels = asdict(PRESETS["race"])
     assert (
-        0.001 < found.pop("roll_gradient") < 0.004
+        0.001 < levels_read.pop("roll_gradient") < 0.004
     )  # 1.2° at 1 g: its accelerometers roll with the body
-    assert 0.002 < found.pop("pitch_gradient") < 0.006
-    for name, value in found.items():
+    assert 0.002 < levels_read.pop("pitch_gradient") < 0.006
+    for name, value in levels_read.items():
         level = levels
         for part in name.split("."):
             level = level[part]

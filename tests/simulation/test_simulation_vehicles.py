@@ -85,11 +85,11 @@ def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
     share = (
         0.95 if name == "jaguar_e_type" else 0.99
     )  # its rear bends as early as its front: at the limit it turns neutral
-    wanted = np.arange(0.5, share * ramp.ay[limit], 0.25)
-    at_wanted = np.interp(wanted, np.maximum.accumulate(ramp.ay[:limit]), angle[:limit])
-    assert at_wanted[0] > 0.0
-    assert (np.diff(at_wanted) > 0.0).all()
-    assert (np.diff(at_wanted, 2)[4:] > -1e-6).all()  # and rises ever faster
+    ay_grid = np.arange(0.5, share * ramp.ay[limit], 0.25)
+    angle_on_grid = np.interp(ay_grid, np.maximum.accumulate(ramp.ay[:limit]), angle[:limit])
+    assert angle_on_grid[0] > 0.0
+    assert (np.diff(angle_on_grid) > 0.0).all()
+    assert (np.diff(angle_on_grid, 2)[4:] > -1e-6).all()  # and rises ever faster
 
 
 @each_vehicle
@@ -102,14 +102,14 @@ def test_grip_is_what_the_car_reaches_in_steady_state(name):
 def test_cars_reach_the_lateral_accelerations_of_the_papers():
     # Table I of Da Lio et al. 2023: 99 % quantiles of the laps; Fig. 4 of Bertipaglia et al. 2024: spread over ±10 m/s²,
     # in transients too, which reach a little more than a steady turn.
-    for name, shown, at_most in (
+    for name, published, at_most in (
         ("corvette_grand_sport", 11.6, 12.5),
         ("ferrari_250_lm", 10.78, 11.7),
         ("bmw_545i", 9.4, 10.5),
     ):
         for speed in (25.0, 40.0):
             ramp = ramp_steer(plant_of(name), speed)
-            assert shown < ramp.ay.max() < at_most, name
+            assert published < ramp.ay.max() < at_most, name
             assert ramp.tyre_fz[: np.argmax(ramp.ay)].min() > 100.0, name  # no wheel lifts
             assert 2.0 < -math.degrees(ramp.sideslip[np.argmax(ramp.ay)]) < 6.0, name
 
@@ -146,12 +146,12 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
 def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
     plant = plant_of(name)
     p = plant.parameters
-    rest = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    at_rest = plant.initial_state(0.0, 0.0, 0.0, 0.0)
     assert p.m_s + p.m_uf + p.m_ur == pytest.approx(p.m, rel=1e-4)
-    disturbed = rest.values.copy()
+    disturbed = at_rest.values.copy()
     disturbed[[HEAVE, PITCH, ROLL, ROLL_RATE]] += 0.02, 0.01, 0.02, 0.1
     settled = plant.advance(PlantState(disturbed, Regime.SLOW), np.zeros(5), 6000)
-    np.testing.assert_allclose(settled.values, rest.values, atol=1e-4)
+    np.testing.assert_allclose(settled.values, at_rest.values, atol=1e-4)
     loads = plant.motion([settled], np.zeros((1, 5)), 100.0).tyre_fz[0]
     if name in OURS:
         expected = p.m * GRAVITY / plant.wheelbase * np.array([p.b, p.b, p.a, p.a]) / 2.0
@@ -316,11 +316,11 @@ def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
         [rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0
     ).tyre_fx
     arm = 0.25 * (plant.parameters.T_f + plant.parameters.T_r)
-    most = (
+    max_moment = (
         min(-forces[0, [0, 2]].sum(), -forces[1, [1, 3]].sum()) * arm
     )  # to turn left, the left wheels are braked
     assert (
-        0.85 * most < stability_control(plant).largest_moment <= 1.01 * most
+        0.85 * max_moment < stability_control(plant).largest_moment <= 1.01 * max_moment
     )  # 15 %: front and rear tyres differ
 
 

@@ -13,7 +13,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.training.context import FitContext
-from vehest.training.members import _ONE_BY_ONE
+from vehest.training.members import _UNBATCHABLE
 from vehest.training.supervised import SupervisedSettings
 
 WINDOW = 8
@@ -110,8 +110,8 @@ def fit(network, seeds, context=None, **training):
 def test_members_equal_training_each_alone(name):
     together, records = fit(NETWORKS[name], [0, 1, 2], max_epochs=12, patience=2)
     for seed, member, record in zip(range(3), together, records, strict=True):
-        (alone,), (own,) = fit(NETWORKS[name], [seed], max_epochs=12, patience=2)
-        assert own.metrics["epochs"] == record.metrics["epochs"]
+        (alone,), (alone_record,) = fit(NETWORKS[name], [seed], max_epochs=12, patience=2)
+        assert alone_record.metrics["epochs"] == record.metrics["epochs"]
         assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
     assert not np.allclose(flat_weights(together[0]), flat_weights(together[1]), atol=1e-2)
 
@@ -122,11 +122,11 @@ def test_members_equal_training_each_alone(name):
 )
 def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one_by_one):
     members, _ = fit(NETWORKS[name], [0, 1])
-    assert (members[0].network in _ONE_BY_ONE) is one_by_one
+    assert (members[0].network in _UNBATCHABLE) is one_by_one
 
 
 @cache
-def known(name, dtype="float64"):
+def network_type(name, dtype="float64"):
     """One trained for a moment; tests leave it as it is."""
     return fit(NETWORKS[name], [0], dtype=dtype)[0][0]
 
@@ -134,7 +134,7 @@ def known(name, dtype="float64"):
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_online_agrees_with_batch(name, dtype, tolerance):
-    member = known(name, dtype)
+    member = network_type(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
     batch = member.estimate([drive])[0]["vy"]
     stepper = member.online()
@@ -148,7 +148,7 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_estimates_are_those_of_the_network_called_by_hand_on_each_window(name):
-    member = known(name)
+    member = network_type(name)
     drive = planar_drive(90.0, seed=3)  # more windows than are evaluated at once
     series = torch.as_tensor(drive.stack(member.channels))
     network = member.network.eval()
@@ -171,8 +171,8 @@ def test_initial_weights_are_those_that_torch_draws_from_the_seed():
     with torch.random.fork_rng():
         torch.manual_seed(5)
         expected = Perceptron().double()
-    for one, other in zip(member.network.parameters(), expected.parameters(), strict=True):
-        assert torch.allclose(one, other, rtol=0, atol=1e-9)
+    for parameter, drawn in zip(member.network.parameters(), expected.parameters(), strict=True):
+        assert torch.allclose(parameter, drawn, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["perceptron", "dropout"])
@@ -183,19 +183,19 @@ def test_global_random_state_neither_matters_nor_changes(name):
     assert torch.equal(before, torch.random.get_rng_state())
     torch.manual_seed(1)
     again, _ = fit(NETWORKS[name], [0, 1])
-    for one, other in zip(first, again, strict=True):
-        assert np.array_equal(flat_weights(one), flat_weights(other))
+    for first_run, second_run in zip(first, again, strict=True):
+        assert np.array_equal(flat_weights(first_run), flat_weights(second_run))
 
 
 @pytest.mark.parametrize("name", ["perceptron", "dropout", "lstm"])
 def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name):
-    whole, _ = fit(NETWORKS[name], [0, 1])
+    uninterrupted, _ = fit(NETWORKS[name], [0, 1])
     folders = [tmp_path / str(seed) for seed in range(2)]
     _, records = fit(NETWORKS[name], [0, 1], FitContext(folders, should_stop=stop_after(15)))
     assert all(record.interrupted and record.metrics["epochs"] > 0 for record in records)
     resumed, _ = fit(NETWORKS[name], [0, 1], FitContext(folders))
-    for one, other in zip(whole, resumed, strict=True):
-        assert np.array_equal(flat_weights(one), flat_weights(other))
+    for expected, actual in zip(uninterrupted, resumed, strict=True):
+        assert np.array_equal(flat_weights(expected), flat_weights(actual))
 
 
 class Frozen(Perceptron):

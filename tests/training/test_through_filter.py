@@ -23,49 +23,49 @@ from vehest.training.through_filter import (
 )
 
 DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
-ONE_STEP = PhaseSettings(learning_rate=5e-3, max_epochs=3)
+ONE_STEP_PHASE = PhaseSettings(learning_rate=5e-3, max_epochs=3)
 THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
 def settings(**changes):
-    known = {
-        "one_step": ONE_STEP,
+    defaults = {
+        "one_step": ONE_STEP_PHASE,
         "one_step_batch": 100,
         "through": THROUGH,
         "noise": THROUGH,
         "steps": 40,
         "batch_size": 3,
     }
-    known |= {
+    defaults |= {
         "validation_steps": 60,
         "validation_drop_steps": 10,
         "mirrored": 0.0,
         "dtype": "float64",
     }
-    return ThroughFilterSettings(**known | changes)
+    return ThroughFilterSettings(**defaults | changes)
 
 
 def estimator(seed=0, **config):
-    made = LearnedUkf.from_config({"width": 8} | config)
-    made.seed(seed)
-    return made
+    learned = LearnedUkf.from_config({"width": 8} | config)
+    learned.seed(seed)
+    return learned
 
 
-def drives(made, steps=40):
+def drives(learned, steps=40):
     """Sequences, and the filter made ready for them."""
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    made.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
-    made.filter.begin_noise(parts, 0.0)
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    learned.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
+    learned.filter.begin_noise(parts, 0.0)
     return sequences_of(parts, steps)
 
 
 def numbered(*lengths):
     """Drives of which state 0 is the sample's number, state 1 the drive's."""
-    made = []
+    parts = []
     for number, length in enumerate(lengths):
         states = torch.stack([torch.arange(float(length)), torch.full((length,), float(number))], 1)
-        made.append(Drive(states, states[:, :1], states))
-    return made
+        parts.append(Drive(states, states[:, :1], states))
+    return parts
 
 
 def test_drives_are_cut_from_their_start_or_at_random_places():
@@ -78,21 +78,21 @@ def test_drives_are_cut_from_their_start_or_at_random_places():
     def drawn(seed):
         return placed(numbered(45, 9, 20), 10, torch.Generator().manual_seed(seed))
 
-    one = drawn(1)
+    first = drawn(1)
     again = drawn(1)
-    other = drawn(2)
-    assert torch.equal(one.states, again.states)
-    assert not torch.equal(one.states, other.states)
-    assert one.states[:, 0, 1].tolist() == [0.0] * 4 + [2.0] * 2
-    assert (one.states[:, 1:, 0] - one.states[:, :-1, 0] == 1.0).all(), "each is uninterrupted"
+    second = drawn(2)
+    assert torch.equal(first.states, again.states)
+    assert not torch.equal(first.states, second.states)
+    assert first.states[:, 0, 1].tolist() == [0.0] * 4 + [2.0] * 2
+    assert (first.states[:, 1:, 0] - first.states[:, :-1, 0] == 1.0).all(), "each is uninterrupted"
 
 
 def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others():
-    made = estimator()
-    drives(made)
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    for placing, same in (("fixed", True), ("random", False)):
-        (phase,) = phases_of(made, parts, settings(placing=placing, start_spread=0.0))
+    learned = estimator()
+    drives(learned)
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    for placing, is_repeated in (("fixed", True), ("random", False)):
+        (phase,) = phases_of(learned, parts, settings(placing=placing, start_spread=0.0))
         generator = torch.Generator().manual_seed(0)
         epochs = [
             {
@@ -102,15 +102,15 @@ def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others():
             }
             for _ in range(2)
         ]
-        assert (epochs[0] == epochs[1]) == same
+        assert (epochs[0] == epochs[1]) == is_repeated
 
 
-def phases_of(made, parts, training):
+def phases_of(learned, parts, training):
     from vehest.training.through_filter import Weights
 
     weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
     return filter_phases(
-        made.filter,
+        learned.filter,
         parts,
         parts,
         weights,
@@ -122,10 +122,10 @@ def phases_of(made, parts, training):
 
 
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true():
-    made = estimator()
-    drives(made)
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    (phase,) = phases_of(made, parts, settings(start_spread=0.2, placing="fixed"))
+    learned = estimator()
+    drives(learned)
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    (phase,) = phases_of(learned, parts, settings(start_spread=0.2, placing="fixed"))
     batches = list(phase.batches(torch.Generator().manual_seed(0)))
     off = torch.cat([start - batch.states[:, 0] for batch, start in batches])
     assert (off[:, :4] == 0.0).all()
@@ -134,51 +134,53 @@ def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true
 
 
 def test_a_share_of_sequences_is_seen_in_a_mirror():
-    made = estimator()
-    drives(made)
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    signs = [torch.tensor(part, dtype=torch.float64) for part in made.filter.mirror]
+    learned = estimator()
+    drives(learned)
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    signs = [torch.tensor(part, dtype=torch.float64) for part in learned.filter.mirror]
     for share, allowed in ((0.0, {False}), (1.0, {True}), (0.5, {False, True})):
         (phase,) = phases_of(
-            made, parts, settings(mirrored=share, start_spread=0.0, placing="fixed")
+            learned, parts, settings(mirrored=share, start_spread=0.0, placing="fixed")
         )
-        known = sequences_of(parts, 40)
-        seen = set()
+        sequences = sequences_of(parts, 40)
+        is_mirrored = set()
         for batch, start in phase.batches(torch.Generator().manual_seed(0)):
             for row in range(len(start)):
                 (at,) = torch.nonzero(
-                    (known.states[:, 0, 0] == start[row, 0])
-                    & (known.states[:, 0, 3] == start[row, 3])
+                    (sequences.states[:, 0, 0] == start[row, 0])
+                    & (sequences.states[:, 0, 3] == start[row, 3])
                 )[0]
-                turned = not torch.equal(batch.states[row], known.states[at])
-                for own, whole, sign in zip(batch, known, signs, strict=True):
-                    assert torch.equal(own[row], whole[at] * sign if turned else whole[at])
-                seen.add(turned)
-        assert seen == allowed
+                turned = not torch.equal(batch.states[row], sequences.states[at])
+                for sequence, unmirrored, sign in zip(batch, sequences, signs, strict=True):
+                    assert torch.equal(
+                        sequence[row], unmirrored[at] * sign if turned else unmirrored[at]
+                    )
+                is_mirrored.add(turned)
+        assert is_mirrored == allowed
 
 
 def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its_starts():
-    made = estimator()
-    sequences = drives(made)
+    learned = estimator()
+    sequences = drives(learned)
     results = {}
     for steps in (None, 40, 15):
-        made.filter.zero_grad()
-        estimated, _ = made.filter.estimated(sequences, sequences.states[:, 0], steps)
+        learned.filter.zero_grad()
+        estimated, _ = learned.filter.estimated(sequences, sequences.states[:, 0], steps)
         (estimated - sequences.states).square().sum().backward()
         gradient = torch.cat(
-            [p.grad.reshape(-1) for p in made.filter.parameters() if p.grad is not None]
+            [p.grad.reshape(-1) for p in learned.filter.parameters() if p.grad is not None]
         )
         results[steps] = (estimated.detach(), gradient)
     assert torch.allclose(results[15][0], results[None][0], rtol=0, atol=1e-12)
     assert torch.equal(results[40][1], results[None][1]), "as long as the sequence: nothing is cut"
     off = float((results[15][1] - results[None][1]).norm() / results[None][1].norm())
     assert 1e-4 < off < 2.0
-    made = estimator()
-    sequences = drives(made)
+    learned = estimator()
+    sequences = drives(learned)
     start = sequences.states[:, 0].clone().requires_grad_()
-    made.filter.estimated(sequences, start, 10)[0][:, 10:].sum().backward()
+    learned.filter.estimated(sequences, start, 10)[0][:, 10:].sum().backward()
     assert start.grad is None or not start.grad.any()
-    made.filter.estimated(sequences, start, None)[0][:, 10:].sum().backward()
+    learned.filter.estimated(sequences, start, None)[0][:, 10:].sum().backward()
     assert start.grad.abs().max() > 0
 
 
@@ -189,8 +191,8 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
     expected = -np.mean(
         [
-            stats.multivariate_normal(cov=own).logpdf(error)
-            for error, own in zip(errors, covariances, strict=True)
+            stats.multivariate_normal(cov=covariance).logpdf(error)
+            for error, covariance in zip(errors, covariances, strict=True)
         ]
     )
     assert float(
@@ -199,36 +201,38 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
 
 
 def test_noise_starts_where_residuals_say_or_as_given():
-    made = estimator(dynamics="pacejka", noise="constant")
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    made.filter.to(torch.float64).begin_noise(parts, 0.0)
+    learned = estimator(dynamics="pacejka", noise="constant")
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    learned.filter.to(torch.float64).begin_noise(parts, 0.0)
     with torch.no_grad():
-        model = made.filter.dynamics
+        model = learned.filter.dynamics
         steps = torch.cat(
             [model.transition(d.states[:-1], d.inputs[:-1], 0.01) - d.states[1:] for d in parts]
         )
-        seen = torch.cat([d.measurements - model.observation(d.states, d.inputs) for d in parts])
-        process = made.filter.process_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
-        observation = made.filter.observation_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
+        residuals = torch.cat(
+            [d.measurements - model.observation(d.states, d.inputs) for d in parts]
+        )
+        process = learned.filter.process_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
+        observation = learned.filter.observation_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
     expected = steps.T @ steps / len(steps)
     assert torch.allclose(process[:4, :4], expected[:4, :4], rtol=1e-5, atol=2e-7)
     assert float(process[4, 4]) == pytest.approx(1e-4, rel=1e-2), (
         "a friction that is constant in training says nothing about its noise"
     )
-    off = observation - seen.T @ seen / len(seen)
+    off = observation - residuals.T @ residuals / len(residuals)
     assert torch.allclose(
         off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7
     )
-    made = estimator()
-    fitted = made.fit(
+    learned = estimator()
+    fitted = learned.fit(
         DATA,
         settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"),
     )
     assert np.isfinite(fitted.metrics["best_validation_loss"])
-    assert made.weights()["process_noise.unit"].tolist() == [1.0] * 5
-    other = estimator()
-    other.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12)))
-    assert (other.weights()["process_noise.unit"] != 1.0).all()
+    assert learned.weights()["process_noise.unit"].tolist() == [1.0] * 5
+    second = estimator()
+    second.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12)))
+    assert (second.weights()["process_noise.unit"] != 1.0).all()
 
 
 def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
@@ -262,10 +266,10 @@ def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
 
 
 def test_a_curriculum_trains_on_shorter_sequences_first():
-    made = estimator()
-    drives(made)
-    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
-    phases = phases_of(made, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
+    learned = estimator()
+    drives(learned)
+    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    phases = phases_of(learned, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
     assert [phase.name for phase in phases] == [
         "through_filter_10",
         "through_filter_20",
@@ -280,14 +284,14 @@ def test_a_curriculum_trains_on_shorter_sequences_first():
     assert [phase.prepare is not None for phase in phases] == [True, False, False], (
         "the noise is started once"
     )
-    record = made.fit(DATA, settings(curriculum=[10], curriculum_epochs=1))
+    record = learned.fit(DATA, settings(curriculum=[10], curriculum_epochs=1))
     assert record.history["phase"] == [0.0] * 3 + [1.0] + [2.0] * 2
 
 
 @pytest.mark.parametrize("stop", [2, 4], ids=["in the one-step phase", "through the filter"])
 def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
-    whole = estimator(seed=3)
-    record = whole.fit(DATA, settings())
+    uninterrupted = estimator(seed=3)
+    record = uninterrupted.fit(DATA, settings())
     with pytest.raises(KeyboardInterrupt):
         estimator(seed=3).fit(
             DATA,
@@ -296,7 +300,7 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
         )
     resumed = estimator(seed=3)
     again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
-    assert np.array_equal(flat_weights(resumed), flat_weights(whole))
+    assert np.array_equal(flat_weights(resumed), flat_weights(uninterrupted))
     assert again.history == record.history
 
 

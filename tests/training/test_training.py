@@ -49,11 +49,14 @@ def test_members_equal_training_each_alone_over_the_whole_training_in_float64(na
         "members must stop at different times for this to mean anything"
     )
     for seed, member, record in zip(range(4), together, records, strict=True):
-        (alone,), (own,) = _fit(name, config, [seed], settings)
-        assert own.metrics["epochs"] == record.metrics["epochs"]
+        (alone,), (alone_record,) = _fit(name, config, [seed], settings)
+        assert alone_record.metrics["epochs"] == record.metrics["epochs"]
         assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
         assert np.allclose(
-            own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8
+            alone_record.history["validation_loss"],
+            record.history["validation_loss"],
+            rtol=0,
+            atol=1e-8,
         )
 
 
@@ -71,10 +74,10 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
 def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkeypatch):
-    (one,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
+    (few_batches,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
     monkeypatch.setattr(supervised, "BATCHES", 4)  # of nine
-    (other,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
-    assert np.array_equal(flat_weights(one), flat_weights(other))
+    (many_batches,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
+    assert np.array_equal(flat_weights(few_batches), flat_weights(many_batches))
 
 
 @pytest.mark.parametrize(
@@ -82,47 +85,47 @@ def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkey
 )
 def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config, averaging):
     settings = SupervisedSettings(max_epochs=12, patience=4, averaging=averaging)
-    whole, whole_records = _fit(name, config, [0, 1, 2], settings)
+    uninterrupted, uninterrupted_records = _fit(name, config, [0, 1, 2], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
     _, records = _fit(
         name, config, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(25))
     )
     assert all(record.interrupted for record in records)
-    assert records[0].metrics["epochs"] < whole_records[0].metrics["epochs"]
+    assert records[0].metrics["epochs"] < uninterrupted_records[0].metrics["epochs"]
     losses = records[0].history["validation_loss"]
     assert records[0].metrics["best_validation_loss"] == min(losses)
     resumed, resumed_records = _fit(name, config, [0, 1, 2], settings, FitContext(folders))
-    for one, other, record, resumed_record in zip(
-        whole, resumed, whole_records, resumed_records, strict=True
+    for expected, actual, record, resumed_record in zip(
+        uninterrupted, resumed, uninterrupted_records, resumed_records, strict=True
     ):
-        assert np.array_equal(flat_weights(one), flat_weights(other))
+        assert np.array_equal(flat_weights(expected), flat_weights(actual))
         assert record.history == resumed_record.history
 
 
 def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=10, patience=10)
-    (whole,), _ = _fit("ksnn", {}, [1], settings)
+    (uninterrupted,), _ = _fit("ksnn", {}, [1], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
     _fit("ksnn", {}, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(30)))
     assert resume_epoch(folders[1]) > 0
     (resumed,), _ = _fit("ksnn", {}, [1], settings, FitContext([folders[1]]))
-    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
+    assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
     settings = SupervisedSettings(max_epochs=4)
     _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=stop_after(20)))
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     assert resume_epoch(tmp_path) == 0
     (resumed,), _ = _fit("ksnn", {}, [0], settings, FitContext([tmp_path]))
-    (whole,), _ = _fit("ksnn", {}, [0], settings)
-    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
+    (uninterrupted,), _ = _fit("ksnn", {}, [0], settings)
+    assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
 def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error():
-    for config, said in (
+    for config, message in (
         ({"learning_rate": -1.0}, "learning_rate must be positive"),
         ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
     ):
-        with pytest.raises(ConfigurationError, match=said):
+        with pytest.raises(ConfigurationError, match=message):
             settings_from_config(SupervisedSettings, config, "training")
     with pytest.raises(DataError, match=r"lower training\.learning_rate"):
         _fit(
@@ -135,16 +138,22 @@ def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error(
 
 def _plant(monkeypatch, member, bad_above, epoch=5):
     """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger than ``bad_above``."""
-    descend = supervised._Run._descend
+    train_epoch = supervised._Run.train_epoch
+    descend = supervised._Batch.descend
 
-    def spoilt(self, batches):
-        losses = descend(self, batches)
-        rows = (self.active == self.planted).nonzero().flatten()
-        if self.epoch + 1 >= epoch and self._step_size() > bad_above:
-            self.flat.data[rows] = np.nan
-        return losses
+    def spoilt_epoch(self):
+        def spoilt_descend(batch, data, windows):
+            losses = descend(batch, data, windows)
+            rows = [row for row, index in enumerate(self.active) if index == self.planted]
+            if self.epoch + 1 >= epoch and batch.adam.learning_rate > bad_above:
+                batch.weights.data[rows] = np.nan
+            return losses
 
-    monkeypatch.setattr(supervised._Run, "_descend", spoilt)
+        with monkeypatch.context() as patch:
+            patch.setattr(supervised._Batch, "descend", spoilt_descend)
+            train_epoch(self)
+
+    monkeypatch.setattr(supervised._Run, "train_epoch", spoilt_epoch)
     monkeypatch.setattr(supervised._Run, "planted", member, raising=False)
 
 
@@ -179,10 +188,10 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
         resumed, resumed_records = _fit("ksnn", {}, [0, 1, 2], settings, context)
         if not any(record.interrupted for record in resumed_records):
             break
-    for one, other, record, resumed_record in zip(
+    for expected, actual, record, resumed_record in zip(
         spoilt, resumed, records, resumed_records, strict=True
     ):
-        assert np.array_equal(flat_weights(one), flat_weights(other))
+        assert np.array_equal(flat_weights(expected), flat_weights(actual))
         np.testing.assert_equal(dict(record.history), dict(resumed_record.history))
     monkeypatch.setattr(supervised._Run, "planted", 0)
     (alone,), _ = _fit("ksnn", {}, [1], settings)
@@ -253,11 +262,11 @@ def _loop_with_all_its_weights(averaging):
             steps.append(torch.cat([p.detach().reshape(-1).clone() for p in network.parameters()]))
         weights = averaging ** torch.arange(len(steps) - 1, -1, -1, dtype=torch.float64)
         averages.append((weights[:, None] * torch.stack(steps)).sum(0) / weights.sum())
-        kept = [p.detach().clone() for p in network.parameters()]
+        weights_of_step = [p.detach().clone() for p in network.parameters()]
         with torch.no_grad():
             torch.nn.utils.vector_to_parameters(averages[-1].clone(), network.parameters())
             losses.append(float((network(x_validation) - y_validation).square().mean()))
-            for parameter, values in zip(network.parameters(), kept, strict=True):
+            for parameter, values in zip(network.parameters(), weights_of_step, strict=True):
                 parameter.copy_(values)
     torch.nn.utils.vector_to_parameters(averages[int(np.argmin(losses))], network.parameters())
     return network, losses
@@ -268,8 +277,8 @@ def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_re
     (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
     network, losses = _loop_with_all_its_weights(0.9)
     assert np.allclose(record.history["validation_loss"], losses, rtol=1e-9)
-    for own, other in zip(member.network.parameters(), network.parameters(), strict=True):
-        assert torch.allclose(own, other, rtol=0, atol=1e-10)
+    for parameter, expected in zip(member.network.parameters(), network.parameters(), strict=True):
+        assert torch.allclose(parameter, expected, rtol=0, atol=1e-10)
     (_,), (plain,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5))
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]

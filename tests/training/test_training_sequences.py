@@ -83,8 +83,8 @@ def _without_times(records):
     "often", [0.0, 1e9], ids=["checkpoint after every epoch", "checkpoint when stopped"]
 )
 def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_path, often):
-    whole = _network()
-    records = train_phases(_two_phases(whole), 3, FitContext())
+    uninterrupted = _network()
+    records = train_phases(_two_phases(uninterrupted), 3, FitContext())
     assert [record.name for record in records] == ["read-out", "all"]
     stops = 0
     interrupted = True
@@ -97,13 +97,13 @@ def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_p
         interrupted = again[-1].interrupted
         stops = stops + 1
     assert stops > 5
-    assert torch.equal(_flat(whole), _flat(resumed))
+    assert torch.equal(_flat(uninterrupted), _flat(resumed))
     assert _without_times(again) == _without_times(records)
 
 
 def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_path):
-    whole = _network()
-    train_phases(_two_phases(whole), 3, FitContext())
+    uninterrupted = _network()
+    train_phases(_two_phases(uninterrupted), 3, FitContext())
     killed = _network()
     with pytest.raises(KeyboardInterrupt):
         train_phases(
@@ -113,26 +113,26 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
             checkpoint_seconds=0.0,
         )
     assert resume_epoch(tmp_path) == 10, "in the second phase"
-    kept = load_checkpoint(tmp_path).tensors
-    assert not torch.equal(kept["now.0.0.weight"], kept["best.0.0.weight"]), (
+    checkpoint = load_checkpoint(tmp_path).tensors
+    assert not torch.equal(checkpoint["now.0.0.weight"], checkpoint["best.0.0.weight"]), (
         "it goes on from the first and ends with the second"
     )
     resumed = _network()
     train_phases(_two_phases(resumed), 3, FitContext([tmp_path]))
-    assert torch.equal(_flat(whole), _flat(resumed))
+    assert torch.equal(_flat(uninterrupted), _flat(resumed))
 
 
 def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finished(tmp_path):
-    one = _network()
-    other = _network()
-    records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
+    first = _network()
+    second = _network()
+    records = train_phases(_two_phases(first), 3, FitContext([tmp_path]))
     assert resume_epoch(tmp_path) == -1
-    asked = []
+    requests = []
     assert _without_times(
-        train_phases(_two_phases(other), 3, FitContext([tmp_path], on_progress=asked.append))
+        train_phases(_two_phases(second), 3, FitContext([tmp_path], on_progress=requests.append))
     ) == _without_times(records)
-    assert not asked
-    assert torch.equal(_flat(one), _flat(other))
+    assert not requests
+    assert torch.equal(_flat(first), _flat(second))
     folders = [tmp_path / "0", tmp_path / "1"]
     networks = [_network(), _network()]
     for index, network in enumerate(networks):
@@ -141,25 +141,27 @@ def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finishe
     assert not torch.allclose(_flat(networks[0]), _flat(networks[1]))
     train_phases([_phase(_network())], 0, FitContext([tmp_path], should_stop=stop_after(9)))
     assert resume_epoch(tmp_path) > 0
-    other = nn.Linear(1, 1)
-    (record,) = train_phases([_phase(other)], 0, FitContext([tmp_path]))
+    second = nn.Linear(1, 1)
+    (record,) = train_phases([_phase(second)], 0, FitContext([tmp_path]))
     assert record.epochs == 12
 
 
 def test_frozen_parameters_stay_and_learn_again_afterwards():
     network = _network()
     before = {name: value.detach().clone() for name, value in network.named_parameters()}
-    asked = {}
+    requires_grad = {}
 
     def loss(batch):
-        asked.update({name: value.requires_grad for name, value in network.named_parameters()})
+        requires_grad.update(
+            {name: value.requires_grad for name, value in network.named_parameters()}
+        )
         return (network(batch[0]) - batch[1]).square().mean()
 
     phase = _phase(
         network, trainable=lambda name: name.startswith("2."), loss=loss, weight_decay=0.1
     )
     train_phases([phase], 0, FitContext())
-    assert asked == {"0.weight": False, "0.bias": False, "2.weight": True, "2.bias": True}
+    assert requires_grad == {"0.weight": False, "0.bias": False, "2.weight": True, "2.bias": True}
     for name, value in network.named_parameters():
         assert torch.equal(value, before[name]) == name.startswith("0."), name
         assert value.requires_grad
@@ -167,18 +169,18 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
 
 def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
     network = _network()
-    seen = []
+    validated_epochs = []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
 
     def validation():
-        seen.append(_flat(network))
+        validated_epochs.append(_flat(network))
         return next(losses)
 
     (record,) = train_phases(
         [_phase(network, validation=validation, max_epochs=5)], 0, FitContext()
     )
     assert (record.start_loss, record.best_epoch, record.best_loss) == (5.0, 2, 2.0)
-    assert torch.equal(_flat(network), seen[2])
+    assert torch.equal(_flat(network), validated_epochs[2])
     start = _flat(network)
     (record,) = train_phases([_phase(network, validation=lambda: 1.0, patience=3)], 0, FitContext())
     assert (record.best_epoch, record.epochs) == (0, 3), (
@@ -196,26 +198,28 @@ def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_o
         False,
         True,
     ]
-    told = []
-    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
-    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
-    assert told[0].max_epochs == 19
+    reported = []
+    train_phases(_two_phases(_network()), 3, FitContext(on_progress=reported.append))
+    assert [progress.epoch for progress in reported] == list(range(1, len(reported) + 1))
+    assert reported[0].max_epochs == 19
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.1])
 def test_adam_is_that_of_torch_bit_by_bit(decay):
     generator = torch.Generator().manual_seed(0)
-    own = _network()
-    other = _network()
-    adam = Adam(own.parameters(), 0.01, decay)
-    theirs = torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay)
+    network = _network()
+    reference = _network()
+    adam = Adam(network.parameters(), 0.01, decay)
+    theirs = torch.optim.AdamW(reference.parameters(), lr=0.01, weight_decay=decay)
     for _ in range(20):
-        for one, two in zip(own.parameters(), other.parameters(), strict=True):
-            one.grad = torch.randn(one.shape, generator=generator, dtype=one.dtype)
-            two.grad = one.grad.clone()
+        for parameter, two in zip(network.parameters(), reference.parameters(), strict=True):
+            parameter.grad = torch.randn(
+                parameter.shape, generator=generator, dtype=parameter.dtype
+            )
+            two.grad = parameter.grad.clone()
         adam.step()
         theirs.step()
-    assert torch.equal(_flat(own), _flat(other))
+    assert torch.equal(_flat(network), _flat(reference))
 
 
 def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
@@ -230,17 +234,17 @@ def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
         lambda _: (line.weight * gradient).sum(),
         lambda: 0.0,
     )
-    seen = []
+    gradients = []
     step = Adam.step
 
     def watched(self, *arguments):
-        seen.append(line.weight.grad.clone())
+        gradients.append(line.weight.grad.clone())
         return step(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Adam, "step", watched)
         train_phases([phase], 0, FitContext())
-    assert torch.equal(seen[0], torch.tensor([[3.0, 0.5]]))
+    assert torch.equal(gradients[0], torch.tensor([[3.0, 0.5]]))
     rates = []
     step = Adam.step
 
@@ -275,12 +279,12 @@ def test_phase_of_no_epochs_is_left_out_with_any_schedule(schedule):
 def test_step_that_is_not_finite_is_skipped_and_counted(where):
     network = _network()
     calls = 0
-    held = []
+    parameters = []
 
     def loss(batch):
         nonlocal calls
         calls += 1
-        held.append(_flat(network))
+        parameters.append(_flat(network))
         good = (network(batch[0]) - batch[1]).square().mean()
         if calls != 2:
             return good
@@ -290,8 +294,8 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
 
     (record,) = train_phases([_phase(network, loss=loss, max_epochs=1)], 0, FitContext())
     assert record.skipped_steps == 1
-    assert not torch.equal(held[0], held[1])
-    assert torch.equal(held[1], held[2]), "the second step changed nothing"
+    assert not torch.equal(parameters[0], parameters[1])
+    assert torch.equal(parameters[1], parameters[2]), "the second step changed nothing"
     assert math.isfinite(record.train_loss[0])
 
 
@@ -340,7 +344,7 @@ def _planted(network, runs, bad_above, **settings):
     phase = _phase(network, "all", max_epochs=40, learning_rate=4e-2, **settings)
 
     def loss(batch):
-        is_bad = runs[-1].now.epochs >= 4 and runs[-1].adam.learning_rate > bad_above
+        is_bad = runs[-1].current.epochs >= 4 and runs[-1].adam.learning_rate > bad_above
         return (network(batch[0]) - batch[1]).square().mean() * (math.nan if is_bad else 1.0)
 
     return replace(phase, loss=loss)

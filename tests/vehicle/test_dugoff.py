@@ -11,7 +11,7 @@ from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.filters.unscented_scan import TorchModel
 from vehest.vehicle.dugoff import LoadedCar
 
-BOTH = pytest.mark.parametrize("tyres", ["plain", "smooth"])
+BOTH_CURVES = pytest.mark.parametrize("tyres", ["plain", "smooth"])
 LOAD = torch.tensor(9000.0, dtype=torch.float64)
 SPEED = torch.tensor(25.0, dtype=torch.float64)
 
@@ -47,14 +47,14 @@ def test_tyres_are_those_of_the_paper():
         ratio = friction * 9000.0 / (2.0 * FRONT.cornering_stiffness * abs(tangent))
         plain = ratio * (2.0 - ratio) if ratio <= 1.0 else 1.0
         smooth = 2.0 / (np.exp(-4.0 * ratio) + 1.0) - 1.0
-        for tyres, used in (("plain", plain), ("smooth", smooth)):
-            expected = FRONT.cornering_stiffness * tangent * used
+        for tyres, force_share in (("plain", plain), ("smooth", smooth)):
+            expected = FRONT.cornering_stiffness * tangent * force_share
             assert float(force(torch.tensor(tangent, dtype=torch.float64), tyres)) == pytest.approx(
                 expected, rel=1e-12
             )
 
 
-@BOTH
+@BOTH_CURVES
 def test_gradients_of_tyres_are_finite_differences_and_the_stiffness_at_zero(tyres):
     slip = torch.tensor([0.0, 1e-12, -1e-12, 1e-4], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(force(slip, tyres).sum(), slip)
@@ -72,24 +72,24 @@ def test_braking_loads_the_front_axle():
     assert front[1] - front[0] == pytest.approx(1970.0 * 5.0 * 0.52 / 2.88, rel=1e-5)
 
 
-@BOTH
+@BOTH_CURVES
 def test_the_compiled_track_is_the_readable_one(tyres):
     track = dugoff_track(tyres)
     readable = TorchModel(track.transition, track.observation)
     compiled = CompiledDugoffTrack(track)
     points, inputs = (part.numpy() for part in driven(300))
     for entry, size in enumerate((2, 5)):
-        expected, found = (
+        expected, actual = (
             called(model, entry, points, inputs, size) for model in (readable, compiled)
         )
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-9)
         upstream = drawn(300, 5, size, seed=3).numpy()
-        expected, found = (
+        expected, actual = (
             called(model, 2 + entry, points, inputs, 2, upstream, [])
             for model in (readable, compiled)
         )
-        assert np.isfinite(found).all()
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        assert np.isfinite(actual).all()
+        np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_gradients_through_the_filter_reach_measurements_and_both_noises():
@@ -105,33 +105,33 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
     ).double()
     inputs[1, 4:, 0] = 8.0  # rolls, then drives
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
-    given = [
+    differentiable = [
         (torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(3, 8, 5) * sizes),
         (torch.tensor([0.05, 0.02]) * (1.0 + 0.3 * drawn(3, 8, 2, seed=4).abs())),
         (sizes * (1.0 + 0.3 * drawn(3, 8, 5, seed=5).abs())),
     ]
-    given[0][0, 3, 2] = torch.nan
+    differentiable[0][0, 3, 2] = torch.nan
     weights = drawn(3, 8, 2, seed=6)
 
     def outcome(parts, *, compiled=True):
         measurements, process, sensors = parts
         noises = (torch.diag_embed(part.square()) for part in (process, sensors))
-        own = TrackFilter(track)
+        track_filter = TrackFilter(track)
         if not compiled:
-            own.model = TorchModel(track.transition, track.observation)
-        filtered = own.filtered(measurements, inputs, *noises)
+            track_filter.model = TorchModel(track.transition, track.observation)
+        filtered = track_filter.filtered(measurements, inputs, *noises)
         return (filtered.steps.filtered.mean * weights).sum()
 
     def gradients(*, compiled):
-        leaves = [part.clone().requires_grad_() for part in given]
+        leaves = [part.clone().requires_grad_() for part in differentiable]
         return list(torch.autograd.grad(outcome(leaves, compiled=compiled), leaves))
 
-    for found, expected, size in zip(
+    for gradient, expected, size in zip(
         gradients(compiled=True), gradients(compiled=False), (sizes, 0.1, sizes), strict=True
     ):
-        assert torch.isfinite(found).all()
+        assert torch.isfinite(gradient).all()
         scale = float((expected * size).abs().max())
-        torch.testing.assert_close(found * size, expected * size, rtol=0.0, atol=1e-8 * scale)
+        torch.testing.assert_close(gradient * size, expected * size, rtol=0.0, atol=1e-8 * scale)
 
 
 def test_a_sequence_has_the_same_digits_alone_as_beside_others():
@@ -154,11 +154,11 @@ def test_a_sequence_has_the_same_digits_alone_as_beside_others():
         filtered = TrackFilter(track).filtered(
             leaves[0], inputs[rows], leaves[1], sizes.double().square().diag()
         )
-        found = filtered.steps.filtered
-        (found.mean.square().sum() + found.covariance.sum()).backward()
+        states = filtered.steps.filtered
+        (states.mean.square().sum() + states.covariance.sum()).backward()
         return [
-            found.mean.detach(),
-            found.covariance.detach(),
+            states.mean.detach(),
+            states.covariance.detach(),
             filtered.repaired,
             *(leaf.grad for leaf in leaves),
         ]
@@ -166,5 +166,5 @@ def test_a_sequence_has_the_same_digits_alone_as_beside_others():
     together = outcome(slice(None))
     assert together[2].any()
     for row in range(count):
-        for own, beside in zip(outcome(slice(row, row + 1)), together, strict=True):
-            assert torch.equal(own[0].nan_to_num(), beside[row].nan_to_num()), row
+        for alone, beside in zip(outcome(slice(row, row + 1)), together, strict=True):
+            assert torch.equal(alone[0].nan_to_num(), beside[row].nan_to_num()), row

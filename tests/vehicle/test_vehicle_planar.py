@@ -42,7 +42,7 @@ def test_runge_kutta_is_an_independent_integrator(car):
     """Over 10 ms from a drifting state; and its error falls with the fourth power of the step."""
     state = tensor(3.0, -0.6, 2.5, 3.4)
     inputs = tensor(0.2, 8.0)
-    known = solve_ivp(
+    solution = solve_ivp(
         lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(),
         (0.0, 0.01),
         state.numpy(),
@@ -51,10 +51,10 @@ def test_runge_kutta_is_an_independent_integrator(car):
     )
     errors = []
     for steps in (1, 2):
-        own = state
+        stepped = state
         for _ in range(steps):
-            own = rk4(lambda x, u: rates(car, x, u), own, inputs, 0.01 / steps)
-        errors.append(float((own - torch.from_numpy(known.y[:, -1])).abs().max()))
+            stepped = rk4(lambda x, u: rates(car, x, u), stepped, inputs, 0.01 / steps)
+        errors.append(float((stepped - torch.from_numpy(solution.y[:, -1])).abs().max()))
     assert errors[0] < 1e-6
     assert 10.0 < errors[0] / errors[1] < 24.0
 
@@ -62,23 +62,23 @@ def test_runge_kutta_is_an_independent_integrator(car):
 def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     state = tensor(4.0, 0.0, 0.0, 4.0)
     inputs = tensor(0.0, 0.0)
-    own = rates(car, state, inputs)
+    car_rates = rates(car, state, inputs)
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
-    assert float(own[0]) == pytest.approx(-drag / F1TENTH["mass"])
-    assert own[1:3].abs().max() < 1e-12
-    assert float(own[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
+    assert float(car_rates[0]) == pytest.approx(-drag / F1TENTH["mass"])
+    assert car_rates[1:3].abs().max() < 1e-12
+    assert float(car_rates[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
     # ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1).
     chassis, tyres = car
     state = tensor(3.0, -0.6, 2.5, 3.4)
     inputs = tensor(0.2, 8.0)
-    own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
-    assert float(own.ax) == pytest.approx(float(own.rates[0] - 2.5 * -0.6))
-    assert float(own.ay) == pytest.approx(float(own.rates[1] + 2.5 * 3.0))
+    car_rates = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+    assert float(car_rates.ax) == pytest.approx(float(car_rates.rates[0] - 2.5 * -0.6))
+    assert float(car_rates.ay) == pytest.approx(float(car_rates.rates[1] + 2.5 * 3.0))
     chassis = PlanarCar().double().requires_grad_(False)
     none = TyreForces(*(tensor(0.0)[0],) * 4)
-    own = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
+    car_rates = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
     drag = 0.1 + 0.01 * 3.0 + 0.1 * 9.0
-    assert own.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
+    assert car_rates.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
 
 
 def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_for(car):
@@ -101,14 +101,14 @@ def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_f
     )
     chassis = PlanarCar()
     slips = chassis.slips(torch.tensor([3.0, 0.5, 1.0, 3.5]), torch.tensor([0.1, 0.0]))
-    for one, other in zip(
+    for first, second in zip(
         plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True
     ):
-        assert one.item() == pytest.approx(other.item(), rel=1e-5)
-    own = PositiveParameters({"inertia": 0.46})
+        assert first.item() == pytest.approx(second.item(), rel=1e-5)
+    inertia_parameter = PositiveParameters({"inertia": 0.46})
     with torch.no_grad():
-        own.get_parameter("log_inertia").sub_(20.0)
-    assert 0.0 < own["inertia"].item() < 1e-8
+        inertia_parameter.get_parameter("log_inertia").sub_(20.0)
+    assert 0.0 < inertia_parameter["inertia"].item() < 1e-8
 
 
 def test_for_small_slips_it_is_the_linear_single_track(car):
@@ -123,13 +123,15 @@ def test_for_small_slips_it_is_the_linear_single_track(car):
     steer = 1e-3
     state = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed)
     inputs = tensor(steer, 0.0)
-    own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+    planar_motion = chassis.motion(
+        state, inputs, tyres(chassis.slips(state, inputs), chassis.loads())
+    )
     A, B, C, D = lateral_model(linear, np.array(speed))
     x = np.array([sideslip, yaw_rate])
     expected = A @ x + B * steer
-    assert float(own.rates[2]) == pytest.approx(expected[1], rel=1e-3)
-    assert float(own.ay) == pytest.approx(float(C @ x + D * steer), rel=1e-3)
-    assert float(own.rates[1]) / speed == pytest.approx(expected[0], rel=1e-3)
+    assert float(planar_motion.rates[2]) == pytest.approx(expected[1], rel=1e-3)
+    assert float(planar_motion.ay) == pytest.approx(float(C @ x + D * steer), rel=1e-3)
+    assert float(planar_motion.rates[1]) / speed == pytest.approx(expected[0], rel=1e-3)
 
 
 def test_the_magic_formula_has_its_slope_its_peak_and_its_curvature():
@@ -152,14 +154,14 @@ def test_the_magic_formula_has_its_slope_its_peak_and_its_curvature():
 def test_forces_oppose_sliding_and_scale_with_friction_and_load(car):
     chassis, tyres = car
     slips = chassis.slips(tensor(3.0, 0.5, 0.0, 3.5), tensor(0.0, 0.0))
-    own = tyres(slips, chassis.loads())
-    assert float(own.front_y) < 0.0
-    assert float(own.rear_y) < 0.0
-    assert float(own.front_x) > 0.0, "wheels that turn faster than the car rolls push it"
+    forces = tyres(slips, chassis.loads())
+    assert float(forces.front_y) < 0.0
+    assert float(forces.rear_y) < 0.0
+    assert float(forces.front_x) > 0.0, "wheels that turn faster than the car rolls push it"
     slippery = PacejkaTyres(TYRES | {"friction": 2.0 * 0.8916}).double().requires_grad_(False)
     half = slippery(slips, tuple(0.5 * load for load in chassis.loads()))
-    for one, other in zip(own, half, strict=True):
-        assert float(other) == pytest.approx(float(one))
+    for force, halved in zip(forces, half, strict=True):
+        assert float(halved) == pytest.approx(float(force))
 
 
 def test_gradients_reach_every_parameter_and_batches_work(car):

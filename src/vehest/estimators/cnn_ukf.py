@@ -306,7 +306,9 @@ class EndToEnd:
                 f"no training recording is {training.steps} samples long, as a sequence for training through the filter is "
                 f"(the longest has {max(self.lengths)}); lower training.steps"
             )
-        taken = [estimator.taken(recording.stack(estimator.channels)) for recording in recordings]
+        taken = [
+            estimator.split_samples(recording.stack(estimator.channels)) for recording in recordings
+        ]
         self.measured, self.driven = (
             torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True)
         )

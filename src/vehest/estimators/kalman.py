@@ -1,4 +1,6 @@
-"""Kalman filter over the linear single track: the KF of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023."""
+"""Kalman filter over the linear single track: the KF of Leanza et al. 2021, as in Table VI of Da
+Lio et al. 2023.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,14 @@ from vehest.filters.kalman_scan import kalman_scan
 from vehest.training.context import FitContext
 
 LEVELS = ("yaw_rate", "ay", "steer")
-SILENT = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
+MIN_LEVEL = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
 
 
 @dataclass(frozen=True)
 class SensorNoise(Group):
-    """Standard deviations of the sensors' noise, given, or else read off measured signals above a frequency."""
+    """Standard deviations of the sensors' noise, given, or else read off measured signals above a
+    frequency.
+    """
 
     group = "estimator.noise"
     read_from: Literal["training", "recording"] = setting(
@@ -56,7 +60,8 @@ class SensorNoise(Group):
 
 @dataclass(frozen=True)
 class SensorOffsets(Group):
-    """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within a manoeuvre is in the covariance.
+    """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within
+    a manoeuvre is in the covariance.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
     """
@@ -76,18 +81,20 @@ class SensorOffsets(Group):
     )
 
     @property
-    def given(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Which there are."""
         return tuple(name for name in ("ay", "steer") if getattr(self, name) is not None)
 
 
 class KalmanFilter(SideslipFilter):
-    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is a noisy input.
+    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is
+    a noisy input.
 
-    Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels, which are `values`, are standard deviations
-    of the high-passed signals; no reference is looked at.
+    Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels, which
+    are `values`, are standard deviations of the high-passed signals; no reference is looked at.
 
-    Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public code.
+    Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public
+    code.
     """
 
     name = "kalman"
@@ -125,13 +132,13 @@ class KalmanFilter(SideslipFilter):
     @property
     def adapts(self) -> bool:
         """Whether offsets are states."""
-        return bool(self.offsets.given)
+        return bool(self.offsets.names)
 
     @property
     def variant(self) -> str:
         """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
-        offsets = "".join(f"_{name}_offset" for name in self.offsets.given)
+        offsets = "".join(f"_{name}_offset" for name in self.offsets.names)
         return self.name + noise + offsets + self.gate_suffix
 
     @property
@@ -143,7 +150,7 @@ class KalmanFilter(SideslipFilter):
             else f", noise {'given' if self.causal else 'read off the recording itself'}"
         )
         names = {"ay": "ay", "steer": "the steering angle"}
-        offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
+        offsets = "".join(f", offset of {names[name]}" for name in self.offsets.names)
         return self.title + noise + offsets + self.gate_title
 
     def declarations_of_values(self) -> Mapping[str, Declaration]:
@@ -157,24 +164,28 @@ class KalmanFilter(SideslipFilter):
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        return self.values | read_levels(recordings, self.noise.unknown, self.noise.cutoff, SILENT)
+        return self.values | read_levels(
+            recordings, self.noise.unknown, self.noise.cutoff, MIN_LEVEL
+        )
 
     def _estimate_one(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        own = self
+        fitted = self
         if not self.causal:
-            own = copy(self)
-            own.values = self._levels_of([recording])
-        return super(KalmanFilter, own)._estimate_one(recording, initial_state)
+            fitted = copy(self)
+            fitted.values = self._levels_of([recording])
+        return super(KalmanFilter, fitted)._estimate_one(recording, initial_state)
 
     def first_gaussian(
-        self, sample: FloatArray, given: Mapping[str, float]
+        self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
         """β and r, and offsets of 0 that are known to their standard deviations."""
-        offsets = [getattr(self.offsets, name) for name in self.offsets.given]
+        offsets = [getattr(self.offsets, name) for name in self.offsets.names]
         return self.first_motion(
-            sample, np.array([self.initial_deviation, self.initial_deviation, *offsets]), given
+            sample,
+            np.array([self.initial_deviation, self.initial_deviation, *offsets]),
+            initial_state,
         )
 
     def filter_samples(
@@ -184,12 +195,14 @@ class KalmanFilter(SideslipFilter):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ - b_δ."""
+        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y +
+        b_ay, and wheels stand at δ - b_δ.
+        """
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         offsets = self.offsets
         steps = len(samples)
-        n = 2 + len(offsets.given)
+        n = 2 + len(offsets.names)
         transition = np.zeros((steps, n, n))
         noise = np.zeros((steps, n, n))
         observation = np.zeros((steps, 2, n))
@@ -198,10 +211,10 @@ class KalmanFilter(SideslipFilter):
         noise[:, :2, :2] = spread[:, :, None] * spread[:, None, :]
         observation[:, 0, :2] = C
         observation[:, 1, 1] = 1.0
-        kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
-        for row, name in enumerate(offsets.given, 2):
-            transition[:, row, row] = kept
-            noise[:, row, row] = getattr(offsets, name) ** 2 * (1.0 - kept**2)
+        decay = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
+        for row, name in enumerate(offsets.names, 2):
+            transition[:, row, row] = decay
+            noise[:, row, row] = getattr(offsets, name) ** 2 * (1.0 - decay**2)
             if name == "ay":
                 observation[:, 0, row] = 1.0
             else:
@@ -212,9 +225,13 @@ class KalmanFilter(SideslipFilter):
         expected = np.stack([D * steer, np.zeros_like(steer)], axis=1)
         sensors = np.array([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2])
         model = LinearModel(transition, driven, noise, observation, expected, sensors)
-        found = kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
-        mean, covariance = found.filtered
-        innovations = (found.innovation, found.innovation_covariance, np.asarray(found.measured))
+        filtered = kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
+        mean, covariance = filtered.filtered
+        innovations = (
+            filtered.innovation,
+            filtered.innovation_covariance,
+            np.asarray(filtered.measured),
+        )
         return FilteredStates(
             mean, None, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1])
         )
@@ -222,10 +239,15 @@ class KalmanFilter(SideslipFilter):
     def c_values(self) -> dict[str, Any]:
         """Its car, levels of noise, offsets and gate."""
         car = self.car
-        kept = math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
+        decay = math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
         offsets = [
-            {"name": name, "row": row, "initial": level, "wander": level * math.sqrt(1.0 - kept**2)}
-            for row, name in enumerate(self.offsets.given, 2)
+            {
+                "name": name,
+                "row": row,
+                "initial": level,
+                "wander": level * math.sqrt(1.0 - decay**2),
+            }
+            for row, name in enumerate(self.offsets.names, 2)
             for level in (getattr(self.offsets, name),)
         ]
         front = car.cornering_stiffness_front
@@ -235,7 +257,7 @@ class KalmanFilter(SideslipFilter):
             "n": 2 + len(offsets),
             "columns": 4 + len(offsets) + (len(offsets) > 1),
             "offsets": offsets,
-            "kept": kept,
+            "kept": decay,
             "car": car,
             "step": 1.0 / self.rate_hz,
             "sum": front + rear,

@@ -15,16 +15,17 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-SHORTEST = 0.02
-LONGEST = 200.0  # s, time constants that are looked at
+MIN_TIME_CONSTANT = 0.02
+MAX_TIME_CONSTANT = 200.0  # s, time constants that are looked at
 N_STARTS = 25  # of a grid over them, in equal ratios, around the best of which the search goes on
 
 
 class Kinematic(Recursive):
     """dv/dt = a_y - u r - v/T, with the time constant T that fits the training recordings best.
 
-    Exact kinematics for T to infinity, where offsets and tilt of the acceleration add up without bound; the leak forgets them, and with
-    them every slow slide. Between samples the acceleration is held.
+    Exact kinematics for T to infinity, where offsets and tilt of the acceleration add up without
+    bound; the leak forgets them, and with them every slow slide. Between samples the acceleration
+    is held.
     """
 
     name = "kinematic"
@@ -38,17 +39,19 @@ class Kinematic(Recursive):
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
         """T [s]: the best of a grid, then a search between its neighbours."""
-        grid = np.geomspace(SHORTEST, LONGEST, N_STARTS)
+        grid = np.geomspace(MIN_TIME_CONSTANT, MAX_TIME_CONSTANT, N_STARTS)
         errors = [self._error_with(recordings, time_constant) for time_constant in grid]
         best = int(np.argmin(errors))
         bounds = (math.log(grid[max(best - 1, 0)]), math.log(grid[min(best + 1, N_STARTS - 1)]))
-        found = scipy.optimize.minimize_scalar(
+        solution = scipy.optimize.minimize_scalar(
             lambda logarithm: self._error_with(recordings, math.exp(logarithm)),
             bounds=bounds,
             method="bounded",
         )
         return {
-            "time_constant": math.exp(found.x) if found.fun < errors[best] else float(grid[best])
+            "time_constant": math.exp(solution.x)
+            if solution.fun < errors[best]
+            else float(grid[best])
         }
 
     def _error_with(self, recordings: Sequence[Recording], time_constant: float) -> float:
@@ -56,17 +59,17 @@ class Kinematic(Recursive):
         return self.mean_squared_error(recordings)
 
     @property
-    def kept(self) -> float:
+    def decay(self) -> float:
         """Share of v that is left after a sample."""
         return math.exp(-1.0 / (self.rate_hz * self.time_constant))
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """v [m/s] at each sample, from that one sample before."""
         vx, yaw_rate, ay = samples.T
-        gain = (1.0 - self.kept) * self.time_constant
+        gain = (1.0 - self.decay) * self.time_constant
         (start,) = state
         vy = scipy.signal.lfilter(
-            [gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start])
+            [gain], [1.0, -self.decay], ay - vx * yaw_rate, zi=np.array([self.decay * start])
         )[0]
         return {"vy": vy}, (float(vy[-1]),)
 
@@ -74,8 +77,8 @@ class Kinematic(Recursive):
         """Its time constant, and what follows from it."""
         return {
             "time_constant": self.time_constant,
-            "kept": self.kept,
-            "gain": (1.0 - self.kept) * self.time_constant,
+            "kept": self.decay,
+            "gain": (1.0 - self.decay) * self.time_constant,
         }
 
 

@@ -47,7 +47,7 @@ from vehest.vehicle.dynamics import (
 )
 from vehest.vehicle.parameters import LENGTH, MASS, YAW_INERTIA
 from vehest.vehicle.planar import F1TENTH, LEARNT
-from vehest.vehicle.tyres import STILL
+from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
 
 SHORT = {
     "pacejka": "pc",
@@ -86,22 +86,22 @@ class CarSettings(Group):
     """A small car with one electric motor: what is known, and where learning starts."""
 
     group = "estimator.car"
-    mass: float = setting(5.1, "known", unit="kg", least=MASS.least, most=MASS.most)
-    wheelbase: float = setting(0.33, "known", unit="m", least=LENGTH.least, most=LENGTH.most)
-    wheel_radius: float = setting(0.05, "known", unit="m", least=LENGTH.least, most=LENGTH.most)
+    mass: float = setting(5.1, "known", unit="kg", least=MASS.lower, most=MASS.upper)
+    wheelbase: float = setting(0.33, "known", unit="m", least=LENGTH.lower, most=LENGTH.upper)
+    wheel_radius: float = setting(0.05, "known", unit="m", least=LENGTH.lower, most=LENGTH.upper)
     yaw_inertia: float = setting(
         F1TENTH["yaw_inertia"],
         "trained from here on",
         unit="kg m²",
-        least=YAW_INERTIA.least,
-        most=YAW_INERTIA.most,
+        least=YAW_INERTIA.lower,
+        most=YAW_INERTIA.upper,
     )
     cg_to_rear_axle: float = setting(
         F1TENTH["cg_to_rear_axle"],
         "trained from here on",
         unit="m",
-        least=LENGTH.least,
-        most=LENGTH.most,
+        least=LENGTH.lower,
+        most=LENGTH.upper,
     )
     drag_constant: float = setting(
         F1TENTH["drag_constant"], "trained from here on", unit="N", positive=True
@@ -549,7 +549,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 "noise_kind": s.noise.replace("_", " "),
                 "step": own.step,
                 "radius": s.car.wheel_radius,
-                "still": STILL,
+                "still": SLIP_SPEED_OFFSET,
                 "turn": TURN,
                 "unscaled": UNSCALED,
                 "friction": s.friction if s.start_friction is None else s.start_friction,

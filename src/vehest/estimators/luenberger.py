@@ -1,4 +1,6 @@
-"""Kinematic Luenberger observer with reset: Farrelly & Wellstead 1996, as in Da Lio et al. 2023, Appendix A."""
+"""Kinematic Luenberger observer with reset: Farrelly & Wellstead 1996, as in Da Lio et al. 2023,
+Appendix A.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,24 @@ def implicit_euler_observer(
     vy: FloatArray,
     vx: FloatArray,
 ) -> None:
-    """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the time of each sample, (T,).
+    """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the
+    time of each sample, (T,).
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
-    Args:
-        measurements: yaw_rate, vx, ay, ax, shape (T, 4).
-        gain, step: α, and the sampling time τ [s].
-        threshold: |yaw rate| below which the state is reset [rad/s].
-        v, u: lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
+    Parameters
+    ----------
+    measurements : FloatArray
+        yaw_rate, vx, ay, ax, shape (T, 4).
+    gain, step : float
+        α, and the sampling time τ [s].
+    threshold : float
+        |yaw rate| below which the state is reset [rad/s].
+    v, u : float
+        Lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
 
-    Source: Da Lio et al. 2023, Appendix A, with the gains in the order of Appendix B; Farrelly & Wellstead 1996.
+    Source: Da Lio et al. 2023, Appendix A, with the gains in the order of Appendix B; Farrelly &
+    Wellstead 1996.
     """
     if math.isnan(u):
         u = measurements[0, 1]
@@ -88,7 +97,8 @@ def observe(
 
 
 class Luenberger(Recursive):
-    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small to observe anything.
+    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small to observe
+    anything.
 
     Source: Da Lio et al. 2023, Appendix A (gains in the order that its Appendix B implies).
     """

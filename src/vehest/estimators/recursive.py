@@ -40,10 +40,12 @@ def compiled(step: Callable[..., Any]) -> Any:
 
 
 class Recursive(Estimator):
-    """An observer or filter: it goes through samples in order and carries a state. Nothing in it is random.
+    """An observer or filter: it goes through samples in order and carries a state. Nothing in it is
+    random.
 
-    Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a setting is not fitted. A family has
-    either a compiled ``step(numbers, state, sample)``, which returns the state after a sample, or its own `run`.
+    Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a
+    setting is not fitted. A family has either a compiled ``step(numbers, state, sample)``, which
+    returns the state after a sample, or its own `run`.
     """
 
     training_type: ClassVar[type] = NoTraining
@@ -63,23 +65,33 @@ class Recursive(Estimator):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         declared = settings.declarations()
-        given = {name: getattr(settings, name) for name in declared if declared[name].is_fitted}
-        self.values = {name: math.nan if value is None else value for name, value in given.items()}
-        self.unknown = tuple(name for name, value in given.items() if value is None)
+        fitted_settings = {
+            name: getattr(settings, name) for name in declared if declared[name].is_fitted
+        }
+        self.values = {
+            name: math.nan if value is None else value for name, value in fitted_settings.items()
+        }
+        self.unknown = tuple(name for name, value in fitted_settings.items() if value is None)
 
-    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
-        """The state before the first sample: what is given, else what is measured, else 0; see `Estimator.first_state`."""
+    def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
+        """The state before the first sample: that of a protocol, else what is measured, else 0; see
+        `Estimator.first_state`.
+        """
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
-        return tuple(float(given.get(name, measured.get(name, 0.0))) for name in self.states)
+        return tuple(
+            float(initial_state.get(name, measured.get(name, 0.0))) for name in self.states
+        )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
         """The quantities of ``states`` by the compiled ``step``; see `Estimator.run`."""
-        found = np.empty((len(samples), len(self.states)))
-        state = _scan(self.step, self.numbers(), state, np.ascontiguousarray(samples), found)
-        return dict(zip(self.states, found.T.copy(), strict=True)), state
+        estimates = np.empty((len(samples), len(self.states)))
+        state = _scan(self.step, self.numbers(), state, np.ascontiguousarray(samples), estimates)
+        return dict(zip(self.states, estimates.T.copy(), strict=True)), state
 
     def numbers(self) -> Any:
-        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes them: a named tuple."""
+        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes
+        them: a named tuple.
+        """
         numbers = {
             name: value
             for name, value in vars(self.settings).items()
@@ -88,20 +100,28 @@ class Recursive(Estimator):
         return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
-        """Numbers of the smallest mean squared error of vy, where the family has them in closed form.
+        """Numbers of the smallest mean squared error of vy, where the family has them in closed
+        form.
 
-        Raises `DataError`: the recordings do not determine them.
+        Raises
+        ------
+        DataError
+            The recordings do not determine them.
         """
         return None
 
     def find_numbers(
         self, data: FitData, training: Any, context: FitContext
     ) -> tuple[Mapping[str, float], FitRecord]:
-        """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
+        """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared
+        error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
 
-        Raises `DataError`: the recordings do not determine the values.
+        Raises
+        ------
+        DataError
+            The recordings do not determine the values.
         """
         values = self.closed_form(data.train)
         if values is not None:
@@ -114,13 +134,15 @@ class Recursive(Estimator):
             )
         declared = [self.settings.declarations()[name] for name in self.unknown]
         scales = [
-            largest_absolute(data.train, own.of_largest, self.name) if own.of_largest else 1.0
-            for own in declared
+            largest_absolute(data.train, declaration.of_largest, self.name)
+            if declaration.of_largest
+            else 1.0
+            for declaration in declared
         ]
         boxes, starts = (
             [
-                tuple(value * scale for value in getattr(own, part))
-                for own, scale in zip(declared, scales, strict=True)
+                tuple(value * scale for value in getattr(declaration, part))
+                for declaration, scale in zip(declared, scales, strict=True)
             ]
             for part in ("box", "start")
         )
@@ -149,19 +171,25 @@ class Recursive(Estimator):
     ) -> list[FitRecord]:
         """Fit one; the others, which could not differ, get the same.
 
-        Raises `DataError`: a channel or the reference is missing or has gaps.
+        Raises
+        ------
+        DataError
+            A channel or the reference is missing or has gaps.
         """
         started = time.monotonic()
-        own = [member for member in members if isinstance(member, Recursive)]
+        recursives = [member for member in members if isinstance(member, Recursive)]
         values: Mapping[str, float] = {}
         record = FitRecord()
-        if own[0].learns:
-            channels = (*own[0].channels, *own[0].learns_from)
+        if recursives[0].learns:
+            channels = (*recursives[0].channels, *recursives[0].learns_from)
             require_learnable(
-                [*data.train, *data.validation], channels, own[0].name, own[0].skippable
+                [*data.train, *data.validation],
+                channels,
+                recursives[0].name,
+                recursives[0].skippable,
             )
-            values, record = own[0].find_numbers(data, training, context)
-        for member in own:
+            values, record = recursives[0].find_numbers(data, training, context)
+        for member in recursives:
             member.values |= {name: float(value) for name, value in values.items()}
         metrics = {"epochs": 0, **record.metrics, "train_seconds": time.monotonic() - started}
         return [replace(record, metrics=metrics)] * len(members)
@@ -177,7 +205,13 @@ class Recursive(Estimator):
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
     def require_fitted(self) -> None:
-        """Raises `ConfigurationError`: a number is neither given nor fitted."""
+        """Check that every number is given or fitted.
+
+        Raises
+        ------
+        ConfigurationError
+            A number is neither given nor fitted.
+        """
         if any(math.isnan(value) for value in self.values.values()):
             raise ConfigurationError(
                 f"estimator '{self.name}' has not been fitted yet; fit or load it first"
@@ -207,15 +241,16 @@ class Recursive(Estimator):
 def _fitted_number(name: str) -> property:
     """Attribute of an estimator that is one of its ``values``."""
     return property(
-        lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)})
+        lambda estimator: estimator.values[name],
+        lambda estimator, value: estimator.values.update({name: float(value)}),
     )
 
 
 @numba.njit(error_model="numpy")
-def _scan(step, numbers, state, samples, found):  # type: ignore[no-untyped-def]
+def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
     """State after the last sample; writes the state after each sample into ``found``, (T, n)."""
     for k in range(len(samples)):
         state = step(numbers, state, samples[k])
         for i in range(len(state)):
-            found[k, i] = state[i]
+            estimates[k, i] = state[i]
     return state

@@ -14,15 +14,17 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-CONDITION = 1e8  # of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
+# of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
+CONDITION = 1e8
 
 
 class StaticMap(Recursive):
     """v = r (b - k u²), with b and k by least squares on the training recordings.
 
-    It is the steady cornering of a linear single track: b is the distance of the rear axle from the point where v holds, k the slip of
-    the rear axle per lateral acceleration, m l_f / (l C_r) (Mitschke & Wallentowitz, Dynamik der Kraftfahrzeuge, steady-state cornering).
-    Dynamics, and tyres beyond their linear range, are left out.
+    It is the steady cornering of a linear single track: b is the distance of the rear axle from the
+    point where v holds, k the slip of the rear axle per lateral acceleration, m l_f / (l C_r)
+    (Mitschke & Wallentowitz, Dynamik der Kraftfahrzeuge, steady-state cornering). Dynamics, and
+    tyres beyond their linear range, are left out.
     """
 
     name = "static_map"

@@ -1,4 +1,5 @@
-"""What calibrated bands are worth: how often they hold the error, how wide they are, and both in one score.
+"""What calibrated bands are worth: how often they hold the error, how wide they are, and both in
+one score.
 
 A band is meant for v and β each: figures of β are in degrees, those of v have the suffix ``_vy``.
 """
@@ -12,9 +13,9 @@ import numpy as np
 import scipy
 
 from vehest.constants import FloatArray
-from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, block_sums, segments_of
+from vehest.evaluation.blocks import MIN_BLOCKS, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import BoolArray, Scored
-from vehest.evaluation.regimes import AY_BANDS, Mask, is_known, is_long_enough
+from vehest.evaluation.regimes import AY_BANDS, Mask, is_long_enough, is_represented
 from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, effective_blocks, intraclass_correlation
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
@@ -32,11 +33,12 @@ class Banded(NamedTuple):
 
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
-    """Errors and bands of ``vy`` [m/s], at all samples, and ``sideslip`` [deg], at those at which it is scored.
+    """Errors and bands of ``vy`` [m/s], at all samples, and ``sideslip`` [deg], at those at which
+    it is scored.
 
     All levels are in proportion to that at 90 %.
     """
-    turned = np.concatenate(
+    sideslip_error = np.concatenate(
         [
             np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
             for part in parts
@@ -44,77 +46,86 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     )
     errors = {
         "vy": np.concatenate([part.vy - part.vy_ref for part in parts]),
-        "sideslip": np.degrees(turned),
+        "sideslip": np.degrees(sideslip_error),
     }
-    shown = {"vy": 1.0, "sideslip": np.degrees(1.0)}
-    beside = {"vy": bands.vy.beside(SHOWN_LEVEL), "sideslip": bands.sideslip.beside(SHOWN_LEVEL)}
+    scale = {"vy": 1.0, "sideslip": np.degrees(1.0)}
+    level_ratios = {
+        "vy": bands.vy.beside(SHOWN_LEVEL),
+        "sideslip": bands.sideslip.beside(SHOWN_LEVEL),
+    }
     half = {
-        name: shown[name]
+        name: scale[name]
         * np.concatenate([part.bands[name] for part in parts])[:, None]
-        * beside[name]
+        * level_ratios[name]
         for name in SUFFIXES
     }
     is_sideslip_scored = np.concatenate([part.is_sideslip_scored for part in parts])
     is_scored = {"vy": np.ones_like(is_sideslip_scored), "sideslip": is_sideslip_scored}
     return {
-        name: Banded(errors[name][own], half[name][own], own) for name, own in is_scored.items()
+        name: Banded(errors[name][mask], half[name][mask], mask) for name, mask in is_scored.items()
     }
 
 
 def band_figures(
-    own: Mapping[str, Banded],
+    banded_errors: Mapping[str, Banded],
     parts: Sequence[Scored],
     turns: Sequence[FloatArray | None],
     rate_hz: float,
 ) -> dict[str, float]:
-    """Figures of the bands of a test set at ``rate_hz`` [Hz], whose yaw rates ``turns`` [rad/s] are None where not measured.
+    """Figures of the bands of a test set at ``rate_hz`` [Hz], whose yaw rates ``turns`` [rad/s] are
+    None where not measured.
 
-    ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and ``crps`` as below; ``coverage_90_p10``
-    and ``…_p90`` 10 and 90 % quantiles of the coverage of manoeuvres, which are the blocks that bands are calibrated by; ``error_icc``
-    intraclass correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres these are spread over.
-    Nothing of a quantity that is scored at no sample.
+    ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and
+    ``crps`` as below; ``coverage_90_p10`` and ``…_p90`` 10 and 90 % quantiles of the coverage of
+    manoeuvres, which are the blocks that bands are calibrated by; ``error_icc`` intraclass
+    correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres
+    these are spread over. Nothing of a quantity that is scored at no sample.
     """
     manoeuvres = np.concatenate(
         manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0]
     )
     figures: dict[str, float] = {}
     for name, suffix in SUFFIXES.items():
-        errors, half, is_scored = own[name]
+        errors, half, is_scored = banded_errors[name]
         if not len(errors):
             continue
         labels = np.unique(manoeuvres[is_scored], return_inverse=True)[1]
-        shown = half[:, LEVELS.index(SHOWN_LEVEL)]
+        half_width_90 = half[:, LEVELS.index(SHOWN_LEVEL)]
         inside = np.abs(errors)[:, None] <= half
         by_block = block_sums(
             inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels
         ) / np.bincount(labels)
-        normalised = np.square(np.divide(errors, shown, out=np.zeros_like(errors), where=shown > 0))
-        found = {
+        normalised = np.square(
+            np.divide(errors, half_width_90, out=np.zeros_like(errors), where=half_width_90 > 0)
+        )
+        values = {
             f"coverage_{100 * level:.0f}": float(inside[:, k].mean())
             for k, level in enumerate(LEVELS)
         }
-        found |= {
+        values |= {
             "coverage_90_p10": float(np.quantile(by_block, 0.1)),
             "coverage_90_p90": float(np.quantile(by_block, 0.9)),
-            "width_90": float(2.0 * shown.mean()),
-            "interval_score": float(interval_score(errors, shown, SHOWN_LEVEL).mean()),
+            "width_90": float(2.0 * half_width_90.mean()),
+            "interval_score": float(interval_score(errors, half_width_90, SHOWN_LEVEL).mean()),
             "crps": float(crps_of_levels(errors, half, LEVELS).mean()),
             "error_icc": intraclass_correlation(normalised, labels),
             "band_blocks": effective_blocks(block_sums(normalised, labels)),
         }
-        figures |= {f"{metric}{suffix}": value for metric, value in found.items()}
+        figures |= {f"{metric}{suffix}": value for metric, value in values.items()}
     return figures
 
 
 def coverage_intervals(
-    own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
+    banded_errors: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
+    """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`;
+    nothing where there are too few.
+    """
     all_segments = segments_of(parts, rate_hz)
-    found = {}
+    intervals = {}
     segment_of = np.repeat(np.arange(len(all_segments)), all_segments.samples.astype(np.int64))
     for name, suffix in SUFFIXES.items():
-        errors, half, is_scored = own[name]
+        errors, half, is_scored = banded_errors[name]
         if not len(errors):
             continue
         segments = all_segments if name == "vy" else all_segments.with_sideslip
@@ -123,64 +134,78 @@ def coverage_intervals(
         for k, level in enumerate(LEVELS):
             inside = np.bincount(places, weights=np.abs(errors) <= half[:, k])
             labels = block_labels(segments, (1.0 - inside / samples)[None])
-            if labels.max() + 1 >= LEAST_BLOCKS:
+            if labels.max() + 1 >= MIN_BLOCKS:
                 sums = block_sums(np.stack([inside, samples]), labels)
-                found[f"coverage_{100 * level:.0f}{suffix}"] = proportion_interval(*sums)
-    return found
+                intervals[f"coverage_{100 * level:.0f}{suffix}"] = proportion_interval(*sums)
+    return intervals
 
 
 def figures_by_regime(
-    own: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float
+    banded_errors: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float
 ) -> dict[str, dict[str, float]]:
-    """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only of what is scored at 2 s of samples."""
-    found: dict[str, dict[str, float]] = {}
-    for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
-        found[regime] = {}
+    """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only of what is
+    scored at 2 s of samples.
+    """
+    figures: dict[str, dict[str, float]] = {}
+    for regime in (regime for regime in AY_BANDS if is_represented(regime, masks, rate_hz)):
+        figures[regime] = {}
         inside = np.concatenate([mask[regime] for mask in masks])
         for name, suffix in SUFFIXES.items():
-            chosen = inside[own[name].is_scored]
+            chosen = inside[banded_errors[name].is_scored]
             if not is_long_enough([chosen], rate_hz):
                 continue
-            errors = own[name].errors[chosen]
-            half = own[name].half[chosen]
-            shown = half[:, LEVELS.index(SHOWN_LEVEL)]
+            errors = banded_errors[name].errors[chosen]
+            half = banded_errors[name].half[chosen]
+            half_width_90 = half[:, LEVELS.index(SHOWN_LEVEL)]
             values = (
-                np.mean(np.abs(errors) <= shown),
-                2.0 * shown.mean(),
-                interval_score(errors, shown, SHOWN_LEVEL).mean(),
+                np.mean(np.abs(errors) <= half_width_90),
+                2.0 * half_width_90.mean(),
+                interval_score(errors, half_width_90, SHOWN_LEVEL).mean(),
             )
-            found[regime] |= {
+            figures[regime] |= {
                 f"{metric}{suffix}": float(value)
                 for metric, value in zip(IN_REGIMES, values, strict=True)
             }
-    return found
+    return figures
 
 
 def interval_score(errors: FloatArray, half: FloatArray, level: float) -> FloatArray:
-    """Width of each interval, and 2/α times by how far it missed; the lowest on average is the true central interval's.
+    """Width of each interval, and 2/α times by how far it missed; the lowest on average is the true
+    central interval's.
 
-    Args:
-        errors, half: (N,), in the unit of the score; half widths of the intervals.
-        level: 1 - α.
+    Parameters
+    ----------
+    errors, half : FloatArray
+        (N,), in the unit of the score; half widths of the intervals.
+    level : float
+        1 - α.
 
-    Source: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 102 (477), 2007, Eq. 43.
+    Source: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 102
+    (477), 2007, Eq. 43.
     """
     return 2.0 * half + 2.0 / (1.0 - level) * np.maximum(np.abs(errors) - half, 0.0)
 
 
 def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]) -> FloatArray:
-    """Continuous ranked probability score from the quantiles that central intervals end at, and the estimate as the median.
+    """Continuous ranked probability score from the quantiles that central intervals end at, and the
+    estimate as the median.
 
-    CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to it. Of a Gaussian, at levels 50, 68,
-    90 and 95 %, that is 2.6 % too low on average, and within 2 σ off by up to 0.045 σ: the tails beyond 97.5 % are taken for their end.
+    CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to
+    it. Of a Gaussian, at levels 50, 68, 90 and 95 %, that is 2.6 % too low on average, and within 2
+    σ off by up to 0.045 σ: the tails beyond 97.5 % are taken for their end.
 
-    Args:
-        errors: estimate - reference, (N,).
-        half: half widths, (N, L).
-        levels: of the columns, ascending.
+    Parameters
+    ----------
+    errors : FloatArray
+        Estimate - reference, (N,).
+    half : FloatArray
+        Half widths, (N, L).
+    levels : Sequence[float]
+        Of the columns, ascending.
 
-    Source: Laio & Tamea, Verification tools for probabilistic forecasts of continuous hydrological variables, Hydrology and Earth System
-    Sciences 11, 2007, for the integral; Gneiting & Raftery 2007, Section 4.2.
+    Source: Laio & Tamea, Verification tools for probabilistic forecasts of continuous hydrological
+    variables, Hydrology and Earth System Sciences 11, 2007, for the integral; Gneiting & Raftery
+    2007, Section 4.2.
     """
     orders = np.sort(
         [0.5, *(0.5 - 0.5 * level for level in levels), *(0.5 + 0.5 * level for level in levels)]
@@ -193,17 +218,21 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
 
 def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
-    """95 % interval of a proportion that is known by blocks: the exact binomial one of as many samples as the blocks are worth.
+    """95 % interval of a proportion that is known by blocks: the exact binomial one of as many
+    samples as the blocks are worth.
 
-    These would have the variance that the blocks show, and are fewer for what so few blocks know of it; where all are inside, or none,
-    each block is worth one.
+    These would have the variance that the blocks show, and are fewer for what so few blocks know of
+    it; where all are inside, or none, each block is worth one.
 
-    Args:
-        sums: samples inside, of each block, (B,), B ≥ 2.
-        sizes: samples of each block, (B,).
+    Parameters
+    ----------
+    sums : FloatArray
+        Samples inside, of each block, (B,), B ≥ 2.
+    sizes : FloatArray
+        Samples of each block, (B,).
 
-    Source: Korn & Graubard, Confidence intervals for proportions with small expected number of positive counts estimated from survey data,
-    Survey Methodology 24 (2), 1998.
+    Source: Korn & Graubard, Confidence intervals for proportions with small expected number of
+    positive counts estimated from survey data, Survey Methodology 24 (2), 1998.
     """
     n_blocks = len(sizes)
     share = float(sums.sum() / sizes.sum())

@@ -1,4 +1,5 @@
-"""Errors of an estimate summed over short segments of a drive, and segments joined into blocks that are about independent of each other.
+"""Errors of an estimate summed over short segments of a drive, and segments joined into blocks that
+are about independent of each other.
 
 An evaluation keeps the segments, so that intervals need neither model nor estimate again.
 """
@@ -20,8 +21,8 @@ from vehest.evaluation.metrics import Scored
 from vehest.evaluation.significance import root_interval, unexplained_interval
 
 SEGMENT_SECONDS = 1.0
-LEAST_PIECES = 8  # ranges or sequences, from which on each is a block
-LEAST_BLOCKS = 3  # below which no interval is given
+MIN_PIECES_AS_BLOCKS = 8  # ranges or sequences, from which on each is a block
+MIN_BLOCKS = 3  # below which no interval is given
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,9 @@ COLUMNS = tuple(field.name for field in fields(Segments))
 
 
 def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
-    """Cut ranges or sequences scored at ``rate_hz`` [Hz] into segments of `SEGMENT_SECONDS`; the last of a range may be shorter."""
+    """Cut ranges or sequences scored at ``rate_hz`` [Hz] into segments of `SEGMENT_SECONDS`; the
+    last of a range may be shorter.
+    """
     steps = max(round(SEGMENT_SECONDS * rate_hz), 1)
     columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
     for position, part in enumerate(parts):
@@ -98,7 +101,9 @@ def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
 
 
 def read_segments(path: Path) -> dict[str, Segments]:
-    """Segments of every test set; raises `MissingError` where there is no such file, `DataError` where it is damaged."""
+    """Segments of every test set; raises `MissingError` where there is no such file, `DataError`
+    where it is damaged.
+    """
     rows: dict[str, list[list[float]]] = {}
     for row in read_rows(path, ("test_set", *COLUMNS)):
         rows.setdefault(row["test_set"], []).append(
@@ -108,9 +113,11 @@ def read_segments(path: Path) -> dict[str, Segments]:
 
 
 def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
-    """Number of each segment's block, (K,), by ``losses`` (C, K): a range or sequence each, or stretches of the Politis-White length."""
+    """Number of each segment's block, (K,), by ``losses`` (C, K): a range or sequence each, or
+    stretches of the Politis-White length.
+    """
     pieces = np.unique(segments.piece)
-    if len(pieces) >= LEAST_PIECES:
+    if len(pieces) >= MIN_PIECES_AS_BLOCKS:
         return np.asarray(np.searchsorted(pieces, segments.piece), dtype=np.int64)
     runs = [losses[:, segments.piece == piece] for piece in pieces]
     length = max(
@@ -119,11 +126,13 @@ def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
     labels = np.empty(len(segments), dtype=np.int64)
     count = 0
     for piece in pieces:
-        own = np.flatnonzero(segments.piece == piece)
+        rows = np.flatnonzero(segments.piece == piece)
         n_blocks = max(
-            len(own) // length, 1
+            len(rows) // length, 1
         )  # what is left over is shared out, so that no block is a stump
-        labels[own] = count + np.minimum(np.arange(len(own)) * n_blocks // len(own), n_blocks - 1)
+        labels[rows] = count + np.minimum(
+            np.arange(len(rows)) * n_blocks // len(rows), n_blocks - 1
+        )
         count += n_blocks
     return labels
 
@@ -131,18 +140,22 @@ def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
 def politis_white_length(runs: Sequence[FloatArray]) -> float:
     """Block length, in segments, that suits the bootstrap of a mean of dependent values.
 
-    The rule for blocks of one length, with the autocovariance R pooled over uninterrupted runs: b = (2 G²/D)^(1/3) n^(1/3) with
-    G = Σ λ(k/M)|k| R(k), D = 4/3 (Σ λ(k/M) R(k))², λ the flat-top window, and M twice the lag after which autocorrelations are no longer
-    significant.
+    The rule for blocks of one length, with the autocovariance R pooled over uninterrupted runs: b =
+    (2 G²/D)^(1/3) n^(1/3) with G = Σ λ(k/M)|k| R(k), D = 4/3 (Σ λ(k/M) R(k))², λ the flat-top
+    window, and M twice the lag after which autocorrelations are no longer significant.
 
-    Args:
-        runs: values of each run, (T,) each.
+    Parameters
+    ----------
+    runs : Sequence[FloatArray]
+        Values of each run, (T,) each.
 
-    Returns:
+    Returns
+    -------
+    float
         At least 1, at most a third of the number of values.
 
-    Source: Politis & White, Econometric Reviews 23 (1), 2004, Section 3, with the correction of Patton, Politis & White, Econometric
-    Reviews 28 (4), 2009.
+    Source: Politis & White, Econometric Reviews 23 (1), 2004, Section 3, with the correction of
+    Patton, Politis & White, Econometric Reviews 28 (4), 2009.
     """
     covariances = _pooled_covariances(runs)
     n = sum(len(run) for run in runs)
@@ -153,7 +166,7 @@ def politis_white_length(runs: Sequence[FloatArray]) -> float:
     )
 
 
-def _beyond(n: int) -> int:
+def _n_insignificant_lags(n: int) -> int:
     """Lags in a row that have to be insignificant."""
     return max(5, int(math.sqrt(math.log10(max(n, 2)))))
 
@@ -163,7 +176,7 @@ def _pooled_covariances(runs: Sequence[FloatArray]) -> FloatArray:
     n = sum(len(run) for run in runs)
     mean = float(np.concatenate(runs).mean())
     deviations = [run - mean for run in runs]
-    longest = max(min(math.ceil(math.sqrt(n)) + _beyond(n), n - 1), 0)
+    longest = max(min(math.ceil(math.sqrt(n)) + _n_insignificant_lags(n), n - 1), 0)
     return np.array(
         [
             sum(float(run[lag:] @ run[: len(run) - lag]) for run in deviations if len(run) > lag)
@@ -177,7 +190,9 @@ def _window(covariances: FloatArray, n: int) -> int:
     """M, twice the lag after which `_beyond` autocorrelations in a row are insignificant."""
     small = np.abs(covariances[1:] / covariances[0]) < 2.0 * math.sqrt(math.log10(n) / n)
     settled = [
-        lag for lag in range(len(small) - _beyond(n) + 1) if small[lag : lag + _beyond(n)].all()
+        lag
+        for lag in range(len(small) - _n_insignificant_lags(n) + 1)
+        if small[lag : lag + _n_insignificant_lags(n)].all()
     ]
     longest = len(covariances) - 1
     return min(2 * max(settled[0], 1), longest) if settled else longest
@@ -203,34 +218,38 @@ def block_sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
 
 
 def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
-    """95 % intervals over blocks of the drive, of one training: what another drive of this kind would give.
+    """95 % intervals over blocks of the drive, of one training: what another drive of this kind
+    would give.
 
-    Returns:
-        Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer than `LEAST_BLOCKS` blocks, and none
-        of ``mse_sideslip``, which counts all samples, where sideslip is not scored at some.
+    Returns
+    -------
+    dict[str, tuple[float, float]]
+        Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer
+        than `MIN_BLOCKS` blocks, and none of ``mse_sideslip``, which counts all samples, where
+        sideslip is not scored at some.
     """
-    found = {}
+    intervals = {}
     moving = segments.with_sideslip
     if len(moving):
         labels = block_labels(moving, _sideslip_loss(moving)[None])
-        if labels.max() + 1 >= LEAST_BLOCKS:
+        if labels.max() + 1 >= MIN_BLOCKS:
             sideslip = root_interval(
                 block_sums(moving.squared_error_sideslip, labels)[None],
                 block_sums(moving.sideslip_samples, labels),
             )
-            found["rmse_sideslip"] = (sideslip.low, sideslip.high)
+            intervals["rmse_sideslip"] = (sideslip.low, sideslip.high)
             if np.array_equal(segments.sideslip_samples, segments.samples):
-                found["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
+                intervals["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
     labels = block_labels(segments, _sideslip_loss(segments)[None])
-    if labels.max() + 1 < LEAST_BLOCKS:
-        return found
+    if labels.max() + 1 < MIN_BLOCKS:
+        return intervals
     sizes = block_sums(segments.samples, labels)
     summed = {
         name: block_sums(getattr(segments, name), labels)
         for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref")
     }
     vy = root_interval(summed["squared_error_vy"][None], sizes)
-    found["rmse_vy"] = (vy.low, vy.high)
+    intervals["rmse_vy"] = (vy.low, vy.high)
     if summed["squared_vy_ref"].sum() > 0:
         fvu = unexplained_interval(
             summed["squared_error_vy"],
@@ -239,15 +258,15 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
             summed["vy_ref"],
             sizes,
         )
-        found |= {"fvu": (fvu.low, fvu.high), "r2": (1.0 - fvu.high, 1.0 - fvu.low)}
-    return found
+        intervals |= {"fvu": (fvu.low, fvu.high), "r2": (1.0 - fvu.high, 1.0 - fvu.low)}
+    return intervals
 
 
 def _sideslip_loss(segments: Segments) -> FloatArray:
     """Mean squared error of β of each segment, (K,) [deg²]; 0 where none is scored."""
     samples = segments.sideslip_samples
-    nothing = np.zeros_like(samples)
+    zeros = np.zeros_like(samples)
     loss: FloatArray = np.divide(
-        segments.squared_error_sideslip, samples, out=nothing, where=samples > 0
+        segments.squared_error_sideslip, samples, out=zeros, where=samples > 0
     )
     return loss

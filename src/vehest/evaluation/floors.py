@@ -1,16 +1,24 @@
-"""What a drive can show: the noise of its reference, and how well v can be estimated at all from a set of inputs along it.
+"""Noise floor of a drive's reference, and Cramér-Rao bound of v for a set of inputs along the
+drive.
 
-Errors are held against both, to separate a poor estimator from a drive that shows little. Both rest on models: yardsticks, not truths.
+    spans, protocol --drives_of--> drives --reference_floor, cramer_rao_floor--> `Floor`
 
-**Noise of the reference** (`reference_floor`). White noise of standard deviation σ has third differences of variance 20 σ². What the
-inertial signals explain of those of v, the second differences of a_y and of u ω, is taken out by least squares. The rest is measured by
-the median of its size, so that kerbs and jumps do not count. Not seen are errors that are slow (an offset, a lever arm), that smoothing
-of the reference hid, or that it shares with the inertial signals: a lower bound. A reference in coarse steps errs by at least step/√12.
+Errors are compared with both, to separate a poor estimator from a drive that contains little
+information. Both rest on models, and are no exact limits.
 
-**Cramér-Rao bound** (`cramer_rao_floor`). No causal estimator has a mean squared error below the posterior bound (Tichavský, Muravchik &
-Nehorai, Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, IEEE Trans. Signal Processing 46 (5), 1998), which is taken of
-a model whose states and noise are drawn at random and whose parameters are known. For a linear model with Gaussian noise its recursion is
-that of the Kalman filter's covariance. The model, with yaw rate ω and speed u as measured:
+**Noise of the reference** (`reference_floor`). White noise of standard deviation σ has third
+differences of variance 20 σ². What the inertial signals explain of those of v, the second
+differences of a_y and of u ω, is taken out by least squares. The rest is measured by the median of
+its size, so that kerbs and jumps do not count. Not seen are errors that are slow (an offset, a
+lever arm), that smoothing of the reference hid, or that it shares with the inertial signals: a
+lower bound. A reference in coarse steps errs by at least step/√12.
+
+**Cramér-Rao bound** (`cramer_rao_floor`). No causal estimator has a mean squared error below the
+posterior bound (Tichavský, Muravchik & Nehorai, Posterior Cramér-Rao bounds for discrete-time
+nonlinear filtering, IEEE Trans. Signal Processing 46 (5), 1998), which is taken of a model whose
+states and noise are drawn at random and whose parameters are known. For a linear model with
+Gaussian noise its recursion is that of the Kalman filter's covariance. The model, with yaw rate ω
+and speed u as measured:
 
     v is a Gauss-Markov process with the spread and correlation time of the drive's v           (always)
     dv/dt = a_y - u ω - b - n          b slow (bank, roll, offset), n white                     (where a_y is read)
@@ -18,15 +26,19 @@ that of the Kalman filter's covariance. The model, with yaw rate ω and speed u 
     v = l_r ω - (1 + s_r) u α_r + e_r,         α = k₁ a + k₂ dω/dt + k₃ a³                      (rear axle, if the car is known)
     v = (δ - δ₀) u - l_f ω - (1 + s_f) u α_f + e_f                                              (front axle, where steer is read too)
 
-The axles are the balances of forces of the single track, each with the load and inertia that belong to it (J = m l_f l_r) and a tyre that
-gives way with the third power; a is a_y where it is read, else u ω.
+The axles are the balances of forces of the single track, each with the load and inertia that belong
+to it (J = m l_f l_r) and a tyre that gives way with the third power; a is a_y where it is read,
+else u ω.
 
-Unknown to the bound are v, u, b, c, the errors e of the axles (a Gauss-Markov process and white noise), and the stiffness of the tyres, of
-which a data sheet says no more than 6 to 15 per rad: s has a standard deviation of 23 %. Known are arms, shape of the tyre, offset of the
-steering angle and all levels of noise, read off the test drive and its reference for the bound's own use: mostly more than an estimator
-knows. An error below the bound says that an estimator knows more of the car still, and an error above it what it leaves unused.
+Unknown to the bound are v, u, b, c, the errors e of the axles (a Gauss-Markov process and white
+noise), and the stiffness of the tyres, of which a data sheet says no more than 6 to 15 per rad: s
+has a standard deviation of 23 %. Known are arms, shape of the tyre, offset of the steering angle
+and all levels of noise, read off the test drive and its reference for the bound's own use: mostly
+more than an estimator knows. An error below the bound says that an estimator knows more of the car
+still, and an error above it what it leaves unused.
 
-Without the car (``car=False``) the axles are left out: what kinematics alone tells of a car of which nothing is known.
+Without the car (``car=False``) the axles are left out: what kinematics alone tells of a car of
+which nothing is known.
 """
 
 from __future__ import annotations
@@ -75,11 +87,11 @@ STIFFNESS_DEVIATION = (
 )  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
 BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
-LEAST_SAMPLES = 20
-LEAST_WHITE = 0.01  # of an axle's slow error, so that no measurement is exact
+MIN_SAMPLES = 20
+MIN_WHITE_SHARE = 0.01  # of an axle's slow error, so that no measurement is exact
 CHUNK = 20_000  # samples that are held at once
-UNIFORM = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
-TINY = 1e-9
+UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
+MIN_POSITIVE = 1e-9
 
 _SPEEDS = ("motor_speed", "wheel_speed_")
 _SILENT = (
@@ -99,7 +111,9 @@ class Floor:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,)."""
+    """A range or sequence of a test set, from where estimators may start, at the evaluation rate;
+    arrays are of shape (T,).
+    """
 
     rate_hz: float  # [Hz]
     inputs: dict[
@@ -107,7 +121,9 @@ class Drive:
     ]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
-    known_start: bool = False  # whether estimators start from the reference at the first sample
+    starts_at_reference: bool = (
+        False  # whether estimators start from the reference at the first sample
+    )
     min_sideslip_speed: float = 0.0  # speed from which on sideslip is scored [m/s]
 
     @property
@@ -118,8 +134,8 @@ class Drive:
     @property
     def scored(self) -> Drive:
         """The scored samples alone."""
-        own = {name: samples[self.first :] for name, samples in self.inputs.items()}
-        return replace(self, inputs=own, vy_ref=self.vy_ref[self.first :], first=0)
+        inputs = {name: samples[self.first :] for name, samples in self.inputs.items()}
+        return replace(self, inputs=inputs, vy_ref=self.vy_ref[self.first :], first=0)
 
     @property
     def is_sideslip_scored(self) -> BoolArray:
@@ -153,26 +169,30 @@ def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
 
 
 def inputs_of(channels: Collection[str]) -> frozenset[str] | None:
-    """The inputs of the bound for an estimator that reads these channels; None where no bound suits.
+    """The inputs of the bound for an estimator that reads these channels; None where no bound
+    suits.
 
-    Wheels and motor stand for the speed, the angle of the steering wheel for that of the road wheels. Measured tyre forces and other
-    channels tell what the bound does not know; without yaw rate there is none.
+    Wheels and motor stand for the speed, the angle of the steering wheel for that of the road
+    wheels. Measured tyre forces and other channels tell what the bound does not know; without yaw
+    rate there is none.
     """
-    found = set()
+    inputs = set()
     for name in channels:
         if name in INPUTS:
-            found.add(name)
+            inputs.add(name)
         elif name.startswith(_SPEEDS):
-            found.add("vx")
+            inputs.add("vx")
         elif name == "handwheel":
-            found.add("steer")
+            inputs.add("steer")
         elif not name.startswith(_SILENT):
             return None
-    return frozenset(found) if {"vx", "yaw_rate"} <= found else None
+    return frozenset(inputs) if {"vx", "yaw_rate"} <= inputs else None
 
 
 def reference_spread(drives: Sequence[Drive]) -> Floor:
-    """Root mean square of the reference itself, the error of v = 0; of a sideslip within a quarter turn, whichever way the car rolls."""
+    """Root mean square of the reference itself, the error of v = 0; of a sideslip within a quarter
+    turn, whichever way the car rolls.
+    """
     velocity, speed = _joined(drives)
     sideslip = np.degrees(np.arctan2(velocity, np.abs(speed)))
     return Floor(_rms([velocity]), _rms([sideslip[_is_sideslip_scored(drives)]]))
@@ -182,20 +202,23 @@ def reference_spread(drives: Sequence[Drive]) -> Floor:
 
 
 def reference_floor(drives: Sequence[Drive]) -> Floor | None:
-    """White noise of the reference, as it stands at the evaluation rate; None where there are too few samples.
+    """White noise of the reference, at the evaluation rate; None where there are too few samples.
 
-    The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which nothing is known.
+    The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which
+    nothing is known.
     """
     third = []
     explained = []
-    longest = 0
-    both = {name for name in ("ay", "yaw_rate") if all(name in drive.inputs for drive in drives)}
+    n_samples = 0
+    shared_inputs = {
+        name for name in ("ay", "yaw_rate") if all(name in drive.inputs for drive in drives)
+    }
     for drive in (drive.scored for drive in drives):
         if len(drive.vy_ref) < 4:
             continue
-        own = drive.inputs
-        parts = ([own["ay"]] if "ay" in both else []) + (
-            [own["vx"] * own["yaw_rate"]] if "yaw_rate" in both else []
+        inputs = drive.inputs
+        parts = ([inputs["ay"]] if "ay" in shared_inputs else []) + (
+            [inputs["vx"] * inputs["yaw_rate"]] if "yaw_rate" in shared_inputs else []
         )
         third.append(np.diff(drive.vy_ref, 3))
         explained.append(
@@ -203,30 +226,35 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
             if parts
             else np.empty((len(third[-1]), 0))
         )
-        longest += len(third[-1])
-    if longest < LEAST_SAMPLES:
+        n_samples += len(third[-1])
+    if n_samples < MIN_SAMPLES:
         return None
-    rest = np.concatenate(third)
-    known = np.concatenate(explained)
-    if known.shape[1]:
-        rest = rest - known @ np.linalg.lstsq(known, rest, rcond=None)[0]
+    residuals = np.concatenate(third)
+    regressors = np.concatenate(explained)
+    if regressors.shape[1]:
+        residuals = residuals - regressors @ np.linalg.lstsq(regressors, residuals, rcond=None)[0]
     velocity, speed = _joined(drives)
     level = max(
-        _robust_deviation(rest) / math.sqrt(20.0), quantisation_step(velocity) / math.sqrt(12.0)
+        _robust_deviation(residuals) / math.sqrt(20.0),
+        quantisation_step(velocity) / math.sqrt(12.0),
     )
     sideslip = _sideslip_deviation(np.full_like(velocity, level), velocity, speed)
     return Floor(level, _rms([sideslip[_is_sideslip_scored(drives)]]))
 
 
 def white_level(series: Sequence[FloatArray]) -> float:
-    """Standard deviation of the white noise of a smooth signal, from its third differences and not below step/√12; 0 if too short."""
+    """Standard deviation of the white noise of a smooth signal, from its third differences and not
+    below step/√12; 0 if too short.
+    """
     third = [np.diff(samples, 3) for samples in series if len(samples) >= 4]
     noise = _robust_deviation(np.concatenate(third)) / math.sqrt(20.0) if third else 0.0
     return max(noise, quantisation_step(np.concatenate(series)) / math.sqrt(12.0))
 
 
 def quantisation_step(samples: FloatArray) -> float:
-    """Step of a signal whose values are multiples of one; 0 where fewer than half of them occur twice, or there is none."""
+    """Step of a signal whose values are multiples of one; 0 where fewer than half of them occur
+    twice, or there is none.
+    """
     values = np.unique(samples)
     if len(values) < 2 or len(values) > len(samples) // 2:
         return 0.0
@@ -276,17 +304,25 @@ class _Levels:
 def cramer_rao_floor(
     drives: Sequence[Drive], inputs: Collection[str], *, car: bool = True
 ) -> Floor | None:
-    """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored samples.
+    """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored
+    samples.
 
-    Args:
-        inputs: some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
-        car: whether the car is known to about what a data sheet tells; else kinematics alone is.
+    Parameters
+    ----------
+    inputs : Collection[str]
+        Some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
+    car : bool, default True
+        Whether the car is known to about what a data sheet tells; else kinematics alone is.
 
-    Returns:
+    Returns
+    -------
+    Floor | None
         None where an input was not measured, or there are too few samples.
 
-    Raises:
-        ValueError: vx or yaw_rate is not among the inputs, or one of them is none of `INPUTS`.
+    Raises
+    ------
+    ValueError
+        Vx or yaw_rate is not among the inputs, or one of them is none of `INPUTS`.
     """
     if not {"vx", "yaw_rate"} <= set(inputs) <= set(INPUTS):
         raise ValueError(
@@ -294,7 +330,7 @@ def cramer_rao_floor(
         )
     if (
         not all(set(inputs) <= set(drive.inputs) for drive in drives)
-        or sum(len(drive.scored.vy_ref) for drive in drives) < LEAST_SAMPLES
+        or sum(len(drive.scored.vy_ref) for drive in drives) < MIN_SAMPLES
     ):
         return None
     levels = _levels(drives, set(inputs), car)
@@ -307,13 +343,18 @@ def cramer_rao_floor(
 
 
 def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatArray:
-    """Smallest covariance of any causal estimate of the state of a linear model with Gaussian noise, (T, n, n).
+    """Smallest covariance of any causal estimate of the state of a linear model with Gaussian
+    noise, (T, n, n).
 
-    Args:
-        model: see `LinearModel`, observation (T, m, n); offsets do not matter.
-        prior: covariance of the state at the first sample before its measurement, (n, n).
+    Parameters
+    ----------
+    model : LinearModel[FloatArray]
+        See `LinearModel`, observation (T, m, n); offsets do not matter.
+    prior : FloatArray
+        Covariance of the state at the first sample before its measurement, (n, n).
 
-    Source: Tichavský, Muravchik & Nehorai 1998, whose recursion is then the Riccati recursion of the Kalman filter.
+    Source: Tichavský, Muravchik & Nehorai 1998, whose recursion is then the Riccati recursion of
+    the Kalman filter.
     """
     steps, m, n = model.observation.shape
     zero = LinearModel(
@@ -328,24 +369,30 @@ def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatA
 
 
 def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
-    """Part a disturbance into white noise and a slow Gauss-Markov process, by the covariances of its means over seconds.
+    """Part a disturbance into white noise and a slow Gauss-Markov process, by the covariances of
+    its means over seconds.
 
-    Means of the slow part over τ = 1 s have the covariance d² 2(cosh x - 1)/x² e^(-kx) at a lag of k > 0 seconds, x = τ/T, and
-    d² 2(x - 1 + e^(-x))/x² at none, where white noise adds its density over τ. Lags of one and two seconds give d and T. The mean counts
-    as part of the disturbance, and white noise has no more than the variance that the slow part leaves.
+    Means of the slow part over τ = 1 s have the covariance d² 2(cosh x - 1)/x² e^(-kx) at a lag of
+    k > 0 seconds, x = τ/T, and d² 2(x - 1 + e^(-x))/x² at none, where white noise adds its density
+    over τ. Lags of one and two seconds give d and T. The mean counts as part of the disturbance,
+    and white noise has no more than the variance that the slow part leaves.
 
-    Args:
-        series: uninterrupted stretches of it, (T,) each.
-        rate_hz: sampling rate [Hz].
+    Parameters
+    ----------
+    series : Sequence[FloatArray]
+        Uninterrupted stretches of it, (T,) each.
+    rate_hz : float
+        Sampling rate [Hz].
     """
     block = max(round(BLOCK_SECONDS * rate_hz), 1)
     means = [
         samples[: len(samples) // block * block].reshape(-1, block).mean(1) for samples in series
     ]
     products = [
-        [own[lag:] * own[: len(own) - lag] for own in means if len(own) > lag] for lag in range(3)
+        [mean[lag:] * mean[: len(mean) - lag] for mean in means if len(mean) > lag]
+        for lag in range(3)
     ]
-    lags = [float(np.concatenate(own).mean()) if own else 0.0 for own in products]
+    lags = [float(np.concatenate(parts).mean()) if parts else 0.0 for parts in products]
     variance = _rms(series) ** 2
     if not min(lags[:2]) > 0:
         return Noise(
@@ -354,10 +401,10 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     low, high = (math.exp(-BLOCK_SECONDS / time) for time in SLOW_SECONDS)
     ratio = min(max(lags[2] / lags[1], low), high)
     x = -math.log(ratio)
-    apart = 2.0 * (math.cosh(x) - 1.0) / x**2
-    together = 2.0 * (x - 1.0 + ratio) / x**2
-    slow = min(lags[1] / (ratio * apart), lags[0] / together)
-    white = min((lags[0] - slow * together) * BLOCK_SECONDS, max(variance - slow, 0.0) / rate_hz)
+    lagged_factor = 2.0 * (math.cosh(x) - 1.0) / x**2
+    same_factor = 2.0 * (x - 1.0 + ratio) / x**2
+    slow = min(lags[1] / (ratio * lagged_factor), lags[0] / same_factor)
+    white = min((lags[0] - slow * same_factor) * BLOCK_SECONDS, max(variance - slow, 0.0) / rate_hz)
     return Noise(max(white, 0.0), math.sqrt(slow), BLOCK_SECONDS / x)
 
 
@@ -373,7 +420,7 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
         ]
     below = np.flatnonzero(total < total[0] / math.e)
     lags = int(below[0]) if len(below) else longest
-    return Noise(0.0, max(deviation, TINY), max(lags, 1) / rate_hz)
+    return Noise(0.0, max(deviation, MIN_POSITIVE), max(lags, 1) / rate_hz)
 
 
 def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
@@ -381,34 +428,34 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
     rate = drives[0].rate_hz
     lateral = longitudinal = rear = front = None
     if "ay" in inputs:
-        left = [
+        balances = [
             (
-                own.vy_ref,
-                own.inputs["ay"] - own.inputs["vx"] * own.inputs["yaw_rate"],
-                own.inputs["ay"],
+                drive.vy_ref,
+                drive.inputs["ay"] - drive.inputs["vx"] * drive.inputs["yaw_rate"],
+                drive.inputs["ay"],
             )
-            for own in parts
+            for drive in parts
         ]
-        lateral = split_noise(_unexplained(left, rate), rate)
+        lateral = split_noise(_unexplained(balances, rate), rate)
     if "ax" in inputs:
-        left = [
+        balances = [
             (
-                own.inputs["vx"],
-                own.inputs["ax"] + own.vy_ref * own.inputs["yaw_rate"],
-                own.inputs["ax"],
+                drive.inputs["vx"],
+                drive.inputs["ax"] + drive.vy_ref * drive.inputs["yaw_rate"],
+                drive.inputs["ax"],
             )
-            for own in parts
+            for drive in parts
         ]
-        longitudinal = split_noise(_unexplained(left, rate), rate)
+        longitudinal = split_noise(_unexplained(balances, rate), rate)
     if car:
         rear = _fitted_axle(parts, inputs, False)
         front = _fitted_axle(parts, inputs, True) if "steer" in inputs else None
     reference = reference_floor(drives)
     return _Levels(
-        velocity=gauss_markov([own.vy_ref for own in parts], rate),
+        velocity=gauss_markov([drive.vy_ref for drive in parts], rate),
         lateral=lateral,
         longitudinal=longitudinal,
-        speed=max(white_level([own.inputs["vx"] for own in parts]), TINY),
+        speed=max(white_level([drive.inputs["vx"] for drive in parts]), MIN_POSITIVE),
         reference=reference.vy if reference is not None else 0.0,
         rear=rear,
         front=front,
@@ -418,33 +465,42 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
 def _unexplained(
     series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float
 ) -> list[FloatArray]:
-    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out."""
-    left = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
-    sensor = [_middle(own) for *_, own in series]
-    power = sum(float(own @ own) for own in sensor)
+    """Rate of change of a velocity less an expected rate [m/s²], without its part in proportion to
+    a sensor.
+
+    That part is the scale of the sensor; roll and pitch of the body act alike.
+    """
+    residuals = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
+    sensor = [_middle(samples) for *_, samples in series]
+    power = sum(float(samples @ samples) for samples in sensor)
     scale = (
-        sum(float(own @ other) for own, other in zip(left, sensor, strict=True)) / power
+        sum(float(residual @ samples) for residual, samples in zip(residuals, sensor, strict=True))
+        / power
         if power > 0
         else 0.0
     )
-    return [own - scale * other for own, other in zip(left, sensor, strict=True)]
+    return [residual - scale * samples for residual, samples in zip(residuals, sensor, strict=True)]
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
     columns = [
-        _axle_columns(own, inputs, front) for own in parts
+        _axle_columns(drive, inputs, front) for drive in parts
     ]  # slip and arm make up v, or v - δ u
     targets = [
-        own.vy_ref - own.inputs["steer"] * own.inputs["vx"] if front else own.vy_ref
-        for own in parts
+        drive.vy_ref - drive.inputs["steer"] * drive.inputs["vx"] if front else drive.vy_ref
+        for drive in parts
     ]
     coefficients = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
-    left = [target - known @ coefficients for target, known in zip(targets, columns, strict=True)]
-    return Axle(coefficients, split_noise(left, parts[0].rate_hz))
+    residuals = [
+        target - column @ coefficients for target, column in zip(targets, columns, strict=True)
+    ]
+    return Axle(coefficients, split_noise(residuals, parts[0].rate_hz))
 
 
 def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
-    """Arm, three of the slip angle and, in front, an offset of the steering angle: ω, u a, u dω/dt, u a³, u; (T, 4) or (T, 5)."""
+    """Arm, three of the slip angle and, in front, an offset of the steering angle: ω, u a, u dω/dt,
+    u a³, u; (T, 4) or (T, 5).
+    """
     u = drive.inputs["vx"]
     yaw_rate = drive.inputs["yaw_rate"]
     a = drive.inputs["ay"] if "ay" in inputs else u * yaw_rate
@@ -458,10 +514,12 @@ def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatAr
     deviation = np.empty(len(drive.vy_ref))
     for begin in range(0, len(deviation), CHUNK):
         part = slice(begin, begin + CHUNK)
-        own = model._replace(transition=model.transition[part], observation=model.observation[part])
-        covariance = posterior_bound(own, prior)
+        part_model = model._replace(
+            transition=model.transition[part], observation=model.observation[part]
+        )
+        covariance = posterior_bound(part_model, prior)
         deviation[part] = np.sqrt(covariance[:, 0, 0])
-        last = own.transition[-1]
+        last = part_model.transition[-1]
         prior = last @ covariance[-1] @ last.T + model.process_noise
     return deviation
 
@@ -471,8 +529,9 @@ def _model_of(
 ) -> tuple[LinearModel[FloatArray], FloatArray]:
     """The model of the module's docstring in steps, and the prior covariance of its state, v first.
 
-    The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ: given z, with the gain K = q/(q + r),
-    v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 - K) q, and z itself measures (φ - 1) v + τ b with the variance q + r.
+    The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ:
+    given z, with the gain K = q/(q + r), v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 -
+    K) q, and z itself measures (φ - 1) v + τ b with the variance q + r.
     """
     steps = len(drive.vy_ref)
     step = drive.step
@@ -493,10 +552,12 @@ def _model_of(
 
     decay, noise = _in_steps(levels.velocity, step)
     v = state(
-        decay, noise, levels.reference**2 if drive.known_start else levels.velocity.deviation**2
+        decay,
+        noise,
+        levels.reference**2 if drive.starts_at_reference else levels.velocity.deviation**2,
     )
     if levels.lateral is not None:
-        white = levels.lateral.density * step + TINY**2
+        white = levels.lateral.density * step + MIN_POSITIVE**2
         gain = noise / (noise + white)
         offset = state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
         transition[v, v] = decay - gain * (decay - 1.0)
@@ -517,7 +578,7 @@ def _model_of(
             white = (
                 axle.error.density / step
                 + levels.reference**2
-                + (LEAST_WHITE * axle.error.deviation) ** 2
+                + (MIN_WHITE_SHARE * axle.error.deviation) ** 2
             )
             measured.append(({v: 1.0, error: -1.0, stiffness: -slip}, white))
     n = len(noises)
@@ -529,7 +590,7 @@ def _model_of(
     for row, (of, _) in enumerate(measured):
         for column, value in of.items():
             C[:, row, column] = value
-    R = np.array([variance + TINY**2 for _, variance in measured] or [1.0])
+    R = np.array([variance + MIN_POSITIVE**2 for _, variance in measured] or [1.0])
     return LinearModel(A, np.zeros(n), np.diag(noises), C, np.zeros(m), R), np.diag(priors)
 
 
@@ -548,8 +609,8 @@ def _middle(samples: FloatArray) -> FloatArray:
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
     parts = [drive.scored for drive in drives]
-    return np.concatenate([own.vy_ref for own in parts]), np.concatenate(
-        [own.inputs["vx"] for own in parts]
+    return np.concatenate([drive.vy_ref for drive in parts]), np.concatenate(
+        [drive.inputs["vx"] for drive in parts]
     )
 
 
@@ -567,5 +628,5 @@ def _sideslip_deviation(
     deviation: FloatArray, velocity: FloatArray, speed: FloatArray
 ) -> FloatArray:
     """Standard deviation of atan2(v, u) [deg] to first order, (K,)."""
-    slope = np.abs(speed) / np.maximum(np.square(speed) + np.square(velocity), TINY)
-    return np.minimum(np.degrees(deviation * slope), UNIFORM)
+    slope = np.abs(speed) / np.maximum(np.square(speed) + np.square(velocity), MIN_POSITIVE)
+    return np.minimum(np.degrees(deviation * slope), UNIFORM_ANGLE_DEVIATION)

@@ -1,8 +1,10 @@
-"""Errors with the best lever arm, where the point of the car at which the reference was measured is unknown.
+"""Errors with the best lever arm, where the point of the car at which the reference was measured is
+unknown.
 
-Lateral velocity x ahead of a point is v + x·r, and satisfies the kinematics as well for any x: inertial sensors cannot tell an estimate
-at one point from an error at another. Where the reference's point is unknown, the plain error therefore ranks estimators by the point that
-each happened to learn, too.
+Lateral velocity x ahead of a point is v + x·r, and satisfies the kinematics as well for any x:
+inertial sensors cannot tell an estimate at one point from an error at another. Where the
+reference's point is unknown, the plain error therefore ranks estimators by the point that each
+happened to learn, too.
 """
 
 from __future__ import annotations
@@ -17,20 +19,24 @@ from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
 CONDITION = "best_lever_arm"  # what rows of such errors say in the column ``condition``
-LONGEST = 0.5  # m, ahead of the reference's point or behind it
+MAX_LEVER_ARM = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 
 def lever_arm_figures(
     parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol
 ) -> dict[str, float]:
-    """Errors of a test set whose references were all measured at unknown points, with the lever arm x that leaves the least.
+    """Errors of a test set whose references were all measured at unknown points, with the lever arm
+    x that leaves the least.
 
     It minimises the mean of (v̂ - v - x·r)² within `LONGEST`: Σ(v̂ - v)r / Σr².
 
-    Returns:
-        metric -> value, with ``lever_arm``, how far ahead of the reference's point the estimates hold [m]; nothing where a reference's
-        point is known or undeclared, or a recording has no yaw rate.
+    Returns
+    -------
+    dict[str, float]
+        Metric -> value, with ``lever_arm``, how far ahead of the reference's point the estimates
+        hold [m]; nothing where a reference's point is known or undeclared, or a recording has no
+        yaw rate.
     """
     yaw_rates = []
     speeds = []
@@ -53,7 +59,7 @@ def lever_arm_figures(
     error = np.concatenate([part.vy - part.vy_ref for part in parts])
     turns = np.concatenate(yaw_rates)
     power = float(turns @ turns)
-    x = float(np.clip(error @ turns / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
+    x = float(np.clip(error @ turns / power, -MAX_LEVER_ARM, MAX_LEVER_ARM)) if power > 0.0 else 0.0
     moved = []
     for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
         vy = part.vy - x * yaw_rate

@@ -1,4 +1,8 @@
-"""What is scored, and the metrics: errors of lateral velocity, sideslip angle and further states, and how consistent a filter is."""
+"""Scored samples, and metrics: errors of lateral velocity, sideslip angle and further states,
+consistency of filters.
+
+    spans --sequences, pieces_of--> ranges or sequences --score--> `Scored` --accuracy--> metric -> value
+"""
 
 from __future__ import annotations
 
@@ -18,10 +22,12 @@ from vehest.data.splits import Span
 
 BoolArray = NDArray[np.bool_]
 
-NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
+# m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section
+# V)
+NONLINEAR_AY = 4.0
 
 MIN_SIDESLIP_SPEED = 1.0  # m/s, of a car with the wheelbase below or an unknown one
-USUAL_WHEELBASE = 2.7  # m
+REFERENCE_WHEELBASE = 2.7  # m
 
 REFERENCES = {
     "vx": "vx_ref",
@@ -35,7 +41,9 @@ COVERAGE = {
 }  # number of standard deviations -> fraction of Gaussian errors within them
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
-"""Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
+"""Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public
+code).
+"""
 
 _NAMES = {
     "1": (
@@ -113,12 +121,14 @@ class Protocol:
     min_sideslip_speed: float | dict[str, float] | None = None
 
     def with_wheelbases(self, wheelbases: Mapping[str, float | None]) -> Protocol:
-        """The protocol with a speed for every data set, by its car's wheelbase [m], None where that is not known."""
-        asked = self.min_sideslip_speed
-        if not (asked is None or isinstance(asked, dict)):
+        """The protocol with a speed for every data set, by its car's wheelbase [m], None where that
+        is not known.
+        """
+        declared_speed = self.min_sideslip_speed
+        if not (declared_speed is None or isinstance(declared_speed, dict)):
             return self
         speeds = {name: min_sideslip_speed(wheelbases[name]) for name in sorted(wheelbases)}
-        return replace(self, min_sideslip_speed=speeds | (asked or {}))
+        return replace(self, min_sideslip_speed=speeds | (declared_speed or {}))
 
     def min_sideslip_speed_on(self, dataset: str) -> float:
         """Speed from which on sideslip is scored on a data set [m/s]."""
@@ -128,7 +138,9 @@ class Protocol:
         return MIN_SIDESLIP_SPEED if speed is None else speed
 
     def describe_min_sideslip_speed(self, datasets: Iterable[str]) -> str:
-        """Speed from which on sideslip is scored on these data sets: ``1 m/s``, or ``1 m/s (mine), 0.35 m/s (f1)``."""
+        """Speed from which on sideslip is scored on these data sets: ``1 m/s``, or ``1 m/s (mine),
+        0.35 m/s (f1)``.
+        """
         speeds: dict[str, list[str]] = {}
         for dataset in dict.fromkeys(datasets):
             speed = f"{self.min_sideslip_speed_on(dataset):.3g} m/s"
@@ -155,8 +167,10 @@ class Protocol:
         return "range" if self.sequence_seconds is None else "sequence"
 
     @property
-    def start_in_words(self) -> str:
-        """Sentences on sequences and initial states, each after a space; empty for whole ranges that start from nothing."""
+    def start_description(self) -> str:
+        """Sentences on sequences and initial states, each after a space; empty for whole ranges
+        that start from nothing.
+        """
         words = ""
         if self.sequence_seconds is not None:
             words += (
@@ -172,12 +186,13 @@ class Protocol:
 
 
 def min_sideslip_speed(wheelbase: float | None) -> float:
-    """Speed from which on sideslip is scored [m/s]: 1 m/s · sqrt(wheelbase / 2.7 m), 1 m/s where the wheelbase [m] is None.
+    """Speed from which on sideslip is scored [m/s]: 1 m/s · sqrt(wheelbase / 2.7 m), 1 m/s where
+    the wheelbase [m] is None.
 
-    At standstill the direction of travel is noise. Cars of different size move alike at speeds that are as the roots of their lengths
-    (equal Froude numbers).
+    At standstill the direction of travel is noise. Cars of different size move alike at speeds that
+    are as the roots of their lengths (equal Froude numbers).
     """
-    scale = 1.0 if wheelbase is None else math.sqrt(wheelbase / USUAL_WHEELBASE)
+    scale = 1.0 if wheelbase is None else math.sqrt(wheelbase / REFERENCE_WHEELBASE)
     return MIN_SIDESLIP_SPEED * scale
 
 
@@ -193,7 +208,7 @@ class Scored:
     ay: FloatArray  # measured lateral acceleration [m/s²]; NaN where the recording has none
     is_sideslip_scored: BoolArray  # whether the car is fast enough (`Protocol.min_sideslip_speed`)
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
-    others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    other_states: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     covariance: FloatArray | None = (
         None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
     )
@@ -207,12 +222,16 @@ class Scored:
 
     @property
     def errors(self) -> dict[str, FloatArray]:
-        """Estimate - reference of ``vx``, ``vy`` [m/s] and ``yaw_rate`` [rad/s], of those that are there."""
-        pairs = {**self.others, "vy": (self.vy, self.vy_ref)}
+        """Estimate - reference of ``vx``, ``vy`` [m/s] and ``yaw_rate`` [rad/s], of those that are
+        there.
+        """
+        pairs = {**self.other_states, "vy": (self.vy, self.vy_ref)}
         return {name: pairs[name][0] - pairs[name][1] for name in REFERENCES if name in pairs}
 
     def at(self, chosen: BoolArray | slice) -> Scored:
-        """Lateral velocity and sideslip at some of the samples; without other states, covariances, innovations and bands."""
+        """Lateral velocity and sideslip at some of the samples; without other states, covariances,
+        innovations and bands.
+        """
         return Scored(
             self.time[chosen],
             self.vy[chosen],
@@ -227,7 +246,9 @@ class Scored:
 def sequences(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Span]:
-    """The stretches that estimates are made of: the ranges, or the sequences that they are cut into; `DataError` if all are too short."""
+    """The stretches that estimates are made of: the ranges, or the sequences that they are cut
+    into; `DataError` if all are too short.
+    """
     if protocol.sequence_seconds is None:
         return list(spans)
     steps = round(protocol.sequence_seconds * protocol.rate_hz)
@@ -249,7 +270,9 @@ def sequences(
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol hands over at the first sample: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s]; `DataError` in a gap."""
+    """The state that a protocol hands over at the first sample: ``vx``, ``vy`` [m/s], ``yaw_rate``
+    [rad/s]; `DataError` in a gap.
+    """
     first = reference.index_range(span.start, span.stop)[0]
     state = {}
     for name, channel in REFERENCES.items():
@@ -268,7 +291,9 @@ def score_all(
     recording_of: Callable[[Span], Recording],
     protocol: Protocol,
 ) -> list[Scored]:
-    """Score a test set's estimates by place in its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``; raises `DataError`."""
+    """Score a test set's estimates by place in its `sequences`; ``recording_of`` a range is at
+    ``protocol.rate_hz``; raises `DataError`.
+    """
     return [
         score(estimate_of(position), reference, piece, protocol)
         for position, (reference, piece) in enumerate(pieces_of(spans, recording_of, protocol))
@@ -278,7 +303,9 @@ def score_all(
 def pieces_of(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> Iterator[tuple[Recording, Span]]:
-    """Each range or sequence of a test set with the whole recording that it lies in, one in memory at a time; raises `DataError`."""
+    """Each range or sequence of a test set with the whole recording that it lies in, one in memory
+    at a time; raises `DataError`.
+    """
     read = lru_cache(maxsize=1)(
         lambda dataset, recording: recording_of(Span(dataset, recording))
     )  # a range's sequences stand together
@@ -300,13 +327,20 @@ def scored_range(reference: Recording, span: Span, protocol: Protocol) -> tuple[
 def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protocol) -> Scored:
     """Bring an estimate and its reference onto the evaluation grid.
 
-    Args:
-        estimate: at any rate; a value made for time t is scored at t.
-        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be split by it.
-        span: the range that is scored, after ``protocol.skip_seconds``.
+    Parameters
+    ----------
+    estimate : Estimate
+        At any rate; a value made for time t is scored at t.
+    reference : Recording
+        The recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be
+        split by it.
+    span : Span
+        The range that is scored, after ``protocol.skip_seconds``.
 
-    Raises:
-        DataError: the range is too short, or the estimate does not cover it.
+    Raises
+    ------
+    DataError
+        The range is too short, or the estimate does not cover it.
     """
     start = max(span.start, reference.start_time) + protocol.skip_seconds
     scored = reference.cut(start, span.stop)
@@ -316,7 +350,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
                 f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without"
             )
 
-    def held(name: str) -> FloatArray:
+    def estimate_at(name: str) -> FloatArray:
         values = estimate.held_at(scored.time, name)
         _require_all(
             values,
@@ -325,17 +359,21 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         )
         return values
 
-    vy = held("vy")
+    vy = estimate_at("vy")
     measured = {
-        name: scored[own]
-        for name, own in REFERENCES.items()
-        if own in scored and name in estimate.channels and name != "vy"
+        name: scored[channel]
+        for name, channel in REFERENCES.items()
+        if channel in scored and name in estimate.channels and name != "vy"
     }
-    others = {name: (held(name), own) for name, own in measured.items() if not np.isnan(own).any()}
+    other_states = {
+        name: (estimate_at(name), values)
+        for name, values in measured.items()
+        if not np.isnan(values).any()
+    }
     covariance_of = tuple(
         name
         for name in REFERENCES
-        if name in estimate.covariance_of and (name == "vy" or name in others)
+        if name in estimate.covariance_of and (name == "vy" or name in other_states)
     )
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
     if covariance is not None:
@@ -343,7 +381,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
             covariance.sum(axis=(1, 2)), f"estimator '{estimate.estimator}' has no covariance", span
         )
     bands = {
-        name: held(f"band_{name}")
+        name: estimate_at(f"band_{name}")
         for name in ("vy", "sideslip")
         if f"band_{name}" in estimate.channels
     }
@@ -358,25 +396,28 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         is_sideslip_scored=is_fast_enough(
             scored["vx"], scored["vy_ref"], protocol.min_sideslip_speed_on(span.dataset)
         ),
-        others=others,
+        other_states=other_states,
         covariance=covariance,
         covariance_of=covariance_of,
-        nis=held("nis") if innovations else None,
-        nis_dof=held("nis_dof") if innovations else None,
+        nis=estimate_at("nis") if innovations else None,
+        nis_dof=estimate_at("nis_dof") if innovations else None,
         bands=bands,
     )
 
 
 def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> BoolArray:
-    """Whether sideslip is scored, (K,): where the measured u and the reference v make ``min_speed`` or more, all in m/s."""
+    """Whether sideslip is scored, (K,): where the measured u and the reference v make ``min_speed``
+    or more, all in m/s.
+    """
     return np.asarray(np.hypot(vx, vy_ref) >= min_speed)
 
 
-def _require_all(values: FloatArray, what: str, span: Span) -> None:
+def _require_all(values: FloatArray, problem: str, span: Span) -> None:
+    """Raise `DataError` where a value is NaN; ``problem`` begins the message."""
     missing = int(np.isnan(values).sum())
     if missing:
         raise DataError(
-            f"{what} for {missing} of {len(values)} scored samples of {span.describe()}; "
+            f"{problem} for {missing} of {len(values)} scored samples of {span.describe()}; "
             f"give it a longer warm-up or check that it does not diverge"
         )
 
@@ -384,15 +425,19 @@ def _require_all(values: FloatArray, what: str, span: Span) -> None:
 def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """Metrics over all parts together.
 
-    Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
-    ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none, or no a_y.
-    ``…_weighted`` are the mean of squared `weighted_errors`, the mean and the 99th percentile of absolute ones.
-    ``rmse_sideslip``, ``max_error_sideslip`` and ``p99_sideslip`` are of the samples at which sideslip is scored, NaN where there are
-    none; ``share_below_min_speed`` is the share of the others. Metrics of a paper are of all samples, as it has them.
+    Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023,
+    Section VIII); ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024)
+    and is NaN where there are none, or no a_y. ``…_weighted`` are the mean of squared
+    `weighted_errors`, the mean and the 99th percentile of absolute ones. ``rmse_sideslip``,
+    ``max_error_sideslip`` and ``p99_sideslip`` are of the samples at which sideslip is scored, NaN
+    where there are none; ``share_below_min_speed`` is the share of the others. Metrics of a paper
+    are of all samples, as it has them.
 
-    Returns:
-        Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and of innovations are there only if all
-        parts have what they need.
+    Returns
+    -------
+    dict[str, float]
+        Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and
+        of innovations are there only if all parts have what they need.
     """
     vy = np.concatenate([part.vy for part in parts])
     vy_ref = np.concatenate([part.vy_ref for part in parts])
@@ -425,7 +470,9 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Sizes of errors of vx, vy and yaw rate, such as `np.square`, times `WEIGHTS`, summed, (K,); `DataError` where one is missing."""
+    """Sizes of errors of vx, vy and yaw rate, such as `np.square`, times `WEIGHTS`, summed, (K,);
+    `DataError` where one is missing.
+    """
     errors = part.errors
     missing = [name for name in WEIGHTS if name not in errors]
     if missing:
@@ -489,16 +536,23 @@ def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
 def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> FloatArray:
     """Normalised estimation error squared of each sample over its dimension, eᵀP⁻¹e / n.
 
-    Its mean is 1 for a consistent filter, above 1 for one that is too sure of itself. Infinite where P is not positive definite.
+    Its mean is 1 for a consistent filter, above 1 for one that is too sure of itself. Infinite
+    where P is not positive definite.
 
-    Args:
-        errors: estimate - reference, shape (K, n).
-        covariance: shape (K, n, n).
+    Parameters
+    ----------
+    errors : FloatArray
+        Estimate - reference, shape (K, n).
+    covariance : FloatArray
+        Shape (K, n, n).
 
-    Returns:
+    Returns
+    -------
+    FloatArray
         Shape (K,).
 
-    Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Section 5.4.2.
+    Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation,
+    2001, Section 5.4.2.
     """
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     proper = np.all(variances > 0, axis=1)
@@ -514,13 +568,19 @@ def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> Floa
 
 
 def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
-    """Mean of a filter's normalised innovation squared over the numbers that were measured; 1 for a consistent filter.
+    """Mean of a filter's normalised innovation squared over the numbers that were measured; 1 for a
+    consistent filter.
 
-    Args:
-        nis: eᵀS⁻¹e of each update, shape (K,).
-        dof: numbers measured at each, shape (K,); samples with none do not count.
+    Parameters
+    ----------
+    nis : FloatArray
+        EᵀS⁻¹e of each update, shape (K,).
+    dof : FloatArray
+        Numbers measured at each, shape (K,); samples with none do not count.
 
-    Returns:
+    Returns
+    -------
+    float
         NaN if nothing was measured at any sample.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001, Section 5.4.2.
@@ -530,7 +590,9 @@ def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
 
 
 def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
-    """Fraction of errors, (K,) like ``variance``, within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussians."""
+    """Fraction of errors, (K,) like ``variance``, within ``n_sigma`` standard deviations;
+    `COVERAGE` says what is expected of Gaussians.
+    """
     return float(np.mean(np.square(errors) <= n_sigma**2 * variance))
 
 

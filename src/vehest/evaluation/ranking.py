@@ -1,4 +1,8 @@
-"""Which of several estimators may be called best: paired intervals of their differences, corrected for their number."""
+"""Which of several estimators may be called best: paired intervals of their differences, corrected
+for their number.
+
+    segments of each seed --rank--> blocks -> RMSE, paired differences -> Holm's correction -> `Ranking`
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums
+from vehest.evaluation.blocks import MIN_BLOCKS, Segments, block_labels, block_sums
 from vehest.evaluation.significance import (
     CONFIDENCE,
     Pair,
@@ -36,7 +40,7 @@ class Comparison:
     verdict: Verdict  # whether the first lies significantly lower or higher than the second
 
     @property
-    def turned(self) -> Comparison:
+    def reversed(self) -> Comparison:
         """The second less the first."""
         verdict: Verdict = (
             "higher"
@@ -58,7 +62,7 @@ class Ranking:
     pairs: Mapping[
         tuple[Name, Name], Comparison
     ]  # (first, second) -> comparison, of every pair that was compared, either way round
-    n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
+    n_blocks: int  # blocks that were resampled; below `MIN_BLOCKS` there are no intervals and no comparisons
     block_seconds: float  # mean time in a block at which sideslip is scored [s]
     effective_blocks: float  # how many equal blocks the best one's squared error is spread over
 
@@ -72,28 +76,32 @@ class Ranking:
         ]
 
     def beats(self, name: Name, baseline: str) -> bool | None:
-        """Whether a candidate's RMSE lies significantly below a baseline's; None without a significant difference or a comparison."""
-        found = [
-            own
-            for (candidate, other), own in self.pairs.items()
-            if candidate == name and other[0] == baseline
+        """Whether a candidate's RMSE lies significantly below a baseline's; None without a
+        significant difference or a comparison.
+        """
+        comparisons = [
+            comparison
+            for (candidate, against), comparison in self.pairs.items()
+            if candidate == name and against[0] == baseline
         ]
-        if not found or found[0].verdict == "not told apart":
+        if not comparisons or comparisons[0].verdict == "not told apart":
             return None
-        return found[0].verdict == "lower"
+        return comparisons[0].verdict == "lower"
 
     @property
     def winner(self) -> Name | None:
-        """The one that may be called best: below every other candidate, `zero` and `static_map`, each by more than chance."""
+        """The one that may be called best: below every other candidate, `zero` and `static_map`,
+        each by more than chance.
+        """
         if (
-            self.n_blocks < LEAST_BLOCKS
+            self.n_blocks < MIN_BLOCKS
             or not self.order
             or self.missing_baselines
             or self.order[0][0] in BASELINES
         ):
             return None
         beaten = all(
-            self.pairs[self.order[0], other].verdict == "lower" for other in self.order[1:]
+            self.pairs[self.order[0], candidate].verdict == "lower" for candidate in self.order[1:]
         )
         return (
             self.order[0]
@@ -103,57 +111,72 @@ class Ranking:
 
     @property
     def recommendable(self) -> list[Name]:
-        """The best and those without a significant difference to it, as far as they beat every baseline significantly."""
+        """The best and those without a significant difference to it, as far as they beat every
+        baseline significantly.
+        """
         if not self.order:
             return []
         return [
             name
-            for name in (self.order[0], *self.not_told_apart)
+            for name in (self.order[0], *self.tied_with_best)
             if all(self.beats(name, baseline) for baseline in BASELINES)
         ]
 
     @property
-    def not_told_apart(self) -> list[Name]:
+    def tied_with_best(self) -> list[Name]:
         """Those without a significant difference to the best."""
-        others = [(name, self.pairs.get((self.order[0], name))) for name in self.order[1:]]
-        return [name for name, own in others if own is not None and own.verdict == "not told apart"]
+        comparisons = [(name, self.pairs.get((self.order[0], name))) for name in self.order[1:]]
+        return [
+            name
+            for name, comparison in comparisons
+            if comparison is not None and comparison.verdict == "not told apart"
+        ]
 
 
 def rank(
     segments: Mapping[Name, Sequence[Segments]],
     rate_hz: float,
-    asked: Sequence[tuple[Name, Name]] = (),
+    claimed_pairs: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Compare estimators on one test set by RMSE(β); without an order, and with NaN, where sideslip is scored at no sample.
+    """Compare estimators on one test set by RMSE(β); without an order, and with NaN, where sideslip
+    is scored at no sample.
 
-    Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`differences_of_blocks`).
-    Corrected together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
+    Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their
+    own (`differences_of_blocks`). Corrected together by Holm are: the best against every other,
+    every candidate against each baseline, and the claimed pairs.
 
-    Args:
-        segments: of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].
-        asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
+    Parameters
+    ----------
+    segments : Mapping[Name, Sequence[Segments]]
+        Of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].
+    claimed_pairs : Sequence[tuple[Name, Name]], default ()
+        Further pairs to compare, such as those whose order a paper claims; left out where one of
+        the two is missing.
     """
-    first = next(iter(segments.values()))[0].with_sideslip
-    if not len(first):
+    reference_segments = next(iter(segments.values()))[0].with_sideslip
+    if not len(reference_segments):
         return Ranking([], dict.fromkeys(segments, np.nan), {}, {}, 0, 0.0, 0.0)
     losses = {
-        name: np.stack([own.with_sideslip.squared_error_sideslip for own in seeds])
+        name: np.stack([seed.with_sideslip.squared_error_sideslip for seed in seeds])
         for name, seeds in segments.items()
     }
-    per_sample = np.concatenate([own / first.sideslip_samples for own in losses.values()])
-    labels = block_labels(first, per_sample)
-    sizes = block_sums(first.sideslip_samples, labels)
-    sums = {name: block_sums(own, labels) for name, own in losses.items()}
+    per_sample = np.concatenate(
+        [loss / reference_segments.sideslip_samples for loss in losses.values()]
+    )
+    labels = block_labels(reference_segments, per_sample)
+    sizes = block_sums(reference_segments.sideslip_samples, labels)
+    sums = {name: block_sums(loss, labels) for name, loss in losses.items()}
     rmse = {
-        name: float(np.sqrt(own.sum(axis=1).mean() / sizes.sum())) for name, own in sums.items()
+        name: float(np.sqrt(values.sum(axis=1).mean() / sizes.sum()))
+        for name, values in sums.items()
     }
     order = sorted(rmse, key=lambda name: rmse[name])
-    enough = len(sizes) >= LEAST_BLOCKS
-    pairs = _pairs(order, asked) if enough else []
+    enough = len(sizes) >= MIN_BLOCKS
+    pairs = _pairs(order, claimed_pairs) if enough else []
     compared = dict(
         zip(
             pairs,
-            _corrected([(sums[one], sums[other]) for one, other in pairs], sizes),
+            _corrected([(sums[first], sums[second]) for first, second in pairs], sizes),
             strict=True,
         )
     )
@@ -161,13 +184,16 @@ def rank(
     return Ranking(
         order=order,
         rmse=rmse,
-        intervals={name: (own.low, own.high) for name, own in zip(order, intervals, strict=True)}
+        intervals={
+            name: (interval.low, interval.high)
+            for name, interval in zip(order, intervals, strict=True)
+        }
         if enough
         else {},
         pairs={
-            key: own
-            for (one, other), found in compared.items()
-            for key, own in (((one, other), found), ((other, one), found.turned))
+            key: comparison
+            for (first, second), value in compared.items()
+            for key, comparison in (((first, second), value), ((second, first), value.reversed))
         },
         n_blocks=len(sizes),
         block_seconds=float(sizes.mean()) / rate_hz,
@@ -175,33 +201,41 @@ def rank(
     )
 
 
-def _pairs(order: Sequence[Name], asked: Sequence[tuple[Name, Name]]) -> list[tuple[Name, Name]]:
-    """The best with every other, every candidate with every baseline, and those asked for; each pair once."""
-    pairs = [(order[0], other) for other in order[1:]]
+def _pairs(
+    order: Sequence[Name], claimed_pairs: Sequence[tuple[Name, Name]]
+) -> list[tuple[Name, Name]]:
+    """The best with every other, every candidate with every baseline, and claimed pairs; each pair
+    once.
+    """
+    pairs = [(order[0], second) for second in order[1:]]
     pairs += [
-        (name, other)
+        (name, second)
         for name in order
-        for other in order
-        if other[0] in BASELINES and name[0] not in BASELINES
+        for second in order
+        if second[0] in BASELINES and name[0] not in BASELINES
     ]
-    for one, other in asked:
-        if one in order and other in order and (other, one) not in pairs:
-            pairs.append((one, other))
+    for first, second in claimed_pairs:
+        if first in order and second in order and (second, first) not in pairs:
+            pairs.append((first, second))
     return list(dict.fromkeys(pairs))
 
 
 def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
-    """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is tested."""
-    differences = [own.root for own in differences_of_blocks(pairs, sizes)]
-    adjusted = holm([own.p_value for own in differences])
+    """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is
+    tested.
+    """
+    differences = [difference.root for difference in differences_of_blocks(pairs, sizes)]
+    adjusted = holm([difference.p_value for difference in differences])
     comparisons = []
-    for own, p_value in zip(differences, adjusted, strict=True):
-        factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(pairs))
-        low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
+    for difference, p_value in zip(differences, adjusted, strict=True):
+        factor = (
+            max(p_value / difference.p_value, 1.0) if difference.p_value > 0 else float(len(pairs))
+        )
+        low, high = difference.at(1.0 - (1.0 - CONFIDENCE) / factor)
         verdict: Verdict = (
             "not told apart"
             if p_value >= 1.0 - CONFIDENCE
-            else ("lower" if own.value < 0 else "higher")
+            else ("lower" if difference.value < 0 else "higher")
         )
-        comparisons.append(Comparison(own.value, low, high, p_value, verdict))
+        comparisons.append(Comparison(difference.value, low, high, p_value, verdict))
     return comparisons

@@ -1,13 +1,15 @@
-"""Errors by regime: straight ahead or turning, by lateral acceleration, in transients or steady; each a ``subset`` of the metrics.
+"""Errors by regime: straight ahead or turning, by lateral acceleration, in transients or steady;
+each a ``subset`` of the metrics.
 
-| regime | samples |
-| `straight`, `turning` | yaw rate within ±0.05 rad/s, and the rest |
-| `ay_0_2`, `ay_2_4`, `ay_4_6`, `ay_6_` | size of the lateral acceleration from so many to so many m/s² |
-| `transient`, `steady` | yaw rate changes faster than 0.1 rad/s² or lateral acceleration faster than 2 m/s³, and the rest |
+| regime | samples | | `straight`, `turning` | yaw rate within ±0.05 rad/s, and the rest | |
+`ay_0_2`, `ay_2_4`, `ay_4_6`, `ay_6_` | size of the lateral acceleration from so many to so many
+m/s² | | `transient`, `steady` | yaw rate changes faster than 0.1 rad/s² or lateral acceleration
+faster than 2 m/s³, and the rest |
 
-The two limits of transients are the same at 20 m/s, where a_y ≈ u ω changes by 2 m/s³ with 0.1 rad/s². They were set before any error was
-looked at. Rates of change are slopes of lines fitted by least squares to 0.5 s around each sample (Savitzky & Golay 1964, first order): a
-regime says what the car did, so it may look ahead.
+The two limits of transients are the same at 20 m/s, where a_y ≈ u ω changes by 2 m/s³ with 0.1
+rad/s². They were set before any error was looked at. Rates of change are slopes of lines fitted by
+least squares to 0.5 s around each sample (Savitzky & Golay 1964, first order): a regime says what
+the car did, so it may look ahead.
 """
 
 from __future__ import annotations
@@ -31,14 +33,16 @@ STRAIGHT_YAW_RATE = 0.05  # rad/s
 AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s²
 TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}  # rad/s², m/s³
 SLOPE_SECONDS = 0.5
-LEAST_SECONDS = 2.0  # of samples in a regime, below which it has no errors
+MIN_REGIME_SECONDS = 2.0  # of samples in a regime, below which it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")
 
 AY_BANDS = {
     f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high)
     for low, high in itertools.pairwise(AY_EDGES)
 }
-"""Name of a band of lateral acceleration, ``ay_2_4`` or ``ay_6_`` without upper end -> its ends [m/s²]."""
+"""Name of a band of lateral acceleration, ``ay_2_4`` or ``ay_6_`` without upper end -> its ends
+[m/s²].
+"""
 
 REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
 
@@ -46,36 +50,41 @@ REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the or
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:
     """Which scored samples of a range lie in which regime.
 
-    Returns:
-        Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration no bands, without both none.
+    Returns
+    -------
+    dict[str, Mask]
+        Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration
+        no bands, without both none.
     """
     first, end = scored_range(reference, span, protocol)
     margin = math.ceil(SLOPE_SECONDS * reference.rate_hz)
     around = slice(max(first - margin, 0), end + margin)
     inside = slice(first - around.start, end - around.start)
-    own = {name: reference[name][around] for name in ("yaw_rate", "ay") if name in reference}
-    size = {name: np.abs(samples[inside]) for name, samples in own.items()}
-    found: dict[str, Mask] = {}
+    signals = {name: reference[name][around] for name in ("yaw_rate", "ay") if name in reference}
+    size = {name: np.abs(samples[inside]) for name, samples in signals.items()}
+    masks: dict[str, Mask] = {}
     if "yaw_rate" in size:
-        found["straight"] = size["yaw_rate"] < STRAIGHT_YAW_RATE
-        found["turning"] = size["yaw_rate"] >= STRAIGHT_YAW_RATE
+        masks["straight"] = size["yaw_rate"] < STRAIGHT_YAW_RATE
+        masks["turning"] = size["yaw_rate"] >= STRAIGHT_YAW_RATE
     if "ay" in size:
-        found |= {
+        masks |= {
             name: (size["ay"] >= low) & (size["ay"] < high)
             for name, (low, high) in AY_BANDS.items()
         }
-    if own:
+    if signals:
         fast = [
             np.abs(slope(samples, reference.rate_hz)[inside]) > TRANSIENT[name]
-            for name, samples in own.items()
+            for name, samples in signals.items()
         ]
         transient = np.logical_or.reduce(fast)
-        found |= {"transient": transient, "steady": ~transient}
-    return found
+        masks |= {"transient": transient, "steady": ~transient}
+    return masks
 
 
 def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
-    """Rate of change of a signal, from a line through `SLOPE_SECONDS` around each sample, (T,) [unit/s]; 0 if it is too short."""
+    """Rate of change of a signal, from a line through `SLOPE_SECONDS` around each sample, (T,)
+    [unit/s]; 0 if it is too short.
+    """
     samples = filled(samples)
     window = min(
         2 * max(round(0.5 * SLOPE_SECONDS * rate_hz), 1) + 1, len(samples) - (len(samples) + 1) % 2
@@ -89,41 +98,55 @@ def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 def filled(samples: FloatArray) -> FloatArray:
     """The same with straight lines over gaps (NaN), and zeros where nothing is known."""
-    known = np.isfinite(samples)
-    if known.all():
+    is_finite = np.isfinite(samples)
+    if is_finite.all():
         return samples
     at = np.arange(len(samples))
-    return np.interp(at, at[known], samples[known]) if known.any() else np.zeros_like(samples)
+    return (
+        np.interp(at, at[is_finite], samples[is_finite])
+        if is_finite.any()
+        else np.zeros_like(samples)
+    )
 
 
-def is_known(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
-    """Whether every range tells a regime, and it has `LEAST_SECONDS` of samples in all, at ``rate_hz`` [Hz]."""
-    return all(regime in own for own in masks) and is_long_enough(
-        [own[regime] for own in masks], rate_hz
+def is_represented(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
+    """Whether every range tells a regime, and it has `MIN_REGIME_SECONDS` of samples in all, at
+    ``rate_hz`` [Hz].
+    """
+    return all(regime in mask for mask in masks) and is_long_enough(
+        [mask[regime] for mask in masks], rate_hz
     )
 
 
 def is_long_enough(chosen: Sequence[Mask], rate_hz: float) -> bool:
-    """Whether as many samples as `LEAST_SECONDS` at ``rate_hz`` [Hz] are chosen, over all ranges."""
-    return sum(int(own.sum()) for own in chosen) >= max(LEAST_SECONDS * rate_hz, 1.0)
+    """Whether as many samples as `MIN_REGIME_SECONDS` at ``rate_hz`` [Hz] are chosen, over all
+    ranges.
+    """
+    return sum(int(mask.sum()) for mask in chosen) >= max(MIN_REGIME_SECONDS * rate_hz, 1.0)
 
 
 def errors_by_regime(
     parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float
 ) -> dict[str, dict[str, float]]:
-    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at ``rate_hz`` [Hz].
+    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at
+    ``rate_hz`` [Hz].
 
-    Returns:
-        Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples; RMSE(β) is NaN where it is scored at
-        fewer.
+    Returns
+    -------
+    dict[str, dict[str, float]]
+        Only regimes that every part tells, and of which there are `MIN_REGIME_SECONDS` of samples;
+        RMSE(β) is NaN where it is scored at fewer.
     """
     total = sum(len(part.time) for part in parts)
-    found = {}
-    for name in (name for name in REGIMES if is_known(name, masks, rate_hz)):
-        inside = [part.at(own[name]) for part, own in zip(parts, masks, strict=True)]
+    figures_of = {}
+    for name in (name for name in REGIMES if is_represented(name, masks, rate_hz)):
+        inside = [part.at(mask[name]) for part, mask in zip(parts, masks, strict=True)]
         figures = accuracy(inside)
         if not is_long_enough([part.is_sideslip_scored for part in inside], rate_hz):
             figures["rmse_sideslip"] = math.nan
         count = sum(len(part.time) for part in inside)
-        found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
-    return found
+        figures_of[name] = {
+            **{metric: figures[metric] for metric in METRICS},
+            "share": count / total,
+        }
+    return figures_of

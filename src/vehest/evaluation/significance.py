@@ -1,4 +1,6 @@
-"""Whether one estimator is better than another: a paired block bootstrap of the difference of their mean losses."""
+"""Whether one estimator is better than another: a paired block bootstrap of the difference of their
+mean losses.
+"""
 
 from __future__ import annotations
 
@@ -59,42 +61,50 @@ def differences_of_blocks(
 ) -> list[Difference]:
     """Compare pairs of estimators on the same samples; all pairs see the same draws.
 
-    Each resample draws blocks with replacement, the same for both estimators, since what is difficult for one is for the other; and
-    seeds of each estimator, independently, since they are different trainings. Of n blocks or seeds n - 1 are drawn, which makes the
-    variance of a mean unbiased (Rao & Wu 1988); for a median of three seeds or more all n. The resamples give the standard error,
-    Student's t the interval, with degrees of freedom from blocks and seeds by Welch and Satterthwaite: with 7 sequences and 3 seeds
-    percentiles of the resamples would be too narrow.
+    Each resample draws blocks with replacement, the same for both estimators, since what is
+    difficult for one is for the other; and seeds of each estimator, independently, since they are
+    different trainings. Of n blocks or seeds n - 1 are drawn, which makes the variance of a mean
+    unbiased (Rao & Wu 1988); for a median of three seeds or more all n. The resamples give the
+    standard error, Student's t the interval, with degrees of freedom from blocks and seeds by Welch
+    and Satterthwaite: with 7 sequences and 3 seeds percentiles of the resamples would be too
+    narrow.
 
-    An estimator with one seed counts as if all its trainings had that outcome. Where errors are a seed's own in each sequence, and
-    common neither to an estimator's seeds nor to its sequences, intervals are wider than need be (Owen 2007), never narrower.
+    An estimator with one seed counts as if all its trainings had that outcome. Where errors are a
+    seed's own in each sequence, and common neither to an estimator's seeds nor to its sequences,
+    intervals are wider than need be (Owen 2007), never narrower.
 
-    Args:
-        pairs: sum of the losses of each seed over each block, shape (S, B) and (S', B).
-        sizes: samples in each block, shape (B,).
+    Parameters
+    ----------
+    pairs : Sequence[Pair]
+        Sum of the losses of each seed over each block, shape (S, B) and (S', B).
+    sizes : FloatArray
+        Samples in each block, shape (B,).
 
-    Raises:
-        DataError: there are fewer than two blocks.
+    Raises
+    ------
+    DataError
+        There are fewer than two blocks.
 
-    Source: Künsch, The jackknife and the bootstrap for general stationary observations, Annals of Statistics 17 (3), 1989; Rao & Wu,
-    Resampling inference with complex survey data, JASA 83 (401), 1988; Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1 (2),
-    2007.
+    Source: Künsch, The jackknife and the bootstrap for general stationary observations, Annals of
+    Statistics 17 (3), 1989; Rao & Wu, Resampling inference with complex survey data, JASA 83 (401),
+    1988; Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1 (2), 2007.
     """
     if len(sizes) < 2:
         raise DataError(f"there are {len(sizes)} blocks to resample, at least two are needed")
-    found = []
+    differences = []
     for pair, drawn in zip(pairs, _resampled(pairs, sizes, n_resamples), strict=True):
-        means = [own.sum(axis=1) / sizes.sum() for own in pair]
+        means = [sums.sum(axis=1) / sizes.sum() for sums in pair]
         dof = _degrees_of_freedom(pair, sizes, means)
         with np.errstate(invalid="ignore"):
             root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
-        found.append(
+        differences.append(
             Difference(
                 mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
                 median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
                 root=_interval(root, drawn[2], dof),
             )
         )
-    return found
+    return differences
 
 
 def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000) -> Interval:
@@ -105,28 +115,32 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
 def root_intervals(
     candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000
 ) -> list[Interval]:
-    """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
+    """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared
+    errors, with its interval.
 
-    Blocks and seeds are drawn as in `differences_of_blocks`; the interval is symmetric on a logarithmic axis, on which the distribution of
-    a root of few blocks is less skewed.
+    Blocks and seeds are drawn as in `differences_of_blocks`; the interval is symmetric on a
+    logarithmic axis, on which the distribution of a root of few blocks is less skewed.
 
-    Args:
-        candidates: sum of the losses of each seed over each block, (S, B), none negative, of each estimator.
-        sizes: samples in each block, (B,).
+    Parameters
+    ----------
+    candidates : Sequence[FloatArray]
+        Sum of the losses of each seed over each block, (S, B), none negative, of each estimator.
+    sizes : FloatArray
+        Samples in each block, (B,).
     """
-    nothing = np.zeros((1, len(sizes)))
-    pairs = [(sums, nothing) for sums in candidates]
-    found = []
+    no_losses = np.zeros((1, len(sizes)))
+    pairs = [(sums, no_losses) for sums in candidates]
+    intervals = []
     for sums, drawn in zip(candidates, _resampled(pairs, sizes, n_resamples), strict=True):
         value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
         if value > 0:
             dof = _degrees_of_freedom(
-                [sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]
+                [sums, no_losses], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]
             )
-            found.append(_logarithmic(value, drawn[2], dof))
+            intervals.append(_logarithmic(value, drawn[2], dof))
         else:
-            found.append(Interval(value, value, value, 1.0))
-    return found
+            intervals.append(Interval(value, value, value, 1.0))
+    return intervals
 
 
 def unexplained_interval(
@@ -138,14 +152,21 @@ def unexplained_interval(
     *,
     n_resamples: int = 4000,
 ) -> Interval:
-    """The fraction of variance unexplained with its interval, as `root_interval`; all arguments are sums over blocks, (B,).
+    """The fraction of variance unexplained with its interval, as `root_interval`; all arguments are
+    sums over blocks, (B,).
 
-    Args:
-        squared_error: of (v̂ - v)².
-        error: of v̂ - v.
-        squared: of v².
-        reference: of v.
-        sizes: samples.
+    Parameters
+    ----------
+    squared_error : FloatArray
+        Of (v̂ - v)².
+    error : FloatArray
+        Of v̂ - v.
+    squared : FloatArray
+        Of v².
+    reference : FloatArray
+        Of v.
+    sizes : FloatArray
+        Samples.
     """
     drawn = _counts(len(sizes), n_resamples, np.random.default_rng(0))
 
@@ -300,8 +321,8 @@ def log_ratio_of_pooled(
 ) -> Contrast:
     """Logarithm of the ratio of two sums over blocks, each the mean over its seeds.
 
-    Blocks and seeds are drawn as in `differences_of_blocks`; the resamples give the standard
-    error, and the mean's influences of blocks and seeds its parts. With samples in each block, (1, B), in
+    Blocks and seeds are drawn as in `differences_of_blocks`; the resamples give the standard error,
+    and the mean's influences of blocks and seeds its parts. With samples in each block, (1, B), in
     place of ``second`` it is the logarithm of a mean loss.
 
     Parameters
@@ -338,12 +359,16 @@ def log_ratio_of_pooled(
 
 @lru_cache(maxsize=4)
 def _counts_of_ratios(n_blocks: int, n: int) -> FloatArray:
-    """`_counts`, which are the same for all ratios over as many blocks and take longer than the rest."""
+    """`_counts`, which are the same for all ratios over as many blocks and take longer than the
+    rest.
+    """
     return _counts(n_blocks, n, np.random.default_rng(0))
 
 
 def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
-    """Variance of the mean of (S, B) by its seeds beyond that by single values, and its degrees of freedom."""
+    """Variance of the mean of (S, B) by its seeds beyond that by single values, and its degrees of
+    freedom.
+    """
     n_seeds, n_blocks = values.shape
     if n_seeds < 2:
         return []
@@ -359,7 +384,8 @@ def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values adjusted for their number: those below 0.05 hold together with an error of at most 5 %.
+    """p-values adjusted for their number: those below 0.05 hold together with an error of at most 5
+    %.
 
     Source: Holm, Scandinavian Journal of Statistics 6 (2), 1979.
     """
@@ -381,7 +407,8 @@ def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray
 
 
 def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> FloatArray:
-    """Differences of means, of medians over seeds, and of roots of means of each resample, (pairs, 3, n_resamples).
+    """Differences of means, of medians over seeds, and of roots of means of each resample, (pairs,
+    3, n_resamples).
 
     Pairs of as many seeds share their draws, which are those of each pair alone.
     """
@@ -393,22 +420,22 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
             part = slice(begin, min(begin + at_once, n_resamples))
             counts = _counts(len(sizes), part.stop - begin, generator)
             seeds = [generator.integers(number, size=(len(counts), number)) for number in numbers]
-            known: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+            statistics: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
             for position, pair in enumerate(pairs):
                 if (len(pair[0]), len(pair[1])) != numbers:
                     continue
-                for side, own in enumerate(pair):
-                    if (id(own), side) not in known:
+                for side, sums in enumerate(pair):
+                    if (id(sums), side) not in statistics:
                         losses = np.take_along_axis(
-                            counts @ own.T / (counts @ sizes)[:, None], seeds[side], axis=1
+                            counts @ sums.T / (counts @ sizes)[:, None], seeds[side], axis=1
                         )
-                        fewer = losses[:, : max(len(own) - 1, 1)]
-                        known[id(own), side] = (
+                        fewer = losses[:, : max(len(sums) - 1, 1)]
+                        statistics[id(sums), side] = (
                             fewer.mean(axis=1),
-                            np.median(losses if len(own) > 2 else fewer, axis=1),
+                            np.median(losses if len(sums) > 2 else fewer, axis=1),
                         )
                 (first, first_median), (second, second_median) = (
-                    known[id(own), side] for side, own in enumerate(pair)
+                    statistics[id(sums), side] for side, sums in enumerate(pair)
                 )
                 with np.errstate(invalid="ignore"):
                     drawn[position, :, part] = (
@@ -422,12 +449,18 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
 def _degrees_of_freedom(
     sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]
 ) -> float:
-    """Welch-Satterthwaite over the variance between blocks and that between seeds of either estimator."""
+    """Welch-Satterthwaite over the variance between blocks and that between seeds of either
+    estimator.
+    """
     n_blocks = len(sizes)
     difference = means[0].mean() - means[1].mean()
     residuals = (sums[0].mean(axis=0) - sums[1].mean(axis=0) - difference * sizes) / sizes.mean()
     parts = [(float(residuals.var(ddof=1)) / n_blocks, n_blocks - 1)]
-    parts += [(float(own.var(ddof=1)) / len(own), len(own) - 1) for own in means if len(own) > 1]
+    parts += [
+        (float(seed_means.var(ddof=1)) / len(seed_means), len(seed_means) - 1)
+        for seed_means in means
+        if len(seed_means) > 1
+    ]
     spread = sum(variance**2 / free for variance, free in parts)
     return (
         sum(variance for variance, _ in parts) ** 2 / spread if spread > 0 else float(n_blocks - 1)

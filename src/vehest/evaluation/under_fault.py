@@ -4,7 +4,8 @@
 | `faulted` | from the start of the fault up to its end |
 | `after` | from `SETTLED_SECONDS` after its end on |
 
-Each has the errors of the same estimator on the same samples without the fault beside them, ``…_nominal``.
+Each has the errors of the same estimator on the same samples without the fault beside them,
+``…_nominal``.
 """
 
 from __future__ import annotations
@@ -50,12 +51,15 @@ def errors_under_fault(
 ) -> dict[str, dict[str, float]]:
     """Subset -> metric -> value, over all parts together; a subset without samples is left out.
 
-    Args:
-        parts: estimate under the fault and reference, of each range or sequence; an infinite estimate is a sideslip of 90° and an
-            infinite error of the lateral velocity.
-        nominal: the same without the fault.
+    Parameters
+    ----------
+    parts : Sequence[Scored]
+        Estimate under the fault and reference, of each range or sequence; an infinite estimate is a
+        sideslip of 90° and an infinite error of the lateral velocity.
+    nominal : Sequence[Scored]
+        The same without the fault.
     """
-    found = {}
+    figures = {}
     pairs = list(zip(parts, windows, strict=True))
     during = [
         (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
@@ -65,21 +69,23 @@ def errors_under_fault(
     for subset, masks in ((FAULTED, during), (AFTER, after)):
         if any(mask.any() for mask in masks):
             usual = {f"{name}_nominal": value for name, value in _errors(nominal, masks).items()}
-            found[subset] = _errors(parts, masks) | usual
-    return found
+            figures[subset] = _errors(parts, masks) | usual
+    return figures
 
 
 def flags_under_fault(
     parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float
 ) -> dict[str, float]:
-    """Whether bands hold and faults are flagged while they last, over all parts together, at ``rate_hz`` [Hz].
+    """Whether bands hold and faults are flagged while they last, over all parts together, at
+    ``rate_hz`` [Hz].
 
     Errors count where sideslip is scored, flags at all samples.
 
-    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
-    ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
-    time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
-    is something for.
+    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged``
+    the same of those marked valid; of ranges that were valid before: ``missed_detections`` share in
+    which nothing is flagged before the fault's end, ``detection_delay`` mean time to the first flag
+    of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures
+    that there is something for.
     """
     inside = []
     valid = []
@@ -89,9 +95,9 @@ def flags_under_fault(
         during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
         error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
         error[~part.is_sideslip_scored] = np.nan
-        known = during & np.isfinite(band) & part.is_sideslip_scored
-        inside.append((np.abs(error) <= band)[known])
-        valid.append(health[known] == 0)
+        has_band = during & np.isfinite(band) & part.is_sideslip_scored
+        inside.append((np.abs(error) <= band)[has_band])
+        valid.append(health[has_band] == 0)
         at = np.flatnonzero(during)
         if len(at) and (at[0] == 0 or health[at[0] - 1] == 0):
             flags = health > 0
@@ -99,15 +105,17 @@ def flags_under_fault(
             end = int(at[-1]) + 1
             delays.append(detection_delay(flags, onset, end, rate_hz))
             undetected.append(error_while_undetected(np.degrees(error), flags, onset, end))
-    held = np.concatenate(inside)
-    calm = np.concatenate(valid)
-    found = [delay for delay in delays if math.isfinite(delay)]
-    figures = {"coverage_90": float(held.mean())} if len(held) else {}
-    figures |= {"coverage_90_unflagged": float(held[calm].mean())} if calm.any() else {}
-    figures |= {"detection_delay": float(np.mean(found))} if found else {}
+    is_inside = np.concatenate(inside)
+    is_valid = np.concatenate(valid)
+    finite_delays = [delay for delay in delays if math.isfinite(delay)]
+    figures = {"coverage_90": float(is_inside.mean())} if len(is_inside) else {}
+    figures |= (
+        {"coverage_90_unflagged": float(is_inside[is_valid].mean())} if is_valid.any() else {}
+    )
+    figures |= {"detection_delay": float(np.mean(finite_delays))} if finite_delays else {}
     if delays:
         figures |= {
-            "missed_detections": (len(delays) - len(found)) / len(delays),
+            "missed_detections": (len(delays) - len(finite_delays)) / len(delays),
             "max_error_sideslip_undetected": max(undetected),
         }
     return figures
@@ -134,21 +142,24 @@ def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict
 
 
 def detection_delay(flagged: NDArray[np.bool_], onset: int, end: int, rate_hz: float) -> float:
-    """Time from the first faulty sample to the end of the sample that is flagged first [s]; infinite if none is before ``end``.
+    """Time from the first faulty sample to the end of the sample that is flagged first [s];
+    infinite if none is before ``end``.
 
     ``flagged`` is (T,) at ``rate_hz`` [Hz]; ``onset`` is the index of the first faulty sample.
     """
-    found = np.flatnonzero(flagged[onset:end])
-    return (int(found[0]) + 1) / rate_hz if len(found) else math.inf
+    flagged_rows = np.flatnonzero(flagged[onset:end])
+    return (int(flagged_rows[0]) + 1) / rate_hz if len(flagged_rows) else math.inf
 
 
 def error_while_undetected(
     error: FloatArray, flagged: NDArray[np.bool_], onset: int, end: int
 ) -> float:
-    """Largest size of the error from a fault's onset to its first flag, or to ``end``; 0 if it is flagged at once.
+    """Largest size of the error from a fault's onset to its first flag, or to ``end``; 0 if it is
+    flagged at once.
 
-    ``error``, in which NaN does not count, and ``flagged`` are (T,); ``onset`` is the index of the first faulty sample.
+    ``error``, in which NaN does not count, and ``flagged`` are (T,); ``onset`` is the index of the
+    first faulty sample.
     """
-    found = np.flatnonzero(flagged[onset:end])
-    own = error[onset : onset + int(found[0]) if len(found) else end]
-    return float(np.nanmax(np.abs(own), initial=0.0))
+    flagged_rows = np.flatnonzero(flagged[onset:end])
+    undetected = error[onset : onset + int(flagged_rows[0]) if len(flagged_rows) else end]
+    return float(np.nanmax(np.abs(undetected), initial=0.0))

@@ -1,1 +1,3 @@
-"""Generic filters: batched, differentiable, and compiled where speed is the point; they know no car."""
+"""Generic filters: batched, differentiable, and compiled where speed is the point; they know no
+car.
+"""

@@ -1,4 +1,6 @@
-"""Gates: a measurement too far from what a filter expects is refused, unless it has been for so long that the filter must be wrong."""
+"""Gates: a measurement too far from what a filter expects is refused, unless it has been for so
+long that the filter must be wrong.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,11 @@ PATIENCE = 0.5  # s
 class Gate(NamedTuple):
     """When a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y - ŷ.
 
-    That is the chi-square test of the normalised innovation squared with one degree of freedom, measurement by measurement, so that a
-    sensor that fails takes no other one with it. What is refused counts as not measured. A contradiction longer than ``patience`` says that
-    the filter is lost: the gate opens, until the measurement has agreed as long as it was open, half a second at most. Samples without it
-    count neither way.
+    That is the chi-square test of the normalised innovation squared with one degree of freedom,
+    measurement by measurement, so that a sensor that fails takes no other one with it. What is
+    refused counts as not measured. A contradiction longer than ``patience`` says that the filter is
+    lost: the gate opens, until the measurement has agreed as long as it was open, half a second at
+    most. Samples without it count neither way.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (validation gate).
     """
@@ -31,7 +34,9 @@ class Gate(NamedTuple):
 
 @numba.njit(inline="always")
 def refuses(error, variance, limit, patience, refused, i):  # type: ignore[no-untyped-def]
-    """Whether measurement i is refused, given its innovation, its variance and ``limit``, deviations²; counts in ``refused``, (m,)."""
+    """Whether measurement i is refused, given its innovation, its variance and ``limit``,
+    deviations²; counts in ``refused``, (m,).
+    """
     if not error * error > limit * variance:
         refused[i] = refused[i] - 1 if refused[i] > patience else 0
         return False

@@ -1,4 +1,6 @@
-"""Linear models with Gaussian noise that vary in time, and the Rauch-Tung-Striebel smoother; `kalman_scan` filters them."""
+"""Linear models with Gaussian noise that vary in time, and the Rauch-Tung-Striebel smoother;
+`kalman_scan` filters them.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,17 @@ class LinearModel(NamedTuple, Generic[Array]):
 def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray]) -> FloatArray:
     """Mean states given all measurements, earlier and later ones, (T, n).
 
-    Args:
-        model: that `kalman_scan` was given, its transitions with a dimension for time.
-        filtered: what it returned.
+    Parameters
+    ----------
+    model : LinearModel[FloatArray]
+        That `kalman_scan` was given, its transitions with a dimension for time.
+    filtered : Filtered[FloatArray]
+        What it returned.
 
-    Raises:
-        numpy.linalg.LinAlgError: a predicted covariance is singular.
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A predicted covariance is singular.
 
     Source: Rauch, Tung & Striebel 1965.
     """

@@ -1,4 +1,12 @@
-"""The Kalman filter of one sequence, compiled."""
+"""The Kalman filter of one sequence, compiled.
+
+    x⁻ = A x + b,  P⁻ = A P Aᵀ + Q                                   prediction
+    e = y - C x⁻ - d,  S = C P⁻ Cᵀ + R,  K = P⁻ Cᵀ S⁻¹              for each measurement in turn
+    x = x⁻ + K e,  P = (I - K C) P⁻ (I - K C)ᵀ + K R Kᵀ              Joseph's form
+
+Flow: `LinearModel` and measurements (T, m) -> `kalman_scan` -> `Filtered`. Sums run over states in
+the order of their index.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +31,30 @@ def kalman_scan(
 ) -> Filtered[FloatArray]:
     """Filter one sequence in float64; what is NaN was not measured and is skipped.
 
-    States and innovations are NaN from the sample on at which the filter breaks down: an innovation whose variance is not positive, or a
-    state that is not a number.
+    States and innovations are NaN from the sample on at which the filter breaks down: an innovation
+    whose variance is not positive, or a state that is not a number.
 
-    Args:
-        model: see `LinearModel`.
-        measurements: y, (T, m).
-        initial: state at the first sample before its measurement, mean (n,).
-        gate: which measurements are refused; none: all are taken.
-        refused: how often on end each measurement was before the first sample, (m,); after the last one on return. None: never.
+    Parameters
+    ----------
+    model : LinearModel[FloatArray]
+        See `LinearModel`.
+    measurements : FloatArray
+        y, (T, m).
+    initial : Gaussian[FloatArray]
+        State at the first sample before its measurement, mean (n,).
+    gate : Gate | None, default None
+        Which measurements are refused; none: all are taken.
+    refused : NDArray[np.int64] | None, default None
+        How often on end each measurement was before the first sample, (m,); after the last one on
+        return. None: never.
 
-    Raises:
-        ValueError: shapes do not fit each other.
+    Raises
+    ------
+    ValueError
+        Shapes do not fit each other.
 
-    Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive, a measurement
-    after the other (Bierman 1977).
+    Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances
+    stay symmetric and positive, a measurement after the other (Bierman 1977).
     """
     if measurements.ndim != 2 or len(measurements) == 0:
         raise ValueError(
@@ -72,7 +89,9 @@ def kalman_scan(
 
 
 def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
-    """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names it."""
+    """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names
+    it.
+    """
     if values.shape == shape and values.dtype == np.float64:
         return np.ascontiguousarray(values)
     try:
@@ -99,7 +118,8 @@ def _scan(  # type: ignore[no-untyped-def]
     patience,
     refused,
 ):
-    """Write states and innovations; returns the sample at which an innovation has no positive variance, or -1.
+    """Write states and innovations; return the sample at which an innovation variance is not
+    positive, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
@@ -107,9 +127,9 @@ def _scan(  # type: ignore[no-untyped-def]
     (post_mean, post_cov) = filtered
     (steps, m) = y.shape
     n = A.shape[1]
-    known = np.empty(m, np.bool_)
+    is_measured = np.empty(m, np.bool_)
     of_states = np.empty((m, n))
-    left = np.empty((n, n))
+    product = np.empty((n, n))
     gain = np.empty(n)
     for k in range(steps):
         x = prior_mean[k]
@@ -120,14 +140,16 @@ def _scan(  # type: ignore[no-untyped-def]
             for j in range(n):
                 if k > 0:
                     total += A[k - 1, i, j] * post_mean[k - 1, j]
-                    left[i, j] = _row_times(A[k - 1], i, post_cov[k - 1], j)
+                    product[i, j] = _row_times(A[k - 1], i, post_cov[k - 1], j)
             x[i] = total
             if math.isnan(total):
                 return k
         for i in range(n):
             for j in range(n):
                 P[i, j] = (
-                    start[1][i, j] if k == 0 else Q[k - 1, i, j] + _row_times(left, i, A[k - 1], j)
+                    start[1][i, j]
+                    if k == 0
+                    else Q[k - 1, i, j] + _row_times(product, i, A[k - 1], j)
                 )
         if k > 0:
             make_symmetric(P)
@@ -138,18 +160,18 @@ def _scan(  # type: ignore[no-untyped-def]
                 of_states[i, j] = _row_times(C[k], i, P, j)
                 error -= C[k, i, j] * x[j]
                 variance += of_states[i, j] * C[k, i, j]
-            known[i] = not math.isnan(y[k, i])
+            is_measured[i] = not math.isnan(y[k, i])
             if (
                 limit < math.inf
-                and known[i]
+                and is_measured[i]
                 and refuses(error, variance, limit, patience, refused, i)
             ):
                 y[k, i] = math.nan
-                known[i] = False
-            innovation[k, i], S[i, i] = (error, variance) if known[i] else (0.0, 1.0)
+                is_measured[i] = False
+            innovation[k, i], S[i, i] = (error, variance) if is_measured[i] else (0.0, 1.0)
             for j in range(i):
                 S[i, j] = S[j, i] = (
-                    _row_times(of_states, i, C[k], j) if known[i] and known[j] else 0.0
+                    _row_times(of_states, i, C[k], j) if is_measured[i] and is_measured[j] else 0.0
                 )
         mean = post_mean[k]
         cov = post_cov[k]
@@ -157,10 +179,10 @@ def _scan(  # type: ignore[no-untyped-def]
             mean[i] = x[i]
             for j in range(n):
                 cov[i, j] = P[i, j]
-        for c in range(
-            m - 1, -1, -1
-        ):  # one after the other, since their noise is independent; the yaw rate before ay keeps more digits
-            if not known[c]:
+        # One measurement after the other, since their noise is independent. The yaw rate before ay keeps
+        # more digits.
+        for c in range(m - 1, -1, -1):
+            if not is_measured[c]:
                 continue
             error = y[k, c] - d[k, c]
             variance = R[k, c]
@@ -172,14 +194,14 @@ def _scan(  # type: ignore[no-untyped-def]
                 return k
             for i in range(n):
                 for j in range(n):
-                    left[i, j] = cov[i, j] - gain[i] * gain[j] / variance
+                    product[i, j] = cov[i, j] - gain[i] * gain[j] / variance
             for i in range(n):
                 gain[i] /= variance
                 mean[i] += gain[i] * error
             for i in range(n):
-                seen = _row_times(left, i, C[k], c)
+                cross_covariance = _row_times(product, i, C[k], c)
                 for j in range(n):
-                    cov[i, j] = left[i, j] + (R[k, c] * gain[i] - seen) * gain[j]
+                    cov[i, j] = product[i, j] + (R[k, c] * gain[i] - cross_covariance) * gain[j]
             make_symmetric(cov)
     return -1
 

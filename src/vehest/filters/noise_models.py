@@ -1,4 +1,6 @@
-"""Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled for use; a floor for their entropy."""
+"""Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled
+for use; a floor for their entropy.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +15,23 @@ from torch import Tensor, nn
 from vehest.filters.unscented_scan import CompiledNoise
 
 FLOOR = 1e-7
-"""Added to the diagonal, so that a covariance stays positive definite (Węgrzynowski et al. 2024, Eq. 7)."""
+"""Added to the diagonal, so that a covariance stays positive definite (Węgrzynowski et al. 2024,
+Eq. 7).
+"""
 SCALE = 0.01  # weight of the part that depends on the state; as in the authors' code, like the next
 DEVIATION = 1e-3  # of the random weights of L to begin with; its offsets start at 0
 
 
 class ConstantNoise(nn.Module):
-    """A full covariance L Lᵀ + `FLOOR` · I with a lower triangular factor that is learnt, row by row in units that `begin` may set.
+    """A full covariance L Lᵀ + `FLOOR` · I with a lower triangular factor that is learnt, row by
+    row in units that `begin` may set.
 
-    Args:
-        variances: its diagonal to begin with, n of them.
-        correlated: whether entries off the diagonal are learnt; otherwise they stay zero.
+    Parameters
+    ----------
+    variances : Sequence[float]
+        Its diagonal to begin with, n of them.
+    correlated : bool, default True
+        Whether entries off the diagonal are learnt; otherwise they stay zero.
 
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
@@ -41,7 +49,9 @@ class ConstantNoise(nn.Module):
         self.register_buffer("learnt", (rows == columns) | correlated, persistent=False)
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor | None = None) -> None:
-        """Start from a covariance, (n, n), and learn in units of ``pace`` times its deviations, so that all entries learn alike."""
+        """Start from a covariance, (n, n), and learn in units of ``pace`` times its deviations, so
+        that all entries learn alike.
+        """
         with torch.no_grad():
             if not self.learnt.all():
                 covariance = covariance.diagonal().diag()
@@ -57,14 +67,20 @@ class ConstantNoise(nn.Module):
 
 
 class StateDependentNoise(nn.Module):
-    """A constant covariance and a part of which the factor is linear in the state: Q + `SCALE` · L(x) L(x)ᵀ.
+    """A constant covariance and a part of which the factor is linear in the state: Q + `SCALE` ·
+    L(x) L(x)ᵀ.
 
-    Args:
-        variances: diagonal of the constant part to begin with, n of them.
-        n_states: length k of the state.
-        correlated: whether both parts have entries off their diagonals.
+    Parameters
+    ----------
+    variances : Sequence[float]
+        Diagonal of the constant part to begin with, n of them.
+    n_states : int
+        Length k of the state.
+    correlated : bool, default True
+        Whether both parts have entries off their diagonals.
 
-    Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors' code.
+    Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors'
+    code.
     """
 
     unit: Tensor
@@ -109,9 +125,11 @@ def entropy(covariance: Tensor) -> Tensor:
     return 0.5 * (n * math.log(2.0 * math.pi * math.e) + torch.linalg.slogdet(covariance).logabsdet)
 
 
-def with_entropy(covariance: Tensor, least: float) -> Tensor:
-    """The covariance, scaled up where its entropy lies below ``least`` [nat]; the shape of its ellipsoid stays."""
-    short = (least - entropy(covariance)).clamp(min=0.0)
+def with_entropy(covariance: Tensor, min_entropy: float) -> Tensor:
+    """The covariance, scaled up where its entropy lies below ``min_entropy`` [nat]; the shape of
+    its ellipsoid stays.
+    """
+    short = (min_entropy - entropy(covariance)).clamp(min=0.0)
     return torch.exp(2.0 / covariance.shape[-1] * short)[..., None, None] * covariance
 
 
@@ -128,12 +146,16 @@ def _lower(n: int) -> tuple[Tensor, Tensor]:
     return rows, columns
 
 
-def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf) -> CompiledNoise:
-    """What `StateDependentNoise` and `with_entropy` return, as a function of arrays of the noise's precision.
+def compiled_noise(noise: StateDependentNoise, min_entropy: float = -math.inf) -> CompiledNoise:
+    """What `StateDependentNoise` and `with_entropy` return, as a function of arrays of the noise's
+    precision.
 
-    Args:
-        noise: as it is now; later changes of its parameters are not seen.
-        least_entropy: see `with_entropy` [nat]; none: entropy as it is.
+    Parameters
+    ----------
+    noise : StateDependentNoise
+        As it is now; later changes of its parameters are not seen.
+    min_entropy : float, default -math.inf
+        See `with_entropy` [nat]; none: entropy as it is.
     """
     unit = noise.unit[_lower(noise.constant.n)[0]]
     parts = (
@@ -144,13 +166,14 @@ def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf)
     constant, weight, offset = (part.detach().contiguous().numpy() for part in parts)
     scalar = constant.dtype.type
     return CompiledNoise(
-        _covariances, (constant, weight, offset, scalar(SCALE), scalar(least_entropy))
+        _covariances, (constant, weight, offset, scalar(SCALE), scalar(min_entropy))
     )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyped-def]
-    constant, weight, offset, scale, least = car
+    """Write Q + s L(x) L(x)ᵀ, scaled to at least ``min_entropy``, at states (k, B): (n, n, B)."""
+    constant, weight, offset, scale, min_entropy = car
     n = constant.shape[0]
     lower = np.zeros_like(constant)
     factor = np.zeros_like(constant)
@@ -170,7 +193,7 @@ def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyp
                     total += lower[i, k] * lower[j, k]
                 out[i, j, b] = constant[i, j] + scale * total
                 out[j, i, b] = out[i, j, b]
-        if least > -np.inf:
+        if min_entropy > -np.inf:
             log_determinant = constant[0, 0] * 0
             for j in range(n):
                 total = out[j, j, b]
@@ -183,6 +206,6 @@ def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyp
                     for k in range(j):
                         total -= factor[i, k] * factor[j, k]
                     factor[i, j] = total / factor[j, j]
-            short = least - 0.5 * (n * math.log(2 * math.pi * math.e) + log_determinant)
+            short = min_entropy - 0.5 * (n * math.log(2 * math.pi * math.e) + log_determinant)
             if short > 0:
                 out[:, :, b] *= math.exp(2 * short / n)

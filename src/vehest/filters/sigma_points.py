@@ -12,14 +12,16 @@ class SigmaRule(NamedTuple):
     spread: float  # distance in columns of the factor, positive
     centre_mean: float  # weight of the mean point in means
     centre_covariance: float  # its weight in covariances
-    other: float  # weight of each of the 2n other points, in both
+    outer_weight: float  # weight of each of the 2n other points, in both
 
 
 def symmetric_rule(n: int, kappa: float) -> SigmaRule:
-    """The rule of Julier & Uhlmann 1997; n + κ = 3 meets the fourth moments of a normal distribution.
+    """The rule of Julier & Uhlmann 1997; n + κ = 3 meets the fourth moments of a normal
+    distribution.
 
-    n + κ is positive. With κ < 0 the mean has a negative weight, and covariances may lose their definiteness; κ = 0 is the cubature rule of
-    Arasaratnam & Haykin 2009, with no point at the mean.
+    n + κ is positive. With κ < 0 the mean has a negative weight, and covariances may lose their
+    definiteness; κ = 0 is the cubature rule of Arasaratnam & Haykin 2009, with no point at the
+    mean.
     """
     total = n + kappa
     return SigmaRule(math.sqrt(total), kappa / total, kappa / total, 0.5 / total)

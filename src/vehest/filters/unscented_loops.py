@@ -1,7 +1,13 @@
-"""The loop over samples of the unscented filter and that of its adjoint, compiled for compiled models; uncompiled they run with any model.
+"""The loop over samples of the unscented filter and the loop of its adjoint.
 
-Arrays by time lie (T, ..., B), followed by room for a vector (`room`); a loop works on the sequences from ``first`` to ``end``, so that
-several may run side by side. It calls models and steps by their addresses, so that it compiles once, and in a second.
+    measurements, inputs, noise --forward--> `Tape` of all samples --backward--> gradients
+
+Both loops compile where the model is compiled; with any other model they run uncompiled. They call
+models and steps (`unscented_steps`) by address, so that they compile once, in a second, for all
+models.
+
+Arrays over time are (T, ..., B), followed by room for one vector (`room`). A loop works on the
+sequences from ``first`` to ``end``, so that several loops may run in parallel.
 """
 
 from __future__ import annotations
@@ -29,7 +35,11 @@ from vehest.filters.unscented_steps import (
 
 
 class Setting(NamedTuple):
-    """What a filter does the same at every sample; ``rules`` as in `unscented_steps`, ``limit`` is a gate's deviations²."""
+    """Settings that are the same at every sample.
+
+    ``rules`` are those of `unscented_steps`; ``limit`` is the squared deviations of a `Gate`,
+    ``patience`` its number of samples.
+    """
 
     rules: tuple[Any, Any, Any, bool]
     gated: bool
@@ -38,7 +48,11 @@ class Setting(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What the steps leave behind, sample by sample, (T, ..., B)."""
+    """Values of all samples that the adjoint and the caller need, (T, ..., B).
+
+    ``moved`` are sigma points after the transition, ``expected`` measurements at them, ``centre``
+    the weight of the mean point in covariances, ``repaired`` and ``is_gated_out`` flags.
+    """
 
     prior_mean: Any
     prior_covariance: Any
@@ -47,11 +61,11 @@ class Tape(NamedTuple):
     moved: Any
     expected: Any
     innovation: Any
-    own: Any
+    innovation_covariance: Any
     gain: Any
     centre: Any
     repaired: Any
-    gone: Any
+    is_gated_out: Any
 
 
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
@@ -69,26 +83,32 @@ def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
         (n, m),
         (),
     ]
-    made = [room((steps, *shape, sequences), dtype) for shape in shapes]
+    arrays = [room((steps, *shape, sequences), dtype) for shape in shapes]
     return Tape(
-        *made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_)
+        *arrays, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_)
     )  # type: ignore[call-arg]
 
 
 def forward_scratch(tape: Tape) -> tuple[Any, ...]:
-    """What `forward` works with: each call has its own, so that no two threads write to one line of a cache at every step."""
+    """Scratch memory of one call of `forward`.
+
+    Each call has its own, so that no two threads write to one cache line at every step.
+    """
     points = tape.moved[0]
     covariance = tape.prior_covariance[0]
-    spread = tape.own[0]
+    innovation_covariance = tape.innovation_covariance[0]
     lost = np.empty(points.shape[-1:], np.bool_)
-    *drawn, made, made_spread = (
-        room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread)
+    *drawn, process_noise_scratch, observation_noise_scratch = (
+        room(part.shape, part.dtype) for part in (points, *[covariance] * 3, innovation_covariance)
     )
-    return tuple(drawn), lost, made, made_spread
+    return tuple(drawn), lost, process_noise_scratch, observation_noise_scratch
 
 
 def backward_scratch(tape: Tape) -> tuple[Any, ...]:
-    """What `backward` works with, likewise; the last two become the gradients of the initial mean and covariance."""
+    """Scratch memory of one call of `backward`.
+
+    The last two arrays become the gradients of the initial mean and covariance.
+    """
     points = tape.moved[0]
     expected = tape.expected[0]
     mean = tape.post_mean[0]
@@ -108,12 +128,15 @@ def backward_scratch(tape: Tape) -> tuple[Any, ...]:
             *states,
         )
     ]
-    made = [room(shape, points.dtype) for shape in shapes]
-    return tuple(made[:3]), np.empty(points.shape[-1:], np.bool_), *made[3:]
+    arrays = [room(shape, points.dtype) for shape in shapes]
+    return tuple(arrays[:3]), np.empty(points.shape[-1:], np.bool_), *arrays[3:]
 
 
 def by_address(function: Any, *arguments: Any) -> CompileResultWAP:
-    """A compiled function for arguments of these types, as a loop takes it: the loop calls it where it is, and compiles no copy of it."""
+    """A compiled function for arguments of these types, to be called by address.
+
+    A loop that receives it compiles no copy of it.
+    """
     return _of_types(function, tuple(typeof(argument) for argument in arguments))
 
 
@@ -128,7 +151,9 @@ Forward = namedtuple(
     "Forward",
     ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"),
 )
-"""What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given; numba warns of a plain tuple of these."""
+"""What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given;
+numba warns of a plain tuple of these.
+"""
 Backward = namedtuple(
     "Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car")
 )
@@ -137,7 +162,9 @@ Backward = namedtuple(
 
 @cache
 def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultWAP, ...]:
-    """The steps of a loop, `FORWARD` or `BACKWARD`, for arrays of a precision, as it takes them where it is compiled."""
+    """The steps of a loop, `FORWARD` or `BACKWARD`, for arrays of a precision, as it takes them
+    where it is compiled.
+    """
     return tuple(_of_types(step, types_of(step, dtype)) for step in steps)
 
 
@@ -159,14 +186,15 @@ def forward(  # type: ignore[no-untyped-def]
     first,
     end,
 ):
-    """Halves of steps: half 2k moves the states to sample k of the tape, half 2k + 1 takes in the measurement there.
+    """Run half-steps: 2k predicts the states of sample k, 2k + 1 updates them with its measurement.
 
-    ``noise`` is that of the process and that of measurements, (T, k, k, B), or where there is a function ``at…``, what that writes:
-    ``at(states, inputs, car, out, first, end)``. What a gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
+    ``noise`` = (process, measurement) covariances, (T, k, k, B) each. Where there is a function
+    ``at_state`` or ``at_prior``, covariances are what it writes: ``at(states, inputs, car, out,
+    first, end)``. What the gate refuses becomes NaN in ``y`` and is counted in ``refused``, (B, m).
     """
     car = calls.car
     rules = setting.rules
-    (drawn, lost, made_process, made_spread) = scratch
+    (drawn, lost, process_noise_scratch, observation_noise_scratch) = scratch
     for half in range(halves[0], halves[1]):
         k = half // 2
         if half % 2 == 0:
@@ -179,8 +207,8 @@ def forward(  # type: ignore[no-untyped-def]
             if at_state is None:
                 added = noise[0][k - 1]
             else:
-                at_state(mean, inputs, car_at, made_process, first, end)
-                added = made_process
+                at_state(mean, inputs, car_at, process_noise_scratch, first, end)
+                added = process_noise_scratch
             calls.moments_of(
                 tape.moved[k],
                 added,
@@ -202,8 +230,8 @@ def forward(  # type: ignore[no-untyped-def]
             if at_prior is None:
                 added = noise[1][k]
             else:
-                at_prior(mean, inputs, car_of, made_spread, first, end)
-                added = made_spread
+                at_prior(mean, inputs, car_of, observation_noise_scratch, first, end)
+                added = observation_noise_scratch
             if setting.gated:
                 calls.gate_of(
                     expected,
@@ -213,14 +241,29 @@ def forward(  # type: ignore[no-untyped-def]
                     setting.patience,
                     y[k],
                     refused,
-                    tape.gone[k],
+                    tape.is_gated_out[k],
                     first,
                     end,
                 )
             post = tape.post_mean[k], tape.post_covariance[k]
-            kept = tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]
+            update_results = (
+                tape.innovation[k],
+                tape.innovation_covariance[k],
+                tape.gain[k],
+                tape.centre[k],
+            )
             calls.update_of(
-                mean, drawn, expected, y[k], added, rules, post, kept, repaired, first, end
+                mean,
+                drawn,
+                expected,
+                y[k],
+                added,
+                rules,
+                post,
+                update_results,
+                repaired,
+                first,
+                end,
             )
 
 
@@ -228,10 +271,15 @@ def forward(  # type: ignore[no-untyped-def]
 def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):  # type: ignore[no-untyped-def]
     """The adjoint of `forward` over all samples.
 
-    Args:
-        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
-        scratch: see `backward_scratch`.
-        gradients: those of the model's parameters are added.
+    Parameters
+    ----------
+    bars
+        Gradients of process noise, observation noise and measurements, which are written, and of
+        filtered means and covariances.
+    scratch
+        See `backward_scratch`.
+    gradients
+        Those of the model's parameters are added.
     """
     process_bar, spread_bar, y_bar, mean_up, covariance_up = bars
     (
@@ -256,7 +304,12 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
         mean = tape.prior_mean[k]
-        kept = (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k])
+        update_results = (
+            tape.innovation[k],
+            tape.innovation_covariance[k],
+            tape.gain[k],
+            tape.centre[k],
+        )
         calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
         post_bars = (post_mean_bar, post_covariance_bar)
         prior_bars = (mean_bar, covariance_bar)
@@ -267,7 +320,7 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
             tape.expected[k],
             y[k],
             rules,
-            kept,
+            update_results,
             post_bars,
             prior_bars,
             other_bars,

@@ -1,7 +1,18 @@
-"""The unscented Kalman filter with additive noise over long sequences, by compiled steps and their adjoints.
+"""The unscented Kalman filter with additive noise over long sequences, by compiled steps and their
+adjoints.
 
-A model says how its points move and what is expected at them, and the adjoints of both; everything else is here. Of each step only states
-and what became of the points are kept, so that long sequences need little memory.
+    x[k+1] = f(x[k], u[k]) + w[k],  w ~ N(0, Q)
+    y[k]   = h(x[k], u[k]) + v[k],  v ~ N(0, R)
+
+Flow: `unscented_scan` receives tensors (B, T, ...), copies them to (T, ..., B), runs the loop
+`forward` of `unscented_loops`, which fills a `Tape`, and returns the tape's values by sequence. Its
+gradient runs the loop `backward` over the same tape. `UnscentedStepper` runs the same loop for one
+sample at a time.
+
+A `PointModel` provides f, h and their adjoints. The tape contains states and moved points only, so
+that long sequences need little memory.
+
+Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1.
 """
 
 from __future__ import annotations
@@ -57,13 +68,15 @@ class NonlinearFiltered(NamedTuple):
 
 
 class PointModel:
-    """How sigma points move and what is expected at them, with adjoints; arrays of one precision, float32 or float64.
+    """How sigma points move and what is expected at them, with adjoints; arrays of one precision,
+    float32 or float64.
 
-    Entries are transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with (points,
-    inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by side in points
-    (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from
-    ``first`` to ``end``. Where gradients are wanted, inputs have ``kept`` rows a point more, in which entries may leave numbers for their
-    adjoints.
+    Entries are transition and observation, called with (points, inputs, car, out, first, end), and
+    their adjoints, called with (points, inputs, car, upstream, out, gradients, first, end), which
+    add to the gradients of parameters. Sequences lie side by side in points (S, n, B), inputs (p,
+    B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is
+    written from ``first`` to ``end``. Where gradients are computed, inputs have ``scratch_rows``
+    more rows for each point, in which entries may store numbers for their adjoints.
     """
 
     entries: Sequence[Any]
@@ -71,7 +84,7 @@ class PointModel:
     is_compiled = (
         False  # whether the entries are, so that the loop over samples runs without Python
     )
-    kept = 0
+    scratch_rows = 0
     parameters: Sequence[Tensor] = ()  # what gradients are wanted for
     lower: Sequence[float] | None = (
         None  # smallest possible value of each state, (n,); none: everything is possible
@@ -89,11 +102,16 @@ class PointModel:
 class TorchModel(PointModel):
     """A model written in torch, whose adjoints are those of automatic differentiation.
 
-    Args:
-        transition: f of points (..., n) and inputs (..., p).
-        observation: h of the same, (..., m).
-        parameters: leaves that both may use and gradients are wanted for.
-        lower: see `PointModel`.
+    Parameters
+    ----------
+    transition : Function
+        f of points (..., n) and inputs (..., p).
+    observation : Function
+        h of the same, (..., m).
+    parameters : Sequence[Tensor], default ()
+        Leaves that both may use and gradients are wanted for.
+    lower : Sequence[float] | None, default None
+        See `PointModel`.
     """
 
     def __init__(
@@ -106,8 +124,8 @@ class TorchModel(PointModel):
         self.parameters = [parameter for parameter in parameters if parameter.requires_grad]
         self.lower = lower
         self.entries = [
-            partial(how, function)
-            for how in (self._value, self._adjoint)
+            partial(method, function)
+            for method in (self._value, self._adjoint)
             for function in (transition, observation)
         ]
 
@@ -131,23 +149,23 @@ class TorchModel(PointModel):
         *ends: int,
     ) -> None:
         with torch.enable_grad():
-            state, held = _of_torch(points, inputs, *ends)
-            upstream = torch.from_numpy(_apart(up, *ends))
-            own = torch.autograd.grad(
-                function(state.requires_grad_(), held),
+            state, input_tensor = _of_torch(points, inputs, *ends)
+            upstream = torch.from_numpy(_sequences_first(up, *ends))
+            leaf_gradients = torch.autograd.grad(
+                function(state.requires_grad_(), input_tensor),
                 [state, *self.parameters],
                 upstream,
                 allow_unused=True,
                 materialize_grads=True,
             )
-        for gradient, part in zip(gradients, own[1:], strict=True):
+        for gradient, part in zip(gradients, leaf_gradients[1:], strict=True):
             gradient += part.numpy()
-        out[..., slice(*ends)] = own[0].movedim(0, -1).numpy()
+        out[..., slice(*ends)] = leaf_gradients[0].movedim(0, -1).numpy()
 
 
 def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tensor, Tensor]:
-    return torch.from_numpy(_apart(points, first, end)), torch.from_numpy(
-        _apart(inputs, first, end)
+    return torch.from_numpy(_sequences_first(points, first, end)), torch.from_numpy(
+        _sequences_first(inputs, first, end)
     ).unsqueeze(-2)
 
 
@@ -155,7 +173,8 @@ def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tenso
 class CompiledNoise:
     """Covariances of noise at estimated states."""
 
-    # called with (states (n, B), inputs (p, B), car, out, first, end), compiled where the model is; writes covariances (k, k, B)
+    # called with (states (n, B), inputs (p, B), car, out, first, end), compiled where the model is;
+    # writes covariances (k, k, B)
     entry: Any
     car: tuple[Any, ...]  # what else it is given
 
@@ -190,27 +209,46 @@ def unscented_scan(
     share: Share | None = None,
     gate: Gate | None = None,
 ) -> NonlinearFiltered:
-    """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
+    """Filter sequences; filtered means and covariances are differentiable in every tensor but the
+    inputs, the rest is not.
 
-    Sigma points are drawn again before each update. Where a negative weight of the mean point is what takes the definiteness of an update,
-    the update goes without it; every other covariance that is not positive definite is lifted.
+    Sigma points are drawn again before each update. Where a negative weight of the mean point is
+    what takes the definiteness of an update, the update goes without it; every other covariance
+    that is not positive definite is lifted.
 
-    Args:
-        model: how points move.
-        measurements: y, (B, T, m); what is NaN was not measured.
-        inputs: u, (B, T, p).
-        initial: state at the first sample before its measurement, mean (n,) or (B, n).
-        process_noise: Q of each step, (B, T, n, n) or what broadcasts to it; or at the estimated state, without gradients.
-        observation_noise: R of each sample, (B, T, m, m) or what broadcasts to it; or at the predicted state, without gradients.
-        rule: which sigma points.
-        repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
-        share: how sequences are shared out over threads; none: one thread.
-        gate: which measurements are refused; none: all are taken. The decision itself has no gradient.
+    Parameters
+    ----------
+    model : PointModel
+        How points move.
+    measurements : Tensor
+        y, (B, T, m); what is NaN was not measured.
+    inputs : Tensor
+        u, (B, T, p).
+    initial : Gaussian[Tensor]
+        State at the first sample before its measurement, mean (n,) or (B, n).
+    process_noise : Tensor | CompiledNoise
+        Q of each step, (B, T, n, n) or what broadcasts to it; or at the estimated state, without
+        gradients.
+    observation_noise : Tensor | CompiledNoise
+        R of each sample, (B, T, m, m) or what broadcasts to it; or at the predicted state, without
+        gradients.
+    rule : SigmaRule
+        Which sigma points.
+    repair : bool, default True
+        Whether covariances that are not positive definite are repaired; otherwise the sequence
+        becomes NaN.
+    share : Share | None, default None
+        How sequences are shared out over threads; none: one thread.
+    gate : Gate | None, default None
+        Which measurements are refused; none: all are taken. The decision itself has no gradient.
 
-    Raises:
-        ValueError: shapes do not fit each other.
+    Raises
+    ------
+    ValueError
+        Shapes do not fit each other.
 
-    Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky factor: Murray 2016, arXiv 1602.07527.
+    Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky
+    factor: Murray 2016, arXiv 1602.07527.
     """
     if measurements.dim() != 3 or not measurements.shape[1]:
         raise ValueError(
@@ -253,14 +291,21 @@ def unscented_scan(
         *tensors,
         *model.parameters,
     )
-    outside = (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)
-    prior_mean, prior_covariance, innovation, own = (_by_sequence(values) for values in outside)
-    measured = ~(torch.isnan(measurements) | _by_sequence(tape.gone))
+    predictions = (
+        tape.prior_mean,
+        tape.prior_covariance,
+        tape.innovation,
+        tape.innovation_covariance,
+    )
+    prior_mean, prior_covariance, innovation, innovation_covariance = (
+        _by_sequence(values) for values in predictions
+    )
+    measured = ~(torch.isnan(measurements) | _by_sequence(tape.is_gated_out))
     filtered = Filtered(
         Gaussian(prior_mean, prior_covariance),
         Gaussian(post_mean, post_covariance),
         innovation,
-        own,
+        innovation_covariance,
         measured,
     )
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
@@ -269,17 +314,28 @@ def unscented_scan(
 class UnscentedStepper:
     """The same filter of one sequence, one sample at a time.
 
-    Args:
-        model: how points move.
-        mean, covariance: of the state at the first sample before its measurement, (n,) and (n, n), of the model's precision.
-        measurements: how many there are, m.
-        rule: which sigma points.
-        repair, gate: see `unscented_scan`.
+    Parameters
+    ----------
+    model : PointModel
+        How points move.
+    mean, covariance : Array
+        Of the state at the first sample before its measurement, (n,) and (n, n), of the model's
+        precision.
+    measurements : int
+        How many there are, m.
+    rule : SigmaRule
+        Which sigma points.
+    repair, gate
+        See `unscented_scan`.
 
-    Attributes:
-        prior: the state before its measurement, mean (n,).
-        state: the same after it; both are valid until the next step and may be changed.
-        innovation, innovation_covariance, gain: of the last update, (m,), (m, m) and (n, m).
+    Attributes
+    ----------
+    prior
+        The state before its measurement, mean (n,).
+    state
+        The same after it; both are valid until the next step and may be changed.
+    innovation, innovation_covariance, gain
+        Of the last update, (m,), (m, m) and (n, m).
     """
 
     def __init__(
@@ -307,7 +363,7 @@ class UnscentedStepper:
         self._runs: dict[CompiledNoise | None, Callable[..., None]] = {}
         self._scratch = forward_scratch(tape)
         self.innovation = tape.innovation[0, :, 0]
-        self.innovation_covariance = tape.own[0, :, :, 0]
+        self.innovation_covariance = tape.innovation_covariance[0, :, :, 0]
         self.gain = tape.gain[0, :, :, 0]
 
     def step(
@@ -319,11 +375,16 @@ class UnscentedStepper:
     ) -> Array:
         """The filtered mean, (n,), valid until the next step.
 
-        Args:
-            measurement: (m,); what is NaN was not measured.
-            inputs: (p,); they act from this sample to the next.
-            process_noise: Q of the step that led here, (1, n, n), or at the state before.
-            observation_noise: R, (1, m, m), or at the predicted state.
+        Parameters
+        ----------
+        measurement : Array
+            (m,); what is NaN was not measured.
+        inputs : Array
+            (p,); they act from this sample to the next.
+        process_noise : StepNoise
+            Q of the step that led here, (1, n, n), or at the state before.
+        observation_noise : StepNoise
+            R, (1, m, m), or at the predicted state.
         """
         if self._inputs is not None:
             self.predict(self._inputs, process_noise)
@@ -340,12 +401,14 @@ class UnscentedStepper:
         self._run(1, measurement, inputs, observation_noise)
 
     def _run(self, half: int, measurement: Array, inputs: Array, noise: StepNoise) -> None:
-        given, at = (
+        noise_covariance, at = (
             (noise[0], None)
             if isinstance(noise, np.ndarray)
             else (self.innovation_covariance, noise)
         )
-        y, u, given = (_alone_by_time(part) for part in (measurement, inputs, given))
+        y, u, noise_covariance = (
+            _alone_by_time(part) for part in (measurement, inputs, noise_covariance)
+        )
         if at not in self._runs:
             self._runs[at] = _forward_by(self._model, (at, at))
         with self._model.working():
@@ -354,7 +417,7 @@ class UnscentedStepper:
                 self._tape,
                 y,
                 u,
-                (given, given),
+                (noise_covariance, noise_covariance),
                 self._refused,
                 self._scratch,
                 (half, half + 1),
@@ -364,7 +427,9 @@ class UnscentedStepper:
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
-    """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's parameters alone."""
+    """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's
+    parameters alone.
+    """
     after: Tensor = _Moved.apply(model, states, inputs, *model.parameters)  # type: ignore[no-untyped-call]
     return after
 
@@ -374,26 +439,26 @@ class _Moved(torch.autograd.Function):
     def forward(
         ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
     ) -> Tensor:
-        points, held = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
-        ctx.kept = (model, points, held[0])
+        points, inputs_by_time = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
+        ctx.forward_values = (model, points, inputs_by_time[0])
         out = room(points.shape, points.dtype)
         with model.working():
-            model.entries[0](*ctx.kept[1:], model.car, out, 0, len(states))
-        return torch.from_numpy(_apart(out[0]))
+            model.entries[0](*ctx.forward_values[1:], model.car, out, 0, len(states))
+        return torch.from_numpy(_sequences_first(out[0]))
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        model, points, inputs = ctx.kept
+        model, points, inputs = ctx.forward_values
         gradients = [
             np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters
         ]
         with model.working():
-            given = (
+            adjoint_arguments = (
                 _by_time(upstream[0].unsqueeze(1)),
                 room(points.shape, points.dtype),
                 model.learnt(gradients),
             )
-            model.entries[2](points, inputs, model.car, *given, 0, points.shape[-1])
+            model.entries[2](points, inputs, model.car, *adjoint_arguments, 0, points.shape[-1])
         return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
 
 
@@ -415,33 +480,44 @@ class _Scan(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         ctx.set_materialize_grads(False)
-        kept = model.kept * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
+        scratch_rows = model.scratch_rows * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
         y = _by_time(measurements)
-        u = _by_time(inputs, kept)
+        u = _by_time(inputs, scratch_rows)
         noises = (_by_time(process), _by_time(observation))
-        tape.prior_mean[0] = _beside(mean.detach().numpy())
-        tape.prior_covariance[0] = _beside(covariance.detach().numpy())
+        tape.prior_mean[0] = _sequences_last(mean.detach().numpy())
+        tape.prior_covariance[0] = _sequences_last(covariance.detach().numpy())
         refused = np.zeros(measurements.shape[::2], np.int64)
         halves = (1, 2 * len(y))
         run = _forward_by(model, functions, (tape, u[0]))
         with model.working():
             share(
-                lambda *own: run(
-                    setting, tape, y, u, noises, refused, forward_scratch(tape), halves, *own
+                lambda *sequence_range: run(
+                    setting,
+                    tape,
+                    y,
+                    u,
+                    noises,
+                    refused,
+                    forward_scratch(tape),
+                    halves,
+                    *sequence_range,
                 ),
                 len(measurements),
             )
-        ctx.kept = (model, setting, share, tape, functions, y, u)
+        ctx.forward_values = (model, setting, share, tape, functions, y, u)
         return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        model, setting, share, tape, functions, y, u = ctx.kept
+        model, setting, share, tape, functions, y, u = ctx.forward_values
         if any(function is not None for function in functions):
             raise RuntimeError(
                 "noise that is a function of the estimate has no gradients; give it as a tensor"
             )
-        noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
+        noises = [
+            room(part.shape, part.dtype)
+            for part in (tape.post_covariance, tape.innovation_covariance)
+        ]
         noises[0][-1] = 0  # no step leads on from the last sample
         measured, mean, covariance = (
             np.empty_like(part)
@@ -462,9 +538,9 @@ class _Scan(torch.autograd.Function):
             gradients[first] = [
                 np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters
             ]
-            run, own = _backward_by(model, tape, u, gradients[first])
+            run, parameter_gradients = _backward_by(model, tape, u, gradients[first])
             scratch = backward_scratch(tape)
-            run(setting, tape, y, u, bars, scratch, own, first, end)
+            run(setting, tape, y, u, bars, scratch, parameter_gradients, first, end)
             mean[:, first:end], covariance[:, :, first:end] = (
                 part[..., first:end] for part in scratch[-2:]
             )
@@ -476,7 +552,7 @@ class _Scan(torch.autograd.Function):
             for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)
         ]
         y_bar, *noise_bars = (_by_sequence(part) for part in (measured, *noises))
-        first_bars = (torch.from_numpy(_apart(part)) for part in (mean, covariance))
+        first_bars = (torch.from_numpy(_sequences_first(part)) for part in (mean, covariance))
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
@@ -485,7 +561,9 @@ def _forward_by(
     functions: Sequence[CompiledNoise | None],
     like: tuple[Tape, Array] | None = None,
 ) -> Any:
-    """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs, (p, B), where both are compiled."""
+    """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs,
+    (p, B), where both are compiled.
+    """
     entries = [*model.entries[:2]]
     at_states = [at and at.entry for at in functions]
     loop = getattr(forward, "py_func", forward)
@@ -515,24 +593,24 @@ def _backward_by(
     model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]
 ) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
-    own = model.learnt(gradients)
+    parameter_gradients = model.learnt(gradients)
     if not model.is_compiled or config.DISABLE_JIT:
         return partial(
             getattr(backward, "py_func", backward),
             Backward._make((*BACKWARD, *model.entries[2:], model.car)),
-        ), own
+        ), parameter_gradients
     points = tape.moved[0]
     inputs = u[0]
     called = [
-        by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
+        by_address(entry, points, inputs, model.car, upstream, points, parameter_gradients, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
     return partial(
         backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))
-    ), own
+    ), parameter_gradients
 
 
-def _beside(values: Array) -> Array:
+def _sequences_last(values: Array) -> Array:
     """(B, ...) -> (..., B), followed by room for a vector."""
     moved = np.moveaxis(values, 0, -1)
     out: Array = room(moved.shape, values.dtype)
@@ -540,7 +618,7 @@ def _beside(values: Array) -> Array:
     return out
 
 
-def _apart(values: Array, first: int = 0, end: int | None = None) -> Array:
+def _sequences_first(values: Array, first: int = 0, end: int | None = None) -> Array:
     """(..., B) -> (B, ...) of some sequences, together in memory."""
     return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
 
@@ -552,11 +630,11 @@ def _alone_by_time(values: Array) -> Array:
     return out
 
 
-def _by_time(tensor: Tensor, kept: int = 0) -> Array:
-    """(B, T, p, ...) -> (T, p + kept, ..., B), followed by room for a vector."""
+def _by_time(tensor: Tensor, scratch_rows: int = 0) -> Array:
+    """(B, T, p, ...) -> (T, p + scratch_rows, ..., B), followed by room for a vector."""
     moved = tensor.detach().movedim(0, -1)
-    steps, rows, *rest = moved.shape
-    out: Array = room((steps, rows + kept, *rest), moved.numpy().dtype)
+    steps, rows, *sizes = moved.shape
+    out: Array = room((steps, rows + scratch_rows, *sizes), moved.numpy().dtype)
     torch.from_numpy(out)[:, :rows].copy_(moved)
     return out
 

@@ -1,11 +1,33 @@
 """One step of the unscented filter over many sequences, compiled, and its adjoint.
 
-Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A
-step works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that
-arrays are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``)
-gradients unless it says otherwise. ``rules`` are the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`, the smallest
-possible value of each state, the margin of a repair and whether there are repairs; ``drawn`` are sigma points, the factors and the
-covariances that they come from. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
+Flow of one sample k (forward), with the function that computes each arrow:
+
+    x, P of sample k - 1 --points_of--> points --model--> moved --moments_of--> x, P before y[k]
+    x, P before y[k] --points_of--> points --model--> expected --gate_of, update_of--> x, P after y[k]
+
+With sigma points X_s, weights w_s (means) and v_s (covariances), and L Lᵀ = P:
+
+    points_of    X_0 = x,  X_{1+j} = x + γ L_j,  X_{1+n+j} = x - γ L_j
+    moments_of   x = Σ w_s f(X_s),  P = Σ v_s (f(X_s) - x)(f(X_s) - x)ᵀ + Q
+    update_of    ŷ = Σ w_s h(X_s),  S = Σ v_s e_s e_sᵀ + R,  C = Σ v_s d_s e_sᵀ,  K = C S⁻¹,
+                 x⁺ = x + K (y - ŷ),  P⁺ = P - K Cᵀ,  with e_s = h(X_s) - ŷ and d_s = X_s - x
+
+The adjoint of each function is beside it (``_bar``: gradient of the loss with respect to a value).
+It receives the values that its function received and adds to gradients unless it says otherwise.
+
+Layout: sequences are the last dimension, so that one vector instruction works on several of them:
+means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), expected measurements (2n + 1, m,
+B). A function works on the sequences from ``first`` to ``end``, as many at once as a vector of
+`vehest.lanes` has elements. Vectors are read beyond ``end`` and never written there, hence arrays
+are followed by room for one vector (`room`).
+
+Common arguments: ``rules`` = (row [spread γ, centre_mean, centre_covariance, outer_weight] of a
+`SigmaRule`, smallest possible value of each state, margin of a repair, whether covariances are
+repaired); ``drawn`` = (sigma points, Cholesky factors, the covariances that were factored).
+
+Order of sums: over sigma points 1 … 2n in order, then the mean point; over states and measurements
+in order of their index, as for single numbers. Hence a sequence has the same digits whichever
+others are computed beside it.
 """
 
 from __future__ import annotations
@@ -25,18 +47,20 @@ ARGUMENTS: dict[str, Any] = {
     "rules": (1, 1, 0, types.boolean),
     "drawn": (3, 3, 3),
     "post": (2, 3),
-    "kept": (2, 3, 3, 1),
+    "update_results": (2, 3, 3, 1),
     "post_bars": (2, 3),
     "prior_bars": (2, 3),
     "other_bars": (3, 3, 3, 2),
     "repaired": types.boolean[::1],
-    "gone": types.boolean[:, ::1],
+    "is_gated_out": types.boolean[:, ::1],
     "refused": types.int64[:, ::1],
     **dict.fromkeys(("mean", "mean_bar", "y"), 2),
     **dict.fromkeys(("first", "end", "patience"), types.intp),
     "limit": 0,
 }
-"""Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have three dimensions."""
+"""Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have
+three dimensions.
+"""
 piece = numba.njit(
     forceinline=True,
     no_cpython_wrapper=True,
@@ -73,49 +97,57 @@ def at_row(values, row, b):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _own(rows, row):  # type: ignore[no-untyped-def]
-    """Vector of a row of scratch, (R, W)."""
+def _scratch_row(rows, row):  # type: ignore[no-untyped-def]
+    """Vector of one row of scratch memory, (R, W)."""
     return load_unfused(rows, row * rows.shape[1])
 
 
 @piece
-def _put(rows, row, vector):  # type: ignore[no-untyped-def]
+def _set_scratch_row(rows, row, vector):  # type: ignore[no-untyped-def]
+    """Write a vector into one row of scratch memory, (R, W)."""
     store(rows, row * rows.shape[1], vector)
 
 
 @piece
 def _rows(count, like):  # type: ignore[no-untyped-def]
+    """Scratch memory of ``count`` vectors of the type of ``like``, (count, W)."""
     return np.empty((count, width(like)), like.dtype)
 
 
 @piece
 def _read(values, rows, b):  # type: ignore[no-untyped-def]
-    """Sequences from b on to scratch."""
+    """Copy all rows of the sequences from b on into scratch memory."""
     for row in range(rows.shape[0]):
-        _put(rows, row, at_row(values, row, b))
+        _set_scratch_row(rows, row, at_row(values, row, b))
 
 
 @piece
 def _write(rows, out, b, end):  # type: ignore[no-untyped-def]
-    """Scratch to the sequences from b to ``end``, as many as there are."""
+    """Copy scratch memory to the sequences from b to ``end``, at most one vector of them."""
     stride = out.shape[out.ndim - 1]
     for row in range(rows.shape[0]):
-        store_some(out, row * stride + b, _own(rows, row), end - b)
+        store_some(out, row * stride + b, _scratch_row(rows, row), end - b)
 
 
 @piece
-def _any(condition, b, end, scratch):  # type: ignore[no-untyped-def]
-    """Whether a vector is positive for a sequence from b to ``end``; ``scratch`` (1, W) becomes the vector."""
+def _is_any_positive(condition, b, end, scratch):  # type: ignore[no-untyped-def]
+    """Whether a vector is positive for a sequence from b to ``end``; ``scratch`` (1, W) becomes the
+    vector.
+    """
     store(scratch, 0, condition)
-    found = False
+    is_any_positive = False
     for lane in range(min(end - b, scratch.shape[1])):
-        found |= scratch[0, lane] > 0
-    return found
+        is_any_positive |= scratch[0, lane] > 0
+    return is_any_positive
 
 
 @compiled
-def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
-    """Sigma points of ``given`` covariances, factors, and the covariances where what is not positive definite is repaired."""
+def points_of(mean, state_covariance, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
+    """Draw sigma points X_s = x ± γ L_j and write ``drawn``: points, factors L, covariances.
+
+    A covariance that is not positive definite is repaired first (`_repaired`); ``repaired`` (B,)
+    says where.
+    """
     (rule, lower, margin, repair) = rules
     (points, factor, covariance) = drawn
     n = mean.shape[0]
@@ -126,22 +158,24 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
     P = _rows(count * n, mean)
     flags = _rows(1, mean)
     for b in range(first, end, lanes):
-        _read(given, A, b)
+        _read(state_covariance, A, b)
         lost = 1 - _cholesky(A, L, n)
         for lane in range(min(lanes, end - b)):
             repaired[b + lane] = False
-        if _any(lost, b, end, flags):
+        if _is_any_positive(lost, b, end, flags):
             for lane in range(min(lanes, end - b)):
                 if flags[0, lane] > 0:
                     repaired[b + lane] = _repaired(A, L, lane, n, margin, repair)
-        nothing = _own(L, 0) - _own(L, 0)  # NaN where a sequence is lost
+        nothing = _scratch_row(L, 0) - _scratch_row(L, 0)  # NaN where a sequence is lost
         for i in range(n):
             c = at_row(mean, i, b)
-            _put(P, i, choose(nothing == 0, most(c, lower[i]), nothing))
+            _set_scratch_row(P, i, choose(nothing == 0, most(c, lower[i]), nothing))
             for j in range(n):
-                offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
-                _put(P, (1 + j) * n + i, choose(nothing == 0, most(c + offset, lower[i]), nothing))
-                _put(
+                offset = rule[0] * _scratch_row(L, i * n + j) if j <= i else nothing
+                _set_scratch_row(
+                    P, (1 + j) * n + i, choose(nothing == 0, most(c + offset, lower[i]), nothing)
+                )
+                _set_scratch_row(
                     P,
                     (1 + n + j) * n + i,
                     choose(nothing == 0, most(c - offset, lower[i]), nothing),
@@ -153,7 +187,11 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
 
 @compiled
 def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
-    """Adjoint of `points_of`; what a repair added counts as constant."""
+    """Adjoint of `points_of`; what a repair added counts as constant.
+
+    x̄ += Σ X̄_s,  L̄_j = γ (X̄_{1+j} - X̄_{1+n+j}),  P̄ += adjoint of the Cholesky factor
+    (`_cholesky_adjoint`). A state at its lower bound passes no gradient.
+    """
     n = mean.shape[0]
     (rule, lower, _, _) = rules
     L = _rows(n * n, mean)
@@ -164,20 +202,20 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
     for b in range(first, end, width(mean)):
         _read(factor, L, b)
         _read(covariance_bar, A_bar, b)
-        nothing = _own(L, 0) * 0
+        nothing = _scratch_row(L, 0) * 0
         for i in range(n):
             c = at_row(mean, i, b)
             bar = at_row(mean_bar, i, b)
             bar = choose(c >= lower[i], bar + at_row(points_bar, i, b), bar)
             for j in range(n):
-                offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
+                offset = rule[0] * _scratch_row(L, i * n + j) if j <= i else nothing
                 up = choose(c + offset >= lower[i], at_row(points_bar, (1 + j) * n + i, b), nothing)
                 down = choose(
                     c - offset >= lower[i], at_row(points_bar, (1 + n + j) * n + i, b), nothing
                 )
                 bar += up + down
-                _put(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
-            _put(x_bar, i, bar)
+                _set_scratch_row(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
+            _set_scratch_row(x_bar, i, bar)
         _cholesky_adjoint(L, below, inner, A_bar, n)
         _write(x_bar, mean_bar, b, end)
         _write(A_bar, covariance_bar, b, end)
@@ -185,29 +223,37 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
 
 @piece
 def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-def]
-    """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into scratch (S · m, W)."""
+    """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into
+    scratch (S · m, W).
+    """
     count = values.shape[0]
     around = at_row(values, 0, b) * 0
     for s in range(1, count):
         around += at_row(values, s * m + i, b)
     centre = rule[1] * at_row(values, i, b) + rule[3] * around
     for s in range(count):
-        _put(deviation, s * m + i, at_row(values, s * m + i, b) - centre)
+        _set_scratch_row(deviation, s * m + i, at_row(values, s * m + i, b) - centre)
     return centre
 
 
 @piece
-def _weighted(one, i, n, other, j, m, rule, centre):  # type: ignore[no-untyped-def]
-    """Weighted product of deviations, i of (S · n, W) with j of (S · m, W); the mean point has the weight ``centre``."""
-    result = _own(one, 0) * 0
-    for s in range(1, one.shape[0] // n):
-        result += _own(one, s * n + i) * _own(other, s * m + j)
-    return rule[3] * result + centre * _own(one, i) * _own(other, j)
+def _weighted(first_deviation, i, n, second_deviation, j, m, rule, centre):  # type: ignore[no-untyped-def]
+    """Weighted product of deviations, i of (S · n, W) with j of (S · m, W); the mean point has the
+    weight ``centre``.
+    """
+    result = _scratch_row(first_deviation, 0) * 0
+    for s in range(1, first_deviation.shape[0] // n):
+        result += _scratch_row(first_deviation, s * n + i) * _scratch_row(
+            second_deviation, s * m + j
+        )
+    return rule[3] * result + centre * _scratch_row(first_deviation, i) * _scratch_row(
+        second_deviation, j
+    )
 
 
 @compiled
 def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ignore[no-untyped-def]
-    """Weighted mean and covariance of what became of the points, plus noise."""
+    """Weighted mean x = Σ w_s V_s and covariance P = Σ v_s (V_s - x)(V_s - x)ᵀ + (Q + Qᵀ)/2."""
     (count, n) = values.shape[:2]
     (rule, lower, _, _) = rules
     half = rule.dtype.type(0.5)
@@ -216,20 +262,23 @@ def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ign
     A = _rows(n * n, values)
     for b in range(first, end, width(values)):
         for i in range(n):
-            _put(x, i, most(_deviations(values, b, n, rule, deviation, i), lower[i]))
+            _set_scratch_row(x, i, most(_deviations(values, b, n, rule, deviation, i), lower[i]))
         for i in range(n):
             for j in range(i + 1):
                 spread = _weighted(deviation, i, n, deviation, j, n, rule, rule[2])
                 spread += half * (at_row(noise, i * n + j, b) + at_row(noise, j * n + i, b))
-                _put(A, i * n + j, spread)
-                _put(A, j * n + i, spread)
+                _set_scratch_row(A, i * n + j, spread)
+                _set_scratch_row(A, j * n + i, spread)
         _write(x, mean, b, end)
         _write(A, covariance, b, end)
 
 
 @compiled
 def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
-    """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``."""
+    """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``.
+
+    Q̄ = (P̄ + P̄ᵀ)/2,  D̄_s = 2 v_s Q̄ D_s with D_s = V_s - x,  V̄_s = D̄_s + w_s (x̄ - Σ_r D̄_r).
+    """
     (count, n) = values.shape[:2]
     (rule, lower, _, _) = rules
     half = rule.dtype.type(0.5)
@@ -237,14 +286,16 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
     deviation = _rows(count * n, values)
     V_bar = _rows(count * n, values)
     through = _rows(n, values)
-    whole = _rows(n * n, values)
+    symmetric_bar = _rows(n * n, values)
     for b in range(first, end, width(values)):
         for i in range(n):
             centre = _deviations(values, b, n, rule, deviation, i)
-            _put(through, i, choose(centre >= lower[i], at_row(mean_bar, i, b), centre * 0))
+            _set_scratch_row(
+                through, i, choose(centre >= lower[i], at_row(mean_bar, i, b), centre * 0)
+            )
             for j in range(n):
-                _put(
-                    whole,
+                _set_scratch_row(
+                    symmetric_bar,
                     i * n + j,
                     half
                     * (at_row(covariance_bar, i * n + j, b) + at_row(covariance_bar, j * n + i, b)),
@@ -252,45 +303,51 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
         for s in range(count):
             weight = two * (rule[2] if s == 0 else rule[3])
             for i in range(n):
-                bar = _own(through, 0) * 0
+                bar = _scratch_row(through, 0) * 0
                 for j in range(n):
-                    bar += _own(whole, i * n + j) * _own(deviation, s * n + j)
-                _put(V_bar, s * n + i, weight * bar)
+                    bar += _scratch_row(symmetric_bar, i * n + j) * _scratch_row(
+                        deviation, s * n + j
+                    )
+                _set_scratch_row(V_bar, s * n + i, weight * bar)
         for i in range(n):
-            left = _own(through, i)
+            mean_gradient = _scratch_row(through, i)
             for s in range(count):
-                left -= _own(V_bar, s * n + i)
+                mean_gradient -= _scratch_row(V_bar, s * n + i)
             for s in range(count):
-                _put(
+                _set_scratch_row(
                     V_bar,
                     s * n + i,
-                    _own(V_bar, s * n + i) + (rule[1] if s == 0 else rule[3]) * left,
+                    _scratch_row(V_bar, s * n + i)
+                    + (rule[1] if s == 0 else rule[3]) * mean_gradient,
                 )
         _write(V_bar, values_bar, b, end)
-        _write(whole, noise_bar, b, end)
+        _write(symmetric_bar, noise_bar, b, end)
 
 
 @compiled
-def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
-    """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (m, B); counts in ``refused``, (B, m); see `Gate`.
+def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, first, end):  # type: ignore[no-untyped-def]
+    """Mark measurements that the gate refuses: NaN in ``y`` (m, B), true in ``is_gated_out`` (m,
+    B).
+
+    ``refused`` (B, m) counts how long each has been refused; see `Gate`.
 
     A negative weight of the mean point cannot make a variance smaller than that of the noise.
     """
     count, m = expected.shape[:2]
-    _, centre_mean, centre_covariance, other = rules[0]
+    _, centre_mean, centre_covariance, outer_weight = rules[0]
     for b in range(first, end):
         for i in range(m):
-            gone[i, b] = False
+            is_gated_out[i, b] = False
             if y[i, b] != y[i, b]:
                 continue
             total = expected[0, i, b] * 0
             for s in range(1, count):
                 total += expected[s, i, b]
-            centre = centre_mean * expected[0, i, b] + other * total
+            centre = centre_mean * expected[0, i, b] + outer_weight * total
             total = centre * 0
             for s in range(1, count):
                 total += (expected[s, i, b] - centre) * (expected[s, i, b] - centre)
-            total = other * total + centre_covariance * (expected[0, i, b] - centre) * (
+            total = outer_weight * total + centre_covariance * (expected[0, i, b] - centre) * (
                 expected[0, i, b] - centre
             )
             if refuses(
@@ -302,20 +359,24 @@ def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, en
                 i,
             ):
                 y[i, b] = np.nan
-                gone[i, b] = True
+                is_gated_out[i, b] = True
 
 
 @compiled
-def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, first, end):  # type: ignore[no-untyped-def]
-    """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
+def update_of(mean, drawn, expected, y, noise, rules, post, update_results, repaired, first, end):  # type: ignore[no-untyped-def]
+    """Update the state with a measurement; an element of ``y`` that is NaN was not measured.
 
-    Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, and the weight of the mean point in
-    covariances, (B,), 0 where a negative one took their definiteness.
+    K = C S⁻¹,  x⁺ = x + K (y - ŷ),  P⁺ = P - K Cᵀ (see the module).
+
+    Written are ``post`` (mean, covariance) and ``update_results``: innovation (m, B), its
+    covariance S (m, m, B), gain K (n, m, B), and the weight of the mean point in covariances (B,),
+    which is 0 where a negative weight took the definiteness of P⁺. ``repaired`` is set where S is
+    repaired.
     """
     (rule, lower, margin, repair) = rules
     (points, _, covariance) = drawn
     (post_mean, post_covariance) = post
-    (innovation, own, gain, centre) = kept
+    (innovation, innovation_covariance, gain, centre) = update_results
     count, m = expected.shape[:2]
     n = mean.shape[0]
     lanes = width(mean)
@@ -342,83 +403,95 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
             _posterior(covariance, b, cross, factor, K, A)
             if attempt == 0 and repair and rule[2] < 0:
                 lost = 1 - definite * _cholesky(A, tried, n)
-                if _any(lost, b, end, flags):
+                if _is_any_positive(lost, b, end, flags):
                     nothing = lost * 0
                     for row in range(m * m):
-                        nothing += _own(S, row) * 0
+                        nothing += _scratch_row(S, row) * 0
                     for row in range(n * n):
                         nothing += at_row(covariance, row, b) * 0
                     lost = choose(nothing == 0, lost, 0.0)
-                    if _any(lost, b, end, flags):
+                    if _is_any_positive(lost, b, end, flags):
                         for lane in range(min(lanes, end - b)):
                             repaired[b + lane] |= flags[0, lane] > 0
                         around = choose(lost > 0, around * 0, around)
                         continue
-            if lifted or not _any(1 - definite, b, end, flags):
+            if lifted or not _is_any_positive(1 - definite, b, end, flags):
                 break
             lifted = True
             for lane in range(min(lanes, end - b)):
                 if flags[0, lane] > 0:
                     repaired[b + lane] |= _repaired(S, factor, lane, m, margin, repair)
-        _put(weight, 0, around)
+        _set_scratch_row(weight, 0, around)
         for i in range(n):
-            _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
+            _set_scratch_row(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
         _write(x, post_mean, b, end)
         _write(A, post_covariance, b, end)
         _write(error, innovation, b, end)
-        _write(S, own, b, end)
+        _write(S, innovation_covariance, b, end)
         _write(K, gain, b, end)
         _write(weight, centre, b, end)
 
 
 @piece
 def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
+    """State i after the update, before its lower bound: x_i + Σ_c K_ic e_c."""
     state = at_row(mean, i, b)
     for c in range(m):
-        state += _own(K, i * m + c) * _own(error, c)
+        state += _scratch_row(K, i * m + c) * _scratch_row(error, c)
     return state
 
 
 @piece
 def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # type: ignore[no-untyped-def]
-    """Innovation, and how far points lie from the mean and what is expected at them from its own; 0 where not measured."""
+    """Write innovation, deviations e_s of expected measurements and d_s of points; 0 where not
+    measured.
+    """
     count, m = expected.shape[:2]
     n = mean.shape[0]
     for i in range(m):
         z = at_row(y, i, b)
         centre = _deviations(expected, b, m, rule, spread, i)
-        _put(error, i, choose(z == z, z - centre, 0.0))
+        _set_scratch_row(error, i, choose(z == z, z - centre, 0.0))
         for s in range(count):
-            _put(spread, s * m + i, choose(z == z, _own(spread, s * m + i), 0.0))
+            _set_scratch_row(
+                spread, s * m + i, choose(z == z, _scratch_row(spread, s * m + i), 0.0)
+            )
     for s in range(count):
         for i in range(n):
-            _put(deviation, s * n + i, at_row(points, s * n + i, b) - at_row(mean, i, b))
+            _set_scratch_row(
+                deviation, s * n + i, at_row(points, s * n + i, b) - at_row(mean, i, b)
+            )
 
 
 @piece
-def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, own, factor):  # type: ignore[no-untyped-def]
-    """Covariance of states with what is expected, and of that with noise, with its factor; 1 where it is positive definite, else 0."""
+def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, innovation_covariance, factor):  # type: ignore[no-untyped-def]
+    """Write C = Σ v_s d_s e_sᵀ, S = Σ v_s e_s e_sᵀ + R and the factor of S.
+
+    Returns 1 in lanes in which S is positive definite, else 0.
+    """
     m = y.shape[0]
     half = rule.dtype.type(0.5)
     for i in range(n):
         for j in range(m):
-            _put(cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre))
+            _set_scratch_row(
+                cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre)
+            )
     for i in range(m):
         for j in range(i + 1):
-            one = at_row(y, i, b)
-            other = at_row(y, j, b)
+            y_i = at_row(y, i, b)
+            y_j = at_row(y, j, b)
             bare = _weighted(spread, i, m, spread, j, m, rule, centre)
             noisy = bare + half * (at_row(noise, i * m + j, b) + at_row(noise, j * m + i, b))
             alone = bare + 1 if i == j else bare
-            value = choose(one == one, choose(other == other, noisy, alone), alone)
-            _put(own, i * m + j, value)
-            _put(own, j * m + i, value)
-    return _cholesky(own, factor, m)
+            value = choose(y_i == y_i, choose(y_j == y_j, noisy, alone), alone)
+            _set_scratch_row(innovation_covariance, i * m + j, value)
+            _set_scratch_row(innovation_covariance, j * m + i, value)
+    return _cholesky(innovation_covariance, factor, m)
 
 
 @piece
 def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ignore[no-untyped-def]
-    """Gain cross S⁻¹, by the factor of S, and the covariance that is left."""
+    """Write the gain K = C S⁻¹, by the factor of S, and P⁺ = P - (K Cᵀ + C Kᵀ)/2."""
     n = covariance.shape[0]
     m = cross.shape[0] // n
     half = cross.dtype.type(0.5)
@@ -426,38 +499,43 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
         _solve(factor, cross, i * m, m, gain)
     for i in range(n):
         for j in range(i + 1):
-            left = half * (at_row(covariance, i * n + j, b) + at_row(covariance, j * n + i, b))
+            posterior = half * (at_row(covariance, i * n + j, b) + at_row(covariance, j * n + i, b))
             for c in range(m):
-                taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(
-                    gain, j * m + c
-                ) * _own(cross, i * m + c)
-                left -= half * taken
-            _put(post_covariance, i * n + j, left)
-            _put(post_covariance, j * n + i, left)
+                reduction = _scratch_row(gain, i * m + c) * _scratch_row(
+                    cross, j * m + c
+                ) + _scratch_row(gain, j * m + c) * _scratch_row(cross, i * m + c)
+                posterior -= half * reduction
+            _set_scratch_row(post_covariance, i * n + j, posterior)
+            _set_scratch_row(post_covariance, j * n + i, posterior)
 
 
 @piece
-def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
-    """S⁻¹ times the m rows of ``given`` from ``at`` on, by the factor of S, into those of ``solved``."""
+def _solve(factor, right_sides, at, m, solved):  # type: ignore[no-untyped-def]
+    """Solve S x = b by the factor of S, for b the m rows of ``right_sides`` from ``at`` on."""
     for j in range(m):
-        left = _own(given, at + j)
+        remainder = _scratch_row(right_sides, at + j)
         for c in range(j):
-            left -= _own(factor, j * m + c) * _own(solved, at + c)
-        _put(solved, at + j, left / _own(factor, j * m + j))
+            remainder -= _scratch_row(factor, j * m + c) * _scratch_row(solved, at + c)
+        _set_scratch_row(solved, at + j, remainder / _scratch_row(factor, j * m + j))
     for j in range(m - 1, -1, -1):
-        left = _own(solved, at + j)
+        remainder = _scratch_row(solved, at + j)
         for c in range(j + 1, m):
-            left -= _own(factor, c * m + j) * _own(solved, at + c)
-        _put(solved, at + j, left / _own(factor, j * m + j))
+            remainder -= _scratch_row(factor, c * m + j) * _scratch_row(solved, at + c)
+        _set_scratch_row(solved, at + j, remainder / _scratch_row(factor, j * m + j))
 
 
 @compiled
 def update_adjoint(  # type: ignore[no-untyped-def]
-    mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end
+    mean, points, expected, y, rules, update_results, post_bars, prior_bars, other_bars, first, end
 ):
-    """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
+    """Adjoint of `update_of`; writes gradients of x, P, points, expected measurements, R and y.
+
+    With M = (P̄⁺ + P̄⁺ᵀ)/2, e = y - ŷ, s = S⁻¹ e and p = Kᵀ x̄⁺: ē = ȳ = p, C̄ = x̄⁺ sᵀ - 2 M K, S̄
+    = -(p sᵀ + s pᵀ)/2 + Kᵀ M K, P̄ = M, R̄ = S̄; d̄_s = v_s C̄ e_s, ē_s = v_s (C̄ᵀ d_s + 2 S̄ e_s),
+    and both pass to X_s, x and h(X_s) through their means.
+    """
     (rule, lower, _, _) = rules
-    (innovation, own, gain, centre) = kept
+    (innovation, innovation_covariance, gain, centre) = update_results
     (post_mean_bar, post_covariance_bar) = post_bars
     (mean_bar, covariance_bar) = prior_bars
     (points_bar, expected_bar, noise_bar, y_bar) = other_bars
@@ -477,7 +555,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     pulled = _rows(m, mean)
     through = _rows(n, mean)
     cross_bar = _rows(n * m, mean)
-    own_bar = _rows(m * m, mean)
+    S_bar = _rows(m * m, mean)
     R_bar = _rows(m * m, mean)
     x_bar = _rows(n, mean)
     z_bar = _rows(m, mean)
@@ -486,14 +564,16 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     for b in range(first, end, width(mean)):
         _spread(expected, points, mean, y, b, rule, off, spread, deviation)
         _read(innovation, error, b)
-        _read(own, S, b)
+        _read(innovation_covariance, S, b)
         _read(gain, K, b)
         around = at_row(centre, 0, b)
         for i in range(n):
             state = _moved(mean, K, error, i, m, b)
-            _put(through, i, choose(state >= lower[i], at_row(post_mean_bar, i, b), state * 0))
+            _set_scratch_row(
+                through, i, choose(state >= lower[i], at_row(post_mean_bar, i, b), state * 0)
+            )
             for j in range(n):
-                _put(
+                _set_scratch_row(
                     P,
                     i * n + j,
                     half
@@ -505,61 +585,70 @@ def update_adjoint(  # type: ignore[no-untyped-def]
         _cholesky(S, factor, m)
         _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
-            pull = _own(through, 0) * 0
-            known = at_row(y, c, b)
+            pull = _scratch_row(through, 0) * 0
+            measurement = at_row(y, c, b)
             for i in range(n):
-                pull += _own(K, i * m + c) * _own(through, i)
-            _put(pulled, c, pull)
-            _put(z_bar, c, choose(known == known, pull, pull * 0))
+                pull += _scratch_row(K, i * m + c) * _scratch_row(through, i)
+            _set_scratch_row(pulled, c, pull)
+            _set_scratch_row(z_bar, c, choose(measurement == measurement, pull, pull * 0))
         for i in range(n):
             for c in range(m):
-                bar = _own(through, i) * _own(solved, c)
+                bar = _scratch_row(through, i) * _scratch_row(solved, c)
                 for j in range(n):
-                    bar -= two * _own(P, i * n + j) * _own(K, j * m + c)
-                _put(cross_bar, i * m + c, bar)
+                    bar -= two * _scratch_row(P, i * n + j) * _scratch_row(K, j * m + c)
+                _set_scratch_row(cross_bar, i * m + c, bar)
         for c in range(m):
             for d in range(m):
                 bar = -half * (
-                    _own(pulled, c) * _own(solved, d) + _own(pulled, d) * _own(solved, c)
+                    _scratch_row(pulled, c) * _scratch_row(solved, d)
+                    + _scratch_row(pulled, d) * _scratch_row(solved, c)
                 )
                 for i in range(n):
                     for j in range(n):
-                        bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
-                _put(own_bar, c * m + d, bar)
-                one = at_row(y, c, b)
-                other = at_row(y, d, b)
-                _put(
+                        bar += (
+                            _scratch_row(K, i * m + c)
+                            * _scratch_row(P, i * n + j)
+                            * _scratch_row(K, j * m + d)
+                        )
+                _set_scratch_row(S_bar, c * m + d, bar)
+                y_c = at_row(y, c, b)
+                y_d = at_row(y, d, b)
+                _set_scratch_row(
                     R_bar,
                     c * m + d,
-                    choose(one == one, choose(other == other, bar, bar * 0), bar * 0),
+                    choose(y_c == y_c, choose(y_d == y_d, bar, bar * 0), bar * 0),
                 )
         for i in range(n):
-            left = _own(through, i)
+            remainder = _scratch_row(through, i)
             for s in range(count):
-                bar = _own(through, i) * 0
+                bar = _scratch_row(through, i) * 0
                 for c in range(m):
-                    bar += _own(cross_bar, i * m + c) * _own(spread, s * m + c)
+                    bar += _scratch_row(cross_bar, i * m + c) * _scratch_row(spread, s * m + c)
                 bar = around * bar if s == 0 else rule[3] * bar
-                _put(V_bar, s * n + i, bar)
-                left -= bar
-            _put(x_bar, i, left)
+                _set_scratch_row(V_bar, s * n + i, bar)
+                remainder -= bar
+            _set_scratch_row(x_bar, i, remainder)
         for c in range(m):
-            known = at_row(y, c, b)
-            left = choose(known == known, -_own(pulled, c), _own(pulled, c) * 0)
+            measurement = at_row(y, c, b)
+            remainder = choose(
+                measurement == measurement, -_scratch_row(pulled, c), _scratch_row(pulled, c) * 0
+            )
             for s in range(count):
-                bar = _own(pulled, c) * 0
+                bar = _scratch_row(pulled, c) * 0
                 for i in range(n):
-                    bar += _own(cross_bar, i * m + c) * _own(deviation, s * n + i)
+                    bar += _scratch_row(cross_bar, i * m + c) * _scratch_row(deviation, s * n + i)
                 for d in range(m):
-                    bar += two * _own(own_bar, c * m + d) * _own(spread, s * m + d)
-                bar = choose(known == known, around * bar if s == 0 else rule[3] * bar, 0.0)
-                _put(E_bar, s * m + c, bar)
-                left -= bar
+                    bar += two * _scratch_row(S_bar, c * m + d) * _scratch_row(spread, s * m + d)
+                bar = choose(
+                    measurement == measurement, around * bar if s == 0 else rule[3] * bar, 0.0
+                )
+                _set_scratch_row(E_bar, s * m + c, bar)
+                remainder -= bar
             for s in range(count):
-                _put(
+                _set_scratch_row(
                     E_bar,
                     s * m + c,
-                    _own(E_bar, s * m + c) + (rule[1] if s == 0 else rule[3]) * left,
+                    _scratch_row(E_bar, s * m + c) + (rule[1] if s == 0 else rule[3]) * remainder,
                 )
         _write(x_bar, mean_bar, b, end)
         _write(P, covariance_bar, b, end)
@@ -571,56 +660,65 @@ def update_adjoint(  # type: ignore[no-untyped-def]
 
 @piece
 def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
-    """Lower factors of matrices (n · n, W) into L; 1 in lanes where one is positive definite, else 0."""
-    nothing = _own(A, 0) * 0
+    """Write lower factors L of matrices A = L Lᵀ, (n · n, W).
+
+    Returns 1 in lanes in which the matrix is positive definite, else 0.
+    """
+    nothing = _scratch_row(A, 0) * 0
     definite = choose(nothing == 0, nothing + 1, 0.0)
     nothing = definite * 0
     for j in range(n):
-        left = _own(A, j * n + j)
+        remainder = _scratch_row(A, j * n + j)
         for k in range(j):
-            left -= _own(L, j * n + k) * _own(L, j * n + k)
-        definite = choose(left > 0, definite, 0.0)
-        pivot = root(left)
+            remainder -= _scratch_row(L, j * n + k) * _scratch_row(L, j * n + k)
+        definite = choose(remainder > 0, definite, 0.0)
+        pivot = root(remainder)
         nothing += pivot * 0
-        _put(L, j * n + j, pivot)
+        _set_scratch_row(L, j * n + j, pivot)
         for i in range(j):
-            _put(L, i * n + j, nothing * 0)
+            _set_scratch_row(L, i * n + j, nothing * 0)
         for i in range(j + 1, n):
-            left = _own(A, i * n + j)
+            remainder = _scratch_row(A, i * n + j)
             for k in range(j):
-                left -= _own(L, i * n + k) * _own(L, j * n + k)
-            left = left / pivot
-            nothing += left * 0
-            _put(L, i * n + j, left)
+                remainder -= _scratch_row(L, i * n + k) * _scratch_row(L, j * n + k)
+            remainder = remainder / pivot
+            nothing += remainder * 0
+            _set_scratch_row(L, i * n + j, remainder)
     return choose(nothing == 0, definite, 0.0)
 
 
 @compiled
 def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
-    """Lift the matrix (n · n, W) of a lane and write its factor, or NaN where that fails; whether its values were finite."""
-    own = np.empty((n, n), A.dtype)
+    """Add a multiple of the identity to one lane's matrix (n · n, W) and write its factor.
+
+    The smallest eigenvalue becomes ``margin`` times the largest. Where that fails, or there are no
+    repairs, both become NaN. Returns whether the matrix was finite.
+    """
+    matrix = np.empty((n, n), A.dtype)
     factor = np.zeros((n, n), A.dtype)
     for i in range(n):
         for j in range(n):
-            own[i, j] = A[i * n + j, lane]
-    finite = np.isfinite(own).all()
+            matrix[i, j] = A[i * n + j, lane]
+    finite = np.isfinite(matrix).all()
     sound = repair and finite
     if sound:
-        eigenvalues = np.linalg.eigvalsh(own)
+        eigenvalues = np.linalg.eigvalsh(matrix)
         lift = margin * np.abs(eigenvalues).max() - eigenvalues[0]
         for i in range(n):
-            own[i, i] += lift
-        sound = _cholesky_of_one(own, factor)
+            matrix[i, i] += lift
+        sound = _cholesky_single(matrix, factor)
     for i in range(n):
         for j in range(n):
-            A[i * n + j, lane] = own[i, j] if sound else np.nan
+            A[i * n + j, lane] = matrix[i, j] if sound else np.nan
             L[i * n + j, lane] = factor[i, j] if sound else np.nan
     return finite
 
 
 @compiled
-def _cholesky_of_one(A, L):  # type: ignore[no-untyped-def]
-    """Lower factor of a matrix into L, zeros at first; whether it is positive definite."""
+def _cholesky_single(A, L):  # type: ignore[no-untyped-def]
+    """Write the lower factor of one matrix into L, which is zero; return whether A is positive
+    definite.
+    """
     n = A.shape[0]
     for j in range(n):
         total = A[j, j]
@@ -640,31 +738,34 @@ def _cholesky_of_one(A, L):  # type: ignore[no-untyped-def]
 
 @piece
 def _cholesky_adjoint(L, L_bar, inner, A_bar, n):  # type: ignore[no-untyped-def]
-    """A_bar += sym(L⁻ᵀ Φ(Lᵀ L_bar) L⁻¹), Φ the lower triangle with half the diagonal (Murray 2016, Eq. 10)."""
+    """A_bar += sym(L⁻ᵀ Φ(Lᵀ L_bar) L⁻¹), Φ the lower triangle with half the diagonal (Murray 2016,
+    Eq. 10).
+    """
     half = L.dtype.type(0.5)
     for i in range(n):
         for j in range(n):
-            bar = _own(L, 0) * 0
+            bar = _scratch_row(L, 0) * 0
             if j <= i:
                 for k in range(i, n):
-                    bar += _own(L, k * n + i) * _own(L_bar, k * n + j)
-            _put(inner, i * n + j, bar * half if i == j else bar)
+                    bar += _scratch_row(L, k * n + i) * _scratch_row(L_bar, k * n + j)
+            _set_scratch_row(inner, i * n + j, bar * half if i == j else bar)
     for j in range(n):  # Lᵀ X = Φ
         for i in range(n - 1, -1, -1):
-            bar = _own(inner, i * n + j)
+            bar = _scratch_row(inner, i * n + j)
             for k in range(i + 1, n):
-                bar -= _own(L, k * n + i) * _own(inner, k * n + j)
-            _put(inner, i * n + j, bar / _own(L, i * n + i))
+                bar -= _scratch_row(L, k * n + i) * _scratch_row(inner, k * n + j)
+            _set_scratch_row(inner, i * n + j, bar / _scratch_row(L, i * n + i))
     for i in range(n):  # Y L = X
         for j in range(n - 1, -1, -1):
-            bar = _own(inner, i * n + j)
+            bar = _scratch_row(inner, i * n + j)
             for k in range(j + 1, n):
-                bar -= _own(inner, i * n + k) * _own(L, k * n + j)
-            _put(inner, i * n + j, bar / _own(L, j * n + j))
+                bar -= _scratch_row(inner, i * n + k) * _scratch_row(L, k * n + j)
+            _set_scratch_row(inner, i * n + j, bar / _scratch_row(L, j * n + j))
     for i in range(n):
         for j in range(n):
-            _put(
+            _set_scratch_row(
                 A_bar,
                 i * n + j,
-                _own(A_bar, i * n + j) + half * (_own(inner, i * n + j) + _own(inner, j * n + i)),
+                _scratch_row(A_bar, i * n + j)
+                + half * (_scratch_row(inner, i * n + j) + _scratch_row(inner, j * n + i)),
             )

@@ -1,4 +1,6 @@
-"""One simulated drive: a driver takes a vehicle through a manoeuvre, sensors make a recording of it."""
+"""One simulated drive: a driver takes a vehicle through a manoeuvre, sensors make a recording of
+it.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,9 @@ from vehest.simulation.sensors.recording import described, measure
 
 RATE_HZ = 100.0  # default sampling rate of recordings [Hz]
 AFTER_STAND = 1.0  # recorded after the car has come to its stand [s]
-LONGEST_STOP = 60.0  # within which a car stands that spun or left the road [s]
-STOPPING_SHARE = (
-    0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
-)
+MAX_STOP_SECONDS = 60.0  # within which a car stands that spun or left the road [s]
+# share of the grip with which a driver brakes after a spin or beside the road; assumed
+STOPPING_SHARE = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +87,17 @@ def simulate_drive(
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
-    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``. The
-    seed, zero or positive, is that of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; a
-    whole number of plant steps must fit between samples at ``rate_hz``; the loss of grip over the drive, ``stint``, is unknown to the
-    driver.
+    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND
+    later; its provenance has ``flags``. The seed, zero or positive, is that of the driver, of what
+    the manoeuvre draws, of patches on the surface and of the sensors' errors; a whole number of
+    plant steps must fit between samples at ``rate_hz``; the loss of grip over the drive, ``stint``,
+    is unknown to the driver.
 
-    Raises `ConfigurationError`: a value that makes no sense, or a car that cannot do the manoeuvre. Raises `SimulationError`: the car
-    rolled over, or a state is not finite.
+    Raises
+    ------
+    ConfigurationError
+        A value that makes no sense, or a car that cannot do the manoeuvre. Raises
+        `SimulationError`: the car rolled over, or a state is not finite.
     """
     plant = MultiBodyPlant(vehicle)
     with naming(id, seed):
@@ -171,9 +176,11 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion; raises `ConfigurationError` or, where it rolls over, `SimulationError`."""
-    per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
-    per_sample = whole_steps(rate_hz, plant.step, "sampling")
+    """Drive a car through a manoeuvre and keep its true motion; raises `ConfigurationError` or,
+    where it rolls over, `SimulationError`.
+    """
+    per_command = steps_per_tick(DRIVER_RATE_HZ, plant.step, "driver's")
+    per_sample = steps_per_tick(rate_hz, plant.step, "sampling")
     controller = manoeuvre.controller(car_of(plant), surface, seed)
     ride = _Ride(
         plant,
@@ -232,8 +239,8 @@ class _Ride:
 
     def decide(self, time: float) -> bool:
         """The driver's next command [s]; false if the drive is over."""
-        seen = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
-        decision = self._controller.command(time, seen)
+        observation = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
+        decision = self._controller.command(time, observation)
         if self._stint is not None:
             decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
         self.decision = decision
@@ -243,17 +250,19 @@ class _Ride:
         steering_velocity = decision.steering_velocity
         acceleration = decision.acceleration
         if self.gave_up_at is not None:
-            steering_velocity = max(-0.5, min(0.5, -seen.steer / 0.3)) * self._car.steering_rate
+            steering_velocity = (
+                max(-0.5, min(0.5, -observation.steer / 0.3)) * self._car.steering_rate
+            )
             acceleration = -STOPPING_SHARE * self._car.grip * decision.friction
-        along, across = self._slope(seen.yaw)
-        drag = self._car.drag * seen.speed
+        along, across = self._slope(observation.yaw)
+        drag = self._car.drag * observation.speed
         if self.stability_control is not None:
             self.stability = self.stability_control.step(
                 self.stability,
                 1.0 / DRIVER_RATE_HZ,
-                steer=seen.steer,
-                vx=seen.vx,
-                yaw_rate=seen.yaw_rate,
+                steer=observation.steer,
+                vx=observation.vx,
+                yaw_rate=observation.yaw_rate,
                 friction=decision.friction,
             )
         moment = self.stability.moment
@@ -262,8 +271,8 @@ class _Ride:
                 steering_velocity,
                 acceleration,
                 moment,
-                along - drag * seen.vx,
-                across - drag * seen.vy,
+                along - drag * observation.vx,
+                across - drag * observation.vy,
             ]
         )
         return True
@@ -273,7 +282,7 @@ class _Ride:
             self.left_road = True
         if self.gave_up_at is None and (self.left_road or self.state.spun):
             self.gave_up_at = time
-        if not self.state.stands:
+        if not self.state.is_standing:
             self._stands_since = None
         elif self._stands_since is None:
             self._stands_since = time
@@ -283,7 +292,7 @@ class _Ride:
             self.completed = self.gave_up_at is None
             return True
         if self.gave_up_at is not None:
-            return time > self.gave_up_at + LONGEST_STOP
+            return time > self.gave_up_at + MAX_STOP_SECONDS
         self.completed = self._stands_since is None and decision.finished
         return self.completed or (self._stands_since is None and time >= self._longest - 1e-9)
 
@@ -322,7 +331,7 @@ class _Ride:
         flags = Flags(
             spun=self.state.spun,
             left_road=self.left_road,
-            stood=self.state.stands,
+            stood=self.state.is_standing,
             completed=self.completed,
             gave_up_at=self.gave_up_at,
             largest_lateral_error=float(on_line.max()) if len(on_line) else None,
@@ -335,12 +344,14 @@ class _Ride:
         return Trip(motion, lateral_error.copy(), flags, drawn)
 
 
-def whole_steps(rate_hz: float, step: float, what: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate; raises `ConfigurationError` where they are not whole; ``what`` names the rate."""
+def steps_per_tick(rate_hz: float, step: float, rate_name: str) -> int:
+    """Steps of the plant [s] between two ticks of a rate; raises `ConfigurationError` where they
+    are not whole; ``what`` names the rate.
+    """
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(
-            f"the {what} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a whole number of steps must "
+            f"the {rate_name} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a whole number of steps must "
             f"lie between two samples (with 0.001 s: 10, 20, 25, 40, 50, 100, 125, 200, 250, 500 or 1000 Hz)"
         )
     return n_steps

@@ -1,4 +1,6 @@
-"""Cars and sensors that differ from drive to drive, drawn from stated ranges: for training that must generalise."""
+"""Cars and sensors that differ from drive to drive, drawn from stated ranges: for training that
+must generalise.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,8 @@ from vehest.simulation.plant.parameters import (
 from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
 
-_STREAM = (
-    4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
-)
+# of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+_STREAM = 4
 
 
 Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
@@ -53,15 +54,21 @@ class Variation:
 
 
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
-    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
+    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9,
+    1.2]}``, ``log: true`` if wanted.
 
-    Raises `ConfigurationError` where an entry is no variation.
+    Raises
+    ------
+    ConfigurationError
+        Where an entry is no variation.
     """
     return validated(tuple[Variation, ...], entries, "", error=ConfigurationError, group="vary")
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
-    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing varies; raises `ConfigurationError`."""
+    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing
+    varies; raises `ConfigurationError`.
+    """
     if not variations:
         return vehicle
     overrides = deepcopy(dict(vehicle.overrides))
@@ -84,7 +91,9 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
-    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no parameter of the plant."""
+    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no
+    parameter of the plant.
+    """
     return scaled_car(
         car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()}
     )
@@ -93,17 +102,19 @@ def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) ->
 def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]:
     """Scales of each parameter."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
-    found: dict[str, list[float]] = {}
+    factors_of: dict[str, list[float]] = {}
     for variation in variations:
         factor = variation.drawn(generator)
         for name in variation.parameters:
-            found.setdefault(name, []).append(factor)
-    return found
+            factors_of.setdefault(name, []).append(factor)
+    return factors_of
 
 
 @dataclass(frozen=True)
 class SensorVariation:
-    """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of error."""
+    """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of
+    error.
+    """
 
     factors: Mapping[
         str, tuple[float, float]
@@ -113,7 +124,9 @@ class SensorVariation:
 
     @classmethod
     def from_config(cls, entries: Any) -> SensorVariation:
-        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``; raises `ConfigurationError` otherwise."""
+        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``;
+        raises `ConfigurationError` otherwise.
+        """
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
             raise ConfigurationError(
@@ -128,7 +141,9 @@ class SensorVariation:
         )
 
     def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
-        """Levels as the seed scales them; the same ones if nothing varies. References stay as they are."""
+        """Levels as the seed scales them; the same ones if nothing varies. References stay as they
+        are.
+        """
         if not self.factors and self.roll_share is None:
             return levels
         generator = np.random.default_rng(

@@ -8,7 +8,7 @@ from dataclasses import asdict
 import numpy as np
 
 from vehest.data.recording import Recording
-from vehest.simulation.drive import RATE_HZ, Flags, Trip, naming, recording_of, whole_steps
+from vehest.simulation.drive import RATE_HZ, Flags, Trip, naming, recording_of, steps_per_tick
 from vehest.simulation.driving.driver import Observation
 from vehest.simulation.driving.freestyle import COMMAND_RATE_HZ, Freestyle
 from vehest.simulation.driving.manoeuvre import SETTLING_TIME
@@ -34,7 +34,9 @@ CHANNELS = (
     "vy_ref",
     "yaw_rate_ref",
 )
-"""Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
+"""Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes
+are not kept.
+"""
 
 SPUN = np.pi / 2.0  # sideslip angle beyond which a drive counts as one with a spin [rad]
 
@@ -51,15 +53,21 @@ def simulate_planar_drive(
 ) -> Recording:
     """A recording of one drive, with arguments as of `simulate_drive`.
 
-    ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels slip. Spins are driven on from.
+    ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels
+    slip. Spins are driven on from.
 
-    Raises `ConfigurationError`: a value that makes no sense. Raises `SimulationError`: a state is not finite.
+    Raises
+    ------
+    ConfigurationError
+        A value that makes no sense.
+    SimulationError
+        A state is not finite.
     """
     plant = PlanarPlant(car)
     with naming(id, seed):
         trip = drive_freely(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface)
-    shown = measure(trip.motion, sensors, seed)
-    shown["vx"] = car.wheel_radius * shown["motor_speed"]
+    channels = measure(trip.motion, sensors, seed)
+    channels["vx"] = car.wheel_radius * channels["motor_speed"]
     about = {
         "plant": "planar, four wheels",
         "parameters": car.parameters,
@@ -70,7 +78,7 @@ def simulate_planar_drive(
         "stability_control": False,
     }
     return recording_of(
-        id, car.name, trip, {name: shown[name] for name in CHANNELS}, about, sensors, seed
+        id, car.name, trip, {name: channels[name] for name in CHANNELS}, about, sensors, seed
     )
 
 
@@ -82,28 +90,32 @@ def drive_freely(
     rate_hz: float = RATE_HZ,
     surface: Surface = SURFACES["dry"],
 ) -> Trip:
-    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before.
+    """Drive a car for the time of a recording and keep its true motion; it starts from standstill,
+    SETTLING_TIME before.
 
-    Raises `ConfigurationError` where rate or step make no sense, `SimulationError` where a state is not finite.
+    Raises
+    ------
+    ConfigurationError
+        Where rate or step make no sense, `SimulationError` where a state is not finite.
     """
-    per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
-    per_sample = whole_steps(rate_hz, plant.step, "sampling")
+    per_command = steps_per_tick(COMMAND_RATE_HZ, plant.step, "driver's")
+    per_sample = steps_per_tick(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))
     driver = manoeuvre.controller(plant.car, surface, seed)
     first_sample = round(SETTLING_TIME / plant.step)
     state = plant.initial_state()
-    kept = []
-    acting = []
+    states = []
+    inputs_of_samples = []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):
         if now % per_command == 0:
             inputs = driver.inputs(
                 now * plant.step, Observation(*state[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
             )
         if now >= first_sample and (now - first_sample) % per_sample == 0:
-            kept.append(state)
-            acting.append(inputs)
+            states.append(state)
+            inputs_of_samples.append(inputs)
         state = plant.advance(state, inputs, stride)
-    motion = plant.motion(kept, acting, rate_hz)
+    motion = plant.motion(states, inputs_of_samples, rate_hz)
     moving = np.hypot(motion.vx, motion.vy) > 1.0
     sideslip = float(np.abs(motion.sideslip[moving]).max(initial=0.0))
     flags = Flags(

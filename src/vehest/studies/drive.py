@@ -342,7 +342,7 @@ def how_it_was_made(
         f"Command: {as_code(artefacts.command)}",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values. Estimators may "
         f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
-        f"{protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
+        f"{protocol.piece} are not scored, for anyone.{protocol.start_description}",
         f"Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike."
         f"{protocol.describe_sideslip(artefacts.split.datasets)}{_describe_excluded(artefacts)}",
         *choice,

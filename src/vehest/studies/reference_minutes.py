@@ -161,7 +161,7 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
         as_text(parts[0].title),
         test_set,
         ordered,
-        rank(finite, parts[0].protocol.rate_hz, asked=asked),
+        rank(finite, parts[0].protocol.rate_hz, claimed_pairs=asked),
     )
 
 

@@ -1,4 +1,8 @@
-"""Adam as torch has it, without the classes of `torch.optim`: the first of them that is made imports a compiler, for a second and 70 MB."""
+"""Adam by torch's own function, without the classes of `torch.optim`.
+
+The first optimiser that is made of those classes imports torch's compiler: 78 MB and a second or
+more in every training process.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +17,23 @@ from torch.optim.adamw import adamw
 class Adam:
     """Steps of `torch.optim.AdamW`, or without weight decay of `torch.optim.Adam`, bit by bit.
 
-    Args:
-        parameters: leaves that learn.
-        learning_rate: step size; may be changed between steps.
-        weight_decay: decoupled, times the step size.
+    Parameters
+    ----------
+    parameters : Iterable[Tensor]
+        Leaves that learn.
+    learning_rate : float
+        Step size; may be changed between steps.
+    weight_decay : float, default 0.0
+        Decoupled, times the step size.
 
-    Attributes:
-        state: of each parameter that was stepped: ``step`` (), and the moments ``exp_avg`` and ``exp_avg_sq`` in its shape.
+    Attributes
+    ----------
+    state
+        Of each parameter that was stepped: ``step`` (), and the moments ``exp_avg`` and
+        ``exp_avg_sq`` in its shape.
 
-    Source: Kingma & Ba, Adam, 2015; Loshchilov & Hutter, Decoupled weight decay regularization, 2019.
+    Source: Kingma & Ba, Adam, 2015; Loshchilov & Hutter, Decoupled weight decay regularization,
+    2019.
     """
 
     def __init__(

@@ -28,7 +28,9 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint in ``folder`` in one step. Raises `MissingError`: it cannot be written."""
+    """Replace the checkpoint in ``folder`` in one step. Raises `MissingError`: it cannot be
+    written.
+    """
     with written_aside(folder / _FILE) as aside:
         tensors = {
             name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()
@@ -43,20 +45,22 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint in ``folder``; none if there is none or it cannot be read, in which case training starts anew."""
+    """The checkpoint in ``folder``; none if there is none or it cannot be read, in which case
+    training starts anew.
+    """
     path = folder / _FILE
     try:
         regular_file(path)
         with safe_open(path, framework="pt") as file:
-            kept = file.metadata() or {}
+            metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if kept.get("digest") != _digest(kept.get("values", ""), tensors):
+            if metadata.get("digest") != _digest(metadata.get("values", ""), tensors):
                 return None
-            values = parse_json(kept["values"], f"'{path}'")
-            sound = isinstance(values.get("epoch"), int) and isinstance(
+            values = parse_json(metadata["values"], f"'{path}'")
+            is_sound = isinstance(values.get("epoch"), int) and isinstance(
                 values.setdefault("finished", False), bool
             )
-            return Checkpoint(tensors, values) if sound else None
+            return Checkpoint(tensors, values) if is_sound else None
     except (SafetensorError, VehestError, ValueError, OSError):
         return None
 
@@ -71,7 +75,8 @@ def _digest(values: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def resume_epoch(folder: Path) -> int:
-    """Epochs that the checkpoint in ``folder`` saves, 0 if there is none, -1 if training was over and only the model is missing.
+    """Epochs that the checkpoint in ``folder`` saves, 0 if there is none, -1 if training was over
+    and only the model is missing.
 
     Members can go on together if they agree in this.
     """

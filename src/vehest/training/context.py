@@ -1,4 +1,6 @@
-"""Surroundings of a fit: checkpoints, stopping, progress; its record; and the settings of one that learns nothing."""
+"""Surroundings of a fit: checkpoints, stopping, progress; its record; and the settings of one that
+learns nothing.
+"""
 
 from __future__ import annotations
 
@@ -70,13 +72,16 @@ def record_of_epochs(
 
 
 class DivergenceError(DataError):
-    """A loss finds that its training has diverged, so that the trainer returns to the best parameters so far."""
+    """A loss finds that its training has diverged, so that the trainer returns to the best
+    parameters so far.
+    """
 
 
 def divergence_metrics(halvings: int, has_diverged: bool) -> dict[str, float]:
     """Figures of a fit that diverged; empty for one that never did.
 
-    ``step_size_halvings``: how often its step size was halved; ``ended_by_divergence``: 1 if it diverged again at the end.
+    ``step_size_halvings``: how often its step size was halved; ``ended_by_divergence``: 1 if it
+    diverged again at the end.
     """
     if not halvings and not has_diverged:
         return {}

@@ -1,10 +1,11 @@
 """Members: networks of one shape that train together as one batched computation.
 
-Each member's parameters are one row of a matrix, so that everything elementwise (Adam, best weights, stopping) works on
-rows, and what happens in one row never touches another: a member trains exactly as it would alone.
+Each member's parameters are one row of a matrix, so that everything elementwise (Adam, best
+weights, stopping) works on rows, and what happens in one row never touches another: a member trains
+exactly as it would alone.
 
-A network is any ``nn.Module`` whose forward maps prepared windows to the lateral velocity [m/s] one step after them, (B, N, C) -> (B,) or
-(B, 1). It may have besides:
+A network is any ``nn.Module`` whose forward maps prepared windows to the lateral velocity [m/s] one
+step after them, (B, N, C) -> (B,) or (B, 1). It may have besides:
 
 - ``prepared(series)``: the series as it consumes it (scaled, say), (T, C) -> (T, C), asked for once; else as it was measured, in SI;
 - ``reset(generator)``: draws initial weights; else they are those that torch draws when it is built, under the member's seed;
@@ -25,9 +26,8 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 
-MOST_WINDOWS = (
-    1024  # evaluated at once where no gradient is wanted: each is laid out by itself in memory
-)
+# evaluated at once where no gradient is wanted: each is laid out by itself in memory
+MOST_WINDOWS = 1024
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
@@ -62,11 +62,11 @@ def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
         {name: p.detach() for name, p in module.named_parameters() if not p.requires_grad}
         for module in modules
     ]
-    own = [
+    states = [
         parameters | dict(module.named_buffers())
         for parameters, module in zip(frozen, modules, strict=True)
     ]
-    return {name: torch.stack([state[name] for state in own]) for name in own[0]}
+    return {name: torch.stack([state[name] for state in states]) for name in states[0]}
 
 
 class FlatParameters:
@@ -119,23 +119,37 @@ def predict_members(
 ) -> Tensor:
     """Predictions of M members, each on its own windows.
 
-    Without a compiled recursion members are one batched computation by ``torch.func.vmap`` where torch can batch every layer, and one
-    computation a member where it cannot (``nn.LSTM``, ``nn.GRU``) or where a layer draws random numbers (dropout).
+    Without a compiled recursion members are one batched computation by ``torch.func.vmap`` where
+    torch can batch every layer, and one computation a member where it cannot (``nn.LSTM``,
+    ``nn.GRU``) or where a layer draws random numbers (dropout).
 
-    Args:
-        network: whose own parameters and buffers are used where ``parameters`` does not name them.
-        parameters: name -> (M, ...).
-        prepared: (T, C), what `prepare` returned.
-        starts: first row of each window, (M, B), int64.
-        n_window: samples N in a window.
-        compiled: use the compiled recursion where the network has one; PyTorch otherwise.
-        seeds: what layers that draw random numbers draw from, one a member; none: from torch's global state.
+    Parameters
+    ----------
+    network : nn.Module
+        Whose own parameters and buffers are used where ``parameters`` does not name them.
+    parameters : Mapping[str, Tensor]
+        Name -> (M, ...).
+    prepared : Tensor
+        (T, C), what `prepare` returned.
+    starts : Tensor
+        First row of each window, (M, B), int64.
+    n_window : int
+        Samples N in a window.
+    compiled : bool
+        Use the compiled recursion where the network has one; PyTorch otherwise.
+    seeds : Sequence[int], default ()
+        What layers that draw random numbers draw from, one a member; none: from torch's global
+        state.
 
-    Returns:
+    Returns
+    -------
+    Tensor
         (M, B) [m/s].
 
-    Raises:
-        ConfigurationError: the network returns another shape.
+    Raises
+    ------
+    ConfigurationError
+        The network returns another shape.
     """
     if compiled and not is_plain(network):
         result: Tensor = network.compiled_members(parameters, prepared, starts)  # type: ignore[operator]
@@ -151,7 +165,7 @@ def predict_members(
     )
 
 
-_ONE_BY_ONE: WeakSet[nn.Module] = WeakSet()
+_UNBATCHABLE: WeakSet[nn.Module] = WeakSet()
 """Networks with a layer that torch cannot batch."""
 
 
@@ -160,8 +174,8 @@ def _plain(
 ) -> Tensor:
     """Predictions of M members by PyTorch alone, windows (M, B, N, C) -> (M, B)."""
 
-    def predict(own: Mapping[str, Tensor], batch: Tensor) -> Tensor:
-        predicted = torch.func.functional_call(network, dict(own), (batch,))
+    def predict(member_parameters: Mapping[str, Tensor], batch: Tensor) -> Tensor:
+        predicted = torch.func.functional_call(network, dict(member_parameters), (batch,))
         if predicted.shape not in (batch.shape[:1], (*batch.shape[:1], 1)):
             raise ConfigurationError(
                 f"{type(network).__name__} maps windows of shape {tuple(batch.shape)} to {tuple(predicted.shape)}; "
@@ -169,7 +183,7 @@ def _plain(
             )
         return predicted.reshape(len(batch))
 
-    if len(windows) > 1 and network not in _ONE_BY_ONE:
+    if len(windows) > 1 and network not in _UNBATCHABLE:
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings(
@@ -177,7 +191,7 @@ def _plain(
                 )  # one layer goes member by member: still right
                 return torch.func.vmap(predict)(dict(parameters), windows)
         except RuntimeError:  # what is wrong with the network itself is raised again below
-            _ONE_BY_ONE.add(network)
+            _UNBATCHABLE.add(network)
     predictions = []
     for member, batch in enumerate(windows):
         with random_numbers(seeds[member]) if seeds else nullcontext():

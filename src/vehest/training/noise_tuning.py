@@ -1,4 +1,6 @@
-"""How a filter's noise levels are tuned and its tyres identified, as conf/training/noise_tuning.yaml and identification.yaml state it."""
+"""How a filter's noise levels are tuned and its tyres identified, as
+conf/training/noise_tuning.yaml and identification.yaml state it.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ class NoiseTuningSettings(Group):
         context: FitContext,
         trials: int | None = None,
     ) -> SearchRecord:
-        """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see `vehest.training.search`."""
+        """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see
+        `vehest.training.search`.
+        """
         if self.method == "optuna":
             staged = {
                 name: getattr(self, name) for name in ("stages", "shrink") if hasattr(self, name)
@@ -66,7 +70,9 @@ class NoiseTuningSettings(Group):
 
 @dataclass(frozen=True)
 class IdentificationSettings(NoiseTuningSettings):
-    """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section III-B)."""
+    """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section
+    III-B).
+    """
 
     group = "identification"
     method: Literal["data", "nelder_mead", "optuna"] = setting(

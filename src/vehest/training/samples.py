@@ -1,4 +1,6 @@
-"""Training of networks over single samples, members side by side, as a phase of `vehest.training.sequences`."""
+"""Training of networks over single samples, members side by side, as a phase of
+`vehest.training.sequences`.
+"""
 
 from __future__ import annotations
 
@@ -54,15 +56,24 @@ def sample_phase(
 ) -> Phase:
     """Members learn from all samples, each in an order of its own; what is judged is their mean.
 
-    Args:
-        name: of the phase.
-        module: of all members; what happens in one member's parameters must not touch another's.
-        settings: step size, epochs, patience.
-        batch_size: samples that a member sees at a time.
-        n_samples: how many there are.
-        members: M.
-        losses: of a batch, one a member, (M,).
-        judge: on validation samples, (M,).
+    Parameters
+    ----------
+    name : str
+        Of the phase.
+    module : nn.Module
+        Of all members; what happens in one member's parameters must not touch another's.
+    settings : PhaseSettings
+        Step size, epochs, patience.
+    batch_size : int
+        Samples that a member sees at a time.
+    n_samples : int
+        How many there are.
+    members : int
+        M.
+    losses : Callable[[Draw], Tensor]
+        Of a batch, one a member, (M,).
+    judge : Callable[[], Tensor]
+        On validation samples, (M,).
     """
 
     def batches(generator: torch.Generator) -> Iterator[Draw]:

@@ -1,4 +1,6 @@
-"""Search inside a box for the parameters with the smallest cost: Nelder-Mead from a grid of starts, Optuna at once or in stages."""
+"""Search inside a box for the parameters with the smallest cost: Nelder-Mead from a grid of starts,
+Optuna at once or in stages.
+"""
 
 from __future__ import annotations
 
@@ -54,23 +56,33 @@ class SearchRecord(NamedTuple):
 def nelder_mead_over_grid(
     cost: Cost, box: Box, start_range: Box, settings: DirectSearchSettings, context: FitContext
 ) -> SearchRecord:
-    """Minimise a cost that need not be smooth nor finite, keeping the best of several local searches.
+    """Minimise a cost that need not be smooth nor finite, keeping the best of several local
+    searches.
 
-    Args:
-        cost: function of the parameters, shape (K,).
-        box: admissible range of each parameter.
-        start_range: range of each parameter over which ``settings.grid`` starts are spread evenly, ends included.
-        settings: grid and limits.
-        context: progress and the wish to stop.
+    Parameters
+    ----------
+    cost : Cost
+        Function of the parameters, shape (K,).
+    box : Box
+        Admissible range of each parameter.
+    start_range : Box
+        Range of each parameter over which ``settings.grid`` starts are spread evenly, ends
+        included.
+    settings : DirectSearchSettings
+        Grid and limits.
+    context : FitContext
+        Progress and the wish to stop.
 
-    Raises:
-        DataError: the cost is finite nowhere.
+    Raises
+    ------
+    DataError
+        The cost is finite nowhere.
 
     Source:
         Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
     """
     scale = np.array([high - low for low, high in box])
-    bounds = [(low / own, high / own) for (low, high), own in zip(box, scale, strict=True)]
+    bounds = [(low / width, high / width) for (low, high), width in zip(box, scale, strict=True)]
     limits = {"maxfev": settings.max_evaluations, "xatol": settings.tolerance, "fatol": 1e-12}
     starts = list(
         itertools.product(*(np.linspace(low, high, settings.grid) for low, high in start_range))
@@ -115,7 +127,9 @@ def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> 
 
 
 def _simplex(start: FloatArray, box: Box) -> FloatArray:
-    """A start and a step of 5 % of the box along each parameter, inwards where it would leave the box."""
+    """A start and a step of 5 % of the box along each parameter, inwards where it would leave the
+    box.
+    """
     vertices = np.tile(start, (len(start) + 1, 1))
     for k, (low, high) in enumerate(box):
         step = FIRST_STEP * (high - low)
@@ -133,23 +147,35 @@ def optuna_search(
     stages: int = 1,
     shrink: float = 0.3,
 ) -> SearchRecord:
-    """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
+    """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps
+    in smaller ones around the best so far.
 
-    Args:
-        cost: function of the parameters, shape (K,).
-        box: admissible range of each parameter, which no stage leaves.
-        trials: evaluations of all stages together, shared out evenly.
-        seed: of the random numbers that the first stage draws; the others follow it.
-        context: progress and the wish to stop.
-        stages: how many there are.
-        shrink: width of the box of a stage, relative to that of the stage before.
+    Parameters
+    ----------
+    cost : Cost
+        Function of the parameters, shape (K,).
+    box : Box
+        Admissible range of each parameter, which no stage leaves.
+    trials : int
+        Evaluations of all stages together, shared out evenly.
+    seed : int
+        Of the random numbers that the first stage draws; the others follow it.
+    context : FitContext
+        Progress and the wish to stop.
+    stages : int, default 1
+        How many there are.
+    shrink : float, default 0.3
+        Width of the box of a stage, relative to that of the stage before.
 
-    Raises:
-        MissingError: Optuna is not installed.
-        DataError: the cost is finite nowhere.
+    Raises
+    ------
+    MissingError
+        Optuna is not installed.
+    DataError
+        The cost is finite nowhere.
 
-    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019; stages as in Bertipaglia
-    et al., IEEE Intelligent Vehicles Symposium 2022.
+    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et
+    al., KDD 2019; stages as in Bertipaglia et al., IEEE Intelligent Vehicles Symposium 2022.
     """
     try:
         import optuna
@@ -159,7 +185,7 @@ def optuna_search(
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     rows: list[FloatArray] = []
-    own = list(box)
+    stage_box = list(box)
     width = 1.0
     for stage in range(stages):
         if rows:
@@ -172,12 +198,12 @@ def optuna_search(
                 min(max(v - 0.5 * w, low), high - w)
                 for v, w, (low, high) in zip(best, widths, box, strict=True)
             ]
-            own = [(start, start + w) for start, w in zip(starts, widths, strict=True)]
+            stage_box = [(start, start + w) for start, w in zip(starts, widths, strict=True)]
         share = trials * (stage + 1) // stages - trials * stage // stages
         study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed + stage))
         distributions = {
             str(k): optuna.distributions.FloatDistribution(low, high)
-            for k, (low, high) in enumerate(own)
+            for k, (low, high) in enumerate(stage_box)
         }
         lowest = math.inf
         for number in range(share):

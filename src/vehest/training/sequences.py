@@ -1,4 +1,11 @@
-"""Training by gradient in phases one after another, on sequences or pairs, that a killed run goes on with to the same result."""
+"""Training by gradient descent in consecutive phases, on sequences or on pairs of samples.
+
+    Phase (module, batches, loss, validation) --train_phases--> PhaseRecord, best parameters in the module
+
+Within a phase: batches of an epoch -> loss -> gradient -> clipping -> AdamW -> validation -> best
+parameters. The state is stored as a `Checkpoint`, from which a killed run continues to the same
+result.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +67,9 @@ class PhaseSettings(Group):
 class Phase:
     """What learns, from what, and what is to become small.
 
-    Phases may be of one module or of several that share parameters; what an earlier phase learnt is where a later one starts.
-    The module is never asked for random numbers: what is random about an epoch (order, offsets, masks of dropout) is drawn by ``batches``.
+    Phases may be of one module or of several that share parameters; what an earlier phase learnt is
+    where a later one starts. The module is never asked for random numbers: what is random about an
+    epoch (order, offsets, masks of dropout) is drawn by ``batches``.
     """
 
     name: str  # for people and for the checkpoint; unique among the phases of a training
@@ -115,9 +123,19 @@ class PhaseRecord:
         """Epochs finished."""
         return len(self.train_loss)
 
+    def is_over(self, settings: PhaseSettings) -> bool:
+        """Whether the phase ends here: it diverged, ran all epochs, or its patience is over."""
+        if self.has_diverged or self.epochs >= settings.max_epochs:
+            return True
+        is_validated = self.epochs % settings.validate_every == 0
+        waited = self.epochs - max(self.best_epoch, self.returned_at) if is_validated else 0
+        return 0 < settings.patience <= waited
+
 
 def record_of_phases(phases: Sequence[PhaseRecord]) -> FitRecord:
-    """History over the epochs of all phases, and the last phase's figures; epochs, skipped steps and seconds are those of all."""
+    """History over the epochs of all phases, and the last phase's figures; epochs, skipped steps
+    and seconds are those of all.
+    """
     last = phases[-1]
     metrics = {
         "best_epoch": last.best_epoch,
@@ -149,32 +167,49 @@ def train_phases(
     checkpoint_seconds: float = 15.0,
     twins: Sequence[int] = (),
 ) -> list[PhaseRecord]:
-    """Train one member through its phases by AdamW; each phase ends with the parameters of its best validation.
+    """Train one member through its phases by AdamW; each phase ends with the parameters of its best
+    validation.
 
-    The start of a phase counts as a candidate. A step whose loss or gradient is not finite is skipped and counted. Gradients are clipped
-    element by element. Each phase draws from a stream of its own of ``seed``, so that its batches do not hang on how long the phases before
-    it took.
+    The start of a phase counts as a candidate. A step whose loss or gradient is not finite is
+    skipped and counted. Gradients are clipped element by element. Each phase draws from a stream of
+    its own of ``seed``, so that its batches do not hang on how long the phases before it took.
 
-    Where `SKIPS_ALLOWED` steps in a row are not finite, or a loss raises `DivergenceError`, the phase returns to its best parameters and goes on
-    with half the step size and new moments, at most `MAX_HALVINGS` times. After that it ends with its best parameters, and later phases go on
+    Where `SKIPS_ALLOWED` steps in a row are not finite, or a loss raises `DivergenceError`, the
+    phase returns to its best parameters and goes on with half the step size and new moments, at
+    most `MAX_HALVINGS` times. After that it ends with its best parameters, and later phases go on
     from them.
 
-    A stop ends within the current epoch, which the next run does again; the phase's best parameters so far are in its module then.
+    A stop ends within the current epoch, which the next run does again; the phase's best parameters
+    so far are in its module then.
 
-    Args:
-        phases: in their order; names differ.
-        seed: of the batches.
-        context: where the checkpoint is kept, if anywhere, whether to stop (asked before every batch), whom to tell after every epoch.
-        folder_index: which of ``context.checkpoint_folders`` is this member's, where several train one after the other.
-        checkpoint_seconds: time between two checkpoints [s].
-        twins: other members' folders that keep the same checkpoint, since they get the same weights.
+    Parameters
+    ----------
+    phases : Sequence[Phase]
+        In their order; names differ.
+    seed : int
+        Of the batches.
+    context : FitContext
+        Where the checkpoint is kept, if anywhere, whether to stop (asked before every batch), whom
+        to tell after every epoch.
+    folder_index : int, default 0
+        Which of ``context.checkpoint_folders`` is this member's, where several train one after the
+        other.
+    checkpoint_seconds : float, default 15.0
+        Time between two checkpoints [s].
+    twins : Sequence[int], default ()
+        Other members' folders that keep the same checkpoint, since they get the same weights.
 
-    Returns:
+    Returns
+    -------
+    list[PhaseRecord]
         One record for every phase that was begun.
 
-    Raises:
-        DataError: a phase diverged before anything was learnt, or all of its validations were not finite.
-        ConfigurationError: phases of equal names, or nothing to learn in one.
+    Raises
+    ------
+    DataError
+        A phase diverged before anything was learnt, or all of its validations were not finite.
+    ConfigurationError
+        Phases of equal names, or nothing to learn in one.
 
     Source:
         Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
@@ -190,14 +225,18 @@ def train_phases(
     ]
     run = _Run(phases, seed, context, folder_index, checkpoint_seconds, folders)
     run.resume()
-    while run.position < len(phases) and not run.now.interrupted:
+    while run.position < len(phases) and not run.current.interrupted:
         run.train_phase()
     return run.records
 
 
 @dataclass
 class _Run:
-    """State of a training: records of the phases begun; of the phase under way its parameters, the best of them, moments and generator."""
+    """State of a training.
+
+    ``records`` has one entry for each phase begun. Of the current phase there are the parameters
+    (``state``), the best of them, Adam's moments and the random generator.
+    """
 
     phases: Sequence[Phase]
     seed: int
@@ -213,13 +252,14 @@ class _Run:
         self._begin(0)
 
     @property
-    def now(self) -> PhaseRecord:
-        """The record of the phase under way."""
+    def current(self) -> PhaseRecord:
+        """The record of the current phase."""
         return self.records[-1]
 
     def _begin(self, position: int) -> None:
-        """Stand at the start of a phase, or at the end of all."""
-        self.position, self.best = position, _copies(self.state)
+        """Set the state to the start of a phase, or to the end of all phases."""
+        self.position = position
+        self.best = _copies(self.state)
         if position == len(self.phases):
             return
         phase = self.phase = self.phases[position]
@@ -239,29 +279,31 @@ class _Run:
         return Adam(self.learning.values(), self._step_size(), self.phase.settings.weight_decay)
 
     def _step_size(self) -> float:
-        """That of the epoch under way, halved as often as the phase has diverged."""
+        """Step size of the current epoch, halved once for each divergence of the phase."""
         settings = self.phase.settings
         size = settings.learning_rate
         if settings.schedule == "cosine":
-            progress = self.now.epochs / max(settings.max_epochs, 1)  # 0: a phase left out
+            progress = self.current.epochs / max(settings.max_epochs, 1)  # 0: a phase left out
             size = size * 0.5 * (1.0 + math.cos(math.pi * progress))
-        return size * 0.5**self.now.halvings
+        return size * 0.5**self.current.halvings
 
     def train_phase(self) -> None:
-        """Train the phase under way from where it stands to its end, or until a stop."""
+        """Train the current phase from its present state to its end, or until a stop."""
         phase = self.phase
-        asked = {name: value.requires_grad for name, value in phase.module.named_parameters()}
-        started = time.monotonic() - self.now.seconds
+        requires_grad = {
+            name: value.requires_grad for name, value in phase.module.named_parameters()
+        }
+        started = time.monotonic() - self.current.seconds
         try:
             for name, value in phase.module.named_parameters():
                 value.requires_grad_(name in self.learning)
-            while not self._is_over() and not self.now.interrupted:
+            while not self.current.is_over(phase.settings) and not self.current.interrupted:
                 self._train_epoch(started)
         finally:
             for name, value in phase.module.named_parameters():
-                value.requires_grad_(asked[name])
+                value.requires_grad_(requires_grad[name])
                 value.grad = None
-        now = self.now
+        now = self.current
         if now.epochs and not math.isfinite(now.best_loss) and not now.interrupted:
             raise DataError(
                 now.problem
@@ -271,27 +313,18 @@ class _Run:
         is_trained = any(record.best_epoch for record in self.records)
         if now.problem and not is_trained and not now.interrupted:
             raise DataError(now.problem)
-        _put_back(self.state, self.best)
+        _restore(self.state, self.best)
         if not now.interrupted:
             self._begin(self.position + 1)
             self._save_now_and_then(self.position == len(self.phases))
 
-    def _is_over(self) -> bool:
-        epochs = self.now.epochs
-        settings = self.phase.settings
-        best = max(self.now.best_epoch, self.now.returned_at)
-        waited = epochs - best if epochs % settings.validate_every == 0 else 0
-        return (
-            self.now.has_diverged
-            or epochs >= settings.max_epochs
-            or 0 < settings.patience <= waited
-        )
-
     def _train_epoch(self, started: float) -> None:
-        """One pass over the batches, then the validation; an epoch that is stopped leaves no trace but the checkpoint before it."""
+        """One pass over the batches, then the validation; an epoch that is stopped leaves no trace
+        but the checkpoint before it.
+        """
         phase = self.phase
         settings = self.phase.settings
-        now = self.now
+        now = self.current
         if not now.validated:
             if self.context.should_stop():
                 self._stop(self._checkpoint())
@@ -304,7 +337,7 @@ class _Run:
         before = self._checkpoint()
         self.adam.learning_rate = self._step_size()
         total = 0.0
-        taken = 0
+        finite_steps = 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
             if self.context.should_stop():
                 self._stop(before)
@@ -314,8 +347,8 @@ class _Run:
                 return
             if loss is not None:
                 total = total + loss
-                taken = taken + 1
-        now.train_loss.append(total / taken if taken else math.nan)
+                finite_steps = finite_steps + 1
+        now.train_loss.append(total / finite_steps if finite_steps else math.nan)
         judged = now.epochs % settings.validate_every == 0 or now.epochs == settings.max_epochs
         now.validation_loss.append(self._validate() if judged else math.nan)
         now.seconds = time.monotonic() - started
@@ -332,15 +365,17 @@ class _Run:
         self._save_now_and_then()
 
     def _stop(self, before: Checkpoint) -> None:
-        """End here, as if what came after ``before`` had not been."""
+        """Interrupt the training in the state of ``before``."""
         self._save(before)
         self.records[-1] = PhaseRecord(**before.values["phases"][-1])
-        self.now.interrupted = True
+        self.current.interrupted = True
 
-    def _step(self, batch: Any, where: str) -> float | None:
-        """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
+    def _step(self, batch: Any, place: str) -> float | None:
+        """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in
+        which case nothing is changed.
+        """
         self.adam.zero_grad()
-        now = self.now
+        now = self.current
         try:
             loss = self.phase.loss(batch)
             value = float(loss.detach())
@@ -364,19 +399,21 @@ class _Run:
         now.skipped_in_a_row += 1
         if now.skipped_in_a_row >= SKIPS_ALLOWED:
             self._return_to_best(
-                f"training: phase '{now.name}', {where}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
+                f"training: phase '{now.name}', {place}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
                 f"lower its learning_rate or check the data with 'vehest data check'"
             )
         return None
 
     def _return_to_best(self, problem: str) -> None:
-        """Go on from the phase's best parameters with half the step size, or end the phase after `MAX_HALVINGS` of them."""
-        now = self.now
+        """Go on from the phase's best parameters with half the step size, or end the phase after
+        `MAX_HALVINGS` of them.
+        """
+        now = self.current
         now.problem = problem
         if now.halvings == MAX_HALVINGS:
             now.has_diverged = True
             return
-        _put_back(self.state, self.best)
+        _restore(self.state, self.best)
         now.halvings += 1
         now.skipped_in_a_row = 0
         now.returned_at = now.epochs
@@ -386,9 +423,9 @@ class _Run:
         """The validation loss; the parameters are kept if it is the lowest so far."""
         with torch.no_grad():
             loss = float(self.phase.validation())
-        if loss < self.now.best_loss:
-            self.now.best_loss = loss
-            self.now.best_epoch = self.now.epochs
+        if loss < self.current.best_loss:
+            self.current.best_loss = loss
+            self.current.best_epoch = self.current.epochs
             self.best = _copies(self.state)
         return loss
 
@@ -424,12 +461,12 @@ class _Run:
     def resume(self) -> None:
         """Go on from the checkpoint, if there is one and it is of these phases and modules."""
         checkpoint = load_checkpoint(self.folders[0]) if self.folders else None
-        if checkpoint is None or not self._fits(checkpoint):
+        if checkpoint is None or not _is_of(checkpoint, self.phases, self.state):
             return
         finished = checkpoint.values["finished"]
         records = [PhaseRecord(**record) for record in checkpoint.values["phases"]]
-        best = _named(checkpoint, "best.")
-        _put_back(self.state, best if finished else _named(checkpoint, "now."))
+        best = _tensors_below(checkpoint, "best.")
+        _restore(self.state, best if finished else _tensors_below(checkpoint, "now."))
         self._begin(len(records) if finished else len(records) - 1)
         self.records = records
         if not finished:
@@ -437,32 +474,35 @@ class _Run:
             self.best = best
             self.generator.set_state(checkpoint.tensors["generator"])
             for number, parameter in enumerate(self.learning.values()):
-                self.adam.state[parameter] = _named(checkpoint, f"adam.{number}.")
+                self.adam.state[parameter] = _tensors_below(checkpoint, f"adam.{number}.")
 
-    def _fits(self, checkpoint: Checkpoint) -> bool:
-        names = [record["name"] for record in checkpoint.values.get("phases", ())]
-        known = [phase.name for phase in self.phases]
-        shapes = {name: value.shape for name, value in _named(checkpoint, "best.").items()}
-        enough = len(names) == len(known) if checkpoint.values["finished"] else bool(names)
-        return (
-            enough
-            and names == known[: len(names)]
-            and shapes == {name: value.shape for name, value in self.state.items()}
-        )
+
+def _is_of(checkpoint: Checkpoint, phases: Sequence[Phase], state: Mapping[str, Tensor]) -> bool:
+    """Whether a checkpoint has the names of these phases and the shapes of this state."""
+    names = [record["name"] for record in checkpoint.values.get("phases", ())]
+    phase_names = [phase.name for phase in phases]
+    shapes = {name: value.shape for name, value in _tensors_below(checkpoint, "best.").items()}
+    has_phases = len(names) == len(phase_names) if checkpoint.values["finished"] else bool(names)
+    return (
+        has_phases
+        and names == phase_names[: len(names)]
+        and shapes == {name: value.shape for name, value in state.items()}
+    )
 
 
 def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator) -> Tensor:
-    """First rows of as many sequences of ``steps`` samples as fit into each of drives that lie one after another, in random order.
+    """First rows of as many sequences of ``steps`` samples as fit into each of drives that lie one
+    after another, in random order.
 
     Those of a drive follow one another from an offset that is drawn.
     """
     firsts: list[int] = []
     offset = 0
     for length in lengths:
-        used = length // steps * steps
-        if used:
-            shift = offset + int(torch.randint(length - used + 1, (), generator=generator))
-            firsts += range(shift, shift + used, steps)
+        used_samples = length // steps * steps
+        if used_samples:
+            shift = offset + int(torch.randint(length - used_samples + 1, (), generator=generator))
+            firsts += range(shift, shift + used_samples, steps)
         offset += length
     return torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
 
@@ -470,11 +510,11 @@ def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator)
 def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:
     """Parameters and buffers of all phases, each once, under the first phase that has it."""
     state: dict[str, Tensor] = {}
-    seen: set[int] = set()
+    collected_ids: set[int] = set()
     for position, phase in enumerate(phases):
         for name, value in phase.module.state_dict(keep_vars=True).items():
-            if id(value) not in seen:
-                seen.add(id(value))
+            if id(value) not in collected_ids:
+                collected_ids.add(id(value))
                 state[f"{position}.{name}"] = value
     return state
 
@@ -483,13 +523,15 @@ def _copies(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in tensors.items()}
 
 
-def _put_back(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
+def _restore(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    """Copy values into the tensors of a state, in place."""
     with torch.no_grad():
         for name, value in state.items():
             value.copy_(values[name])
 
 
-def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
+def _tensors_below(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
+    """Tensors of a checkpoint whose names begin with a prefix, without it."""
     return {
         name.removeprefix(prefix): value
         for name, value in checkpoint.tensors.items()
@@ -498,7 +540,9 @@ def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
 
 
 def _stream(seed: int, position: int) -> int:
-    """A stream for the batches of a phase that has nothing to do with the one the initial weights were drawn from."""
+    """A stream for the batches of a phase that has nothing to do with the one the initial weights
+    were drawn from.
+    """
     return int(
         np.random.SeedSequence([seed, 1, position]).generate_state(1, np.uint64)[0] >> np.uint64(1)
     )

@@ -1,11 +1,18 @@
-"""Supervised training of windowed networks: Adam on the mean squared error, early stopping, members side by side."""
+"""Supervised training of windowed networks: Adam on the mean squared error, with early stopping.
+
+    windows -> `_Prepared` -> batches -> `_Run._descend` or `_Run._step` -> validation -> `_Member`
+
+Members (networks of one shape) train as one batch. `_Run` has the weights, their average and Adam's
+moments of those that still train, one row each; a `_Member` has what does not depend on the batch: best
+weights, losses, the order of windows. A member trains to the same bits as it would alone.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -44,29 +51,46 @@ def train_members(
     settings: SupervisedSettings,
     context: FitContext,
 ) -> list[FitRecord]:
-    """Train networks of one shape together; each ends with its own best weights, as if it had been trained alone.
+    """Train networks of one shape together; each ends with its own best weights, as if it had been
+    trained alone.
 
-    Every member draws its own order of the windows from its own seed, stops on its own, and leaves the batch then.
+    Every member draws its own order of the windows from its own seed, stops on its own, and leaves
+    the batch then.
 
-    A member whose validation loss is not finite has diverged: it leaves the batch, and goes on alone afterwards from its best weights (those it
-    began with, where no epoch was better) with half the step size and new moments, at most `MAX_HALVINGS` times. After that it ends with its
+    A member whose validation loss is not finite has diverged: it leaves the batch, and goes on
+    alone afterwards from its best weights (those it began with, where no epoch was better) with
+    half the step size and new moments, at most `MAX_HALVINGS` times. After that it ends with its
     best weights.
 
-    Args:
-        networks: M networks of one shape and preparation; changed in place, and in evaluation mode afterwards.
-        seeds: their seeds.
-        train: windows to learn from.
-        validation: windows that decide when to stop and which weights to keep.
-        settings: see `SupervisedSettings`.
-        context: checkpoints, progress and the wish to stop.
+    Parameters
+    ----------
+    networks : Sequence[nn.Module]
+        M networks of one shape and preparation; changed in place, and in evaluation mode
+        afterwards.
+    seeds : Sequence[int]
+        Their seeds.
+    train : WindowSet
+        Windows to learn from.
+    validation : WindowSet
+        Windows that decide when to stop and which weights to keep.
+    settings : SupervisedSettings
+        See `SupervisedSettings`.
+    context : FitContext
+        Checkpoints, progress and the wish to stop.
 
-    Returns:
-        M records, with mean squared errors [m²/s²] over the batches of each epoch and on the validation windows after it. A best epoch of
-        0: none was finished. Seconds are wall time by member, not counting earlier runs that a checkpoint continues.
+    Returns
+    -------
+    list[FitRecord]
+        M records, with mean squared errors [m²/s²] over the batches of each epoch and on the
+        validation windows after it. A best epoch of 0: none was finished. Seconds are wall time by
+        member, not counting earlier runs that a checkpoint continues.
 
-    Raises:
-        DataError: a member diverged in its first epoch and with every smaller step size.
-        ConfigurationError: a network does not return one number a window.
+    Raises
+    ------
+    DataError
+        A member diverged in its first epoch and with every smaller step size.
+    ConfigurationError
+        a network does not return one number a window.
 
     Source:
         Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015, Section 7.2 for the averaging of the weights.
@@ -80,9 +104,202 @@ def train_members(
     return run.finish()
 
 
+@dataclass(eq=False)
+class _Member:
+    """Best weights, losses and random numbers of one member."""
+
+    best: Tensor  # weights with the lowest validation loss so far, (K,)
+    generator: torch.Generator  # of the order of windows, and of seeds of dropout
+    best_loss: float = math.inf  # validation loss of the best weights
+    best_epoch: int = 0  # from 1; 0: no epoch was better than the start
+    halvings: int = 0  # of the step size, one at each divergence
+    returned_at: int = 0  # epoch of the last divergence
+    has_diverged: bool = False  # whether the smallest step size diverged too
+    train_loss: list[float] = field(default_factory=list)
+    validation_loss: list[float] = field(default_factory=list)
+
+    def patience_start(self) -> int:
+        """Epoch from which the patience counts."""
+        return max(self.best_epoch, self.returned_at)
+
+    def checkpoint(self, state: dict[str, Tensor], is_finished: bool) -> Checkpoint:
+        """A checkpoint with these parameters and moments, empty where the training is over."""
+        tensors = {"best": self.best.clone(), **state}
+        if not is_finished:
+            tensors["generator"] = self.generator.get_state()
+        values = {
+            "finished": is_finished,
+            "halvings": self.halvings,
+            "returned_at": self.returned_at,
+            "has_diverged": self.has_diverged,
+            "epoch": len(self.validation_loss),
+            "best_epoch": self.best_epoch,
+            "best_loss": self.best_loss,
+            "train_loss": list(self.train_loss),
+            "validation_loss": list(self.validation_loss),
+        }
+        return Checkpoint(tensors, values)
+
+    def load(self, checkpoint: Checkpoint) -> dict[str, Tensor]:
+        """Continue from a checkpoint; returns its parameters and moments."""
+        state = dict(checkpoint.tensors)
+        values = checkpoint.values
+        self.best = state.pop("best")
+        self.best_loss = values["best_loss"]
+        self.best_epoch = values["best_epoch"]
+        self.halvings = values.get("halvings", 0)
+        self.returned_at = values.get("returned_at", 0)
+        self.has_diverged = values.get("has_diverged", False)
+        self.train_loss = values["train_loss"]
+        self.validation_loss = values["validation_loss"]
+        if not values["finished"]:
+            self.generator.set_state(state.pop("generator"))
+        return state
+
+    def record(self, seconds: float, is_interrupted: bool) -> FitRecord:
+        """The record of the fit, which took ``seconds`` of wall time."""
+        metrics = {
+            "best_epoch": self.best_epoch,
+            "best_validation_loss": min(
+                filter(math.isfinite, self.validation_loss), default=math.nan
+            ),
+            **divergence_metrics(self.halvings, self.has_diverged),
+            "train_seconds": seconds,
+        }
+        return record_of_epochs(self.train_loss, self.validation_loss, metrics, is_interrupted)
+
+
+class _Batch:
+    """Weights that train together with Adam's moments and their running average, one row a member.
+
+    Parameters
+    ----------
+    network : nn.Module
+        Whose forward, or compiled recursion, all rows use.
+    state : dict[str, Tensor]
+        ``parameters`` (M, K), and perhaps ``step``, ``exp_avg``, ``exp_avg_sq`` and ``average``.
+        There is no average before the first step, and none without averaging.
+    fixed : Mapping[str, Tensor]
+        Buffers, and parameters that are not trained, (M, ...).
+    generators : Sequence[torch.Generator]
+        Random numbers of each member.
+    step_size : float
+        Of Adam.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        state: dict[str, Tensor],
+        fixed: Mapping[str, Tensor],
+        generators: Sequence[torch.Generator],
+        step_size: float,
+        settings: SupervisedSettings,
+    ) -> None:
+        self.network = network
+        self.layout = FlatParameters(network)
+        self.fixed = fixed
+        self.generators = generators
+        self.settings = settings
+        self.average = state.pop("average", None)
+        self.weights = nn.Parameter(state.pop("parameters").clone())
+        self.adam = Adam([self.weights], step_size)
+        if state:
+            self.adam.state[self.weights] = state
+
+    def rows(self, rows: Tensor | int) -> dict[str, Tensor]:
+        """Copies of weights, average and moments of some members; Adam's step is that of all."""
+        state = {"parameters": self.weights.detach(), **self.adam.state.get(self.weights, {})}
+        if self.average is not None:
+            state["average"] = self.average
+        return {
+            name: (values[rows] if values.dim() else values).clone()
+            for name, values in state.items()
+        }
+
+    def averaged(self) -> Tensor:
+        """The average of the weights where there is one, otherwise the weights, (M, K)."""
+        return self.weights.detach() if self.average is None else self.average
+
+    def predict(
+        self, weights: Tensor, data: _Prepared, starts: Tensor, seeds: Sequence[int] = ()
+    ) -> Tensor:
+        """Predictions of all members with weights (M, K) on windows from ``starts`` (M, B): (M, B)."""
+        return predict_members(
+            self.network,
+            {**self.layout.views(weights), **self.fixed},
+            data.series,
+            starts,
+            data.n_window,
+            compiled=self.settings.compiled,
+            seeds=seeds,
+        )
+
+    def step(self, data: _Prepared, windows: Tensor) -> Tensor:
+        """One step of Adam on windows (M, B); returns sums of squared errors, (M,)."""
+        self.adam.zero_grad()
+        prediction = self.predict(self.weights, data, data.starts[windows], self._dropout_seeds())
+        losses = (prediction - data.targets[windows]).square().mean(dim=1)
+        losses.sum().backward()
+        self.adam.step()
+        with torch.no_grad():
+            constrain(self.network, self.layout.views(self.weights.detach()))
+        if self.settings.averaging:
+            self._update_average()
+        return losses.detach().double() * windows.shape[1]
+
+    def descend(self, data: _Prepared, windows: Tensor) -> Tensor:
+        """The steps of several batches by compiled code; arguments and result as those of `step`."""
+        settings = self.settings
+        weights = self.weights.detach()
+        state = self.adam.state[self.weights]
+        if not state:
+            state |= {
+                "step": torch.tensor(0.0),
+                "exp_avg": torch.zeros_like(weights),
+                "exp_avg_sq": torch.zeros_like(weights),
+            }
+        if settings.averaging and self.average is None:
+            self.average = torch.zeros_like(weights)
+        bounds = weights.new_tensor([[-math.inf], [math.inf]]).repeat(1, weights.shape[1])
+        constrain(self.network, self.layout.views(bounds))
+        losses: Tensor = self.network.compiled_descent(  # type: ignore[operator]
+            weights,
+            state | ({"average": self.average} if settings.averaging else {}),
+            data.series,
+            data.starts[windows],
+            data.targets[windows],
+            settings.batch_size,
+            self.adam.learning_rate,
+            bounds,
+            settings.averaging,
+        )
+        return losses
+
+    def _update_average(self) -> None:
+        """Add the weights after step t to their average θ̄ₜ = (1 - a)/(1 - aᵗ) Σᵢ aᵗ⁻ⁱ θᵢ, i = 1 … t.
+
+        The factor makes the weights of the sum add up to one from the first step on.
+        """
+        if self.average is None:
+            self.average = self.weights.detach().clone()
+            return
+        decay = self.settings.averaging
+        step = float(self.adam.state[self.weights]["step"])
+        self.average.lerp_(self.weights.detach(), (1.0 - decay) / (1.0 - decay**step))
+
+    def _dropout_seeds(self) -> list[int]:
+        """One seed a member for layers of plain networks that draw; compiled networks draw nothing."""
+        if not is_plain(self.network):
+            return []
+        return [
+            int(torch.randint(2**63 - 1, (), generator=generator)) for generator in self.generators
+        ]
+
+
 @dataclass
 class _Run:
-    """State of one training; rows of ``flat``, of its average and of Adam's moments belong to the members in ``active``."""
+    """A training of several members; rows of ``batch`` belong to the members in ``active``."""
 
     networks: Sequence[nn.Module]
     seeds: Sequence[int]
@@ -92,252 +309,152 @@ class _Run:
     context: FitContext
 
     def __post_init__(self) -> None:
-        members = len(self.networks)
         self.network = self.networks[0]
-        self.layout = FlatParameters(self.network)
         self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
-        self.train, self.validation = (
-            _Prepared(self.network, own, self.settings)
-            for own in (self.train_windows, self.validation_windows)
-        )
-        flat = self.layout.pack(self.networks)
-        self.best = flat.clone()
-        self.best_loss = torch.full((members,), math.inf, dtype=torch.float64)
-        self.best_epoch = torch.zeros(members, dtype=torch.int64)
-        self.halvings = [0] * members  # of the step size, one at each divergence
-        self.returned_at = torch.zeros(members, dtype=torch.int64)  # epoch of the last of them
-        self.has_diverged = [False] * members  # whether the smallest step size diverged too
-        # members that go on alone later, in their order, with the state of `_rows` that they go on
-        # from; an empty state is their best weights
-        self.diverged: dict[int, dict[str, Tensor]] = {}
-        self.active = torch.arange(members)
-        self.generators = [
-            torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds
+        self.train = _Prepared(self.network, self.train_windows, self.settings)
+        self.validation = _Prepared(self.network, self.validation_windows, self.settings)
+        weights = FlatParameters(self.network).pack(self.networks)
+        self.members = [
+            _Member(start.clone(), torch.Generator().manual_seed(_shuffle_seed(seed)))
+            for start, seed in zip(weights, self.seeds, strict=True)
         ]
-        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in self.networks]
+        # members that continue alone later, in their order, with the state that they continue from;
+        # an empty state stands for their best weights
+        self.diverged: dict[int, dict[str, Tensor]] = {}
         self.epoch = 0  # of the members still active
         self.interrupted = False
-        self.started = self.saved = time.monotonic()
-        self._go_on_with({"parameters": flat})
+        self.started = time.monotonic()
+        self.saved = self.started
+        self._activate(list(range(len(self.members))), {"parameters": weights})
 
-    def _rows(self, rows: Tensor | int) -> dict[str, Tensor]:
-        """Copies of parameters, their average and Adam's moments of some active members; Adam's step is that of all."""
-        held = {"parameters": self.flat.detach(), **self.adam.state.get(self.flat, {})}
-        if self.average is not None:
-            held["average"] = self.average
-        return {
-            name: (values[rows] if values.dim() else values).clone()
-            for name, values in held.items()
-        }
-
-    def _go_on_with(self, rows: dict[str, Tensor]) -> None:
-        """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
-        self.average = rows.pop("average", None)
-        self.flat = nn.Parameter(rows.pop("parameters").clone())
-        self.adam = Adam([self.flat], self._step_size())
-        if rows:
-            self.adam.state[self.flat] = rows
-
-    def _step_size(self) -> float:
-        """That of the active members, which are those that never diverged, or a single one."""
-        halvings = self.halvings[int(self.active[0])] if len(self.active) else 0
-        return self.settings.learning_rate * 0.5**halvings
+    def _activate(self, members: list[int], state: dict[str, Tensor]) -> None:
+        """Train these members from now on, from a state as `_Batch` receives it."""
+        self.active = members
+        # active members never diverged, or there is a single one
+        halvings = self.members[members[0]].halvings if members else 0
+        self.batch = _Batch(
+            self.network,
+            state,
+            {name: values[members] for name, values in self.fixed.items()},
+            [self.members[index].generator for index in members],
+            self.settings.learning_rate * 0.5**halvings,
+            self.settings,
+        )
 
     def train_batch(self) -> None:
         """Train the active members until each is over, or until a stop."""
-        while self.active.numel() and self.epoch < self.settings.max_epochs:
+        while self.active and self.epoch < self.settings.max_epochs:
             self.train_epoch()
             if self.interrupted:
                 return
 
     def go_on_alone(self, member: int) -> None:
         """Let a member that has diverged be the only active one."""
-        rows = self.diverged.pop(member)
-        self.active = torch.tensor([member])
-        self.epoch = len(self.history[member][1])
-        self._go_on_with(rows or {"parameters": self.best[[member]]})
+        state = self.diverged.pop(member)
+        self.epoch = len(self.members[member].validation_loss)
+        self._activate([member], state or {"parameters": self.members[member].best.unsqueeze(0)})
 
     def train_epoch(self) -> None:
-        """One pass over the training windows, then the validation loss and the decisions that hang on it."""
+        """One pass over the training windows, then the validation."""
         before = self._checkpoints()
         order = torch.stack(
             [
-                torch.randperm(len(self.train), generator=self.generators[m])
-                for m in self.active.tolist()
+                torch.randperm(len(self.train), generator=self.members[index].generator)
+                for index in self.active
             ]
         )
         total = torch.zeros(len(self.active), dtype=torch.float64)
         self.network.train()
         compiled = self.settings.compiled and hasattr(self.network, "compiled_descent")
-        for batches in order.split(self.settings.batch_size * (BATCHES if compiled else 1), dim=1):
+        train = self.batch.descend if compiled else self.batch.step
+        for windows in order.split(self.settings.batch_size * (BATCHES if compiled else 1), dim=1):
             if self.context.should_stop():
                 self.interrupted = True
                 self._save(before)
                 return
-            total += self._descend(batches) if compiled else self._step(batches)
+            total += train(self.train, windows)
         self.epoch += 1
         self._judge(total / len(self.train))
 
-    def _step(self, batch: Tensor) -> Tensor:
-        """One step of Adam; sums of squared errors of the members, (M,)."""
-        self.adam.zero_grad()
-        views = self.layout.views(self.flat)
-        error = (
-            self._predict(views, self.train, self.train.starts[batch], self._batch_seeds())
-            - self.train.targets[batch]
-        )
-        losses = error.square().mean(dim=1)
-        losses.sum().backward()
-        self.adam.step()
-        with torch.no_grad():
-            constrain(self.network, self.layout.views(self.flat.detach()))
-        if self.settings.averaging:
-            self._average()
-        return losses.detach().double() * batch.shape[1]
-
-    def _descend(self, batches: Tensor) -> Tensor:
-        """The same for several batches by compiled code."""
-        own = self.settings
-        flat = self.flat.detach()
-        state = self.adam.state[self.flat]
-        if not state:
-            state |= {
-                "step": torch.tensor(0.0),
-                "exp_avg": torch.zeros_like(flat),
-                "exp_avg_sq": torch.zeros_like(flat),
-            }
-        if own.averaging and self.average is None:
-            self.average = torch.zeros_like(flat)
-        moments = state | ({"average": self.average} if own.averaging else {})
-        bounds = flat.new_tensor([[-math.inf], [math.inf]]).repeat(1, flat.shape[1])
-        constrain(self.network, self.layout.views(bounds))
-        starts = self.train.starts[batches]
-        targets = self.train.targets[batches]
-        numbers = own.batch_size, self._step_size(), bounds, own.averaging
-        losses: Tensor = self.network.compiled_descent(
-            flat, moments, self.train.series, starts, targets, *numbers
-        )  # type: ignore[operator]
-        return losses
-
-    def _average(self) -> None:
-        """Take the weights after this step into their average, θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t.
-
-        The factor in front, with which the weights add up to one from the first step on, is in the step's share of the recursion.
-        """
-        if self.average is None:
-            self.average = self.flat.detach().clone()
-            return
-        decay = self.settings.averaging
-        step = float(self.adam.state[self.flat]["step"])
-        self.average.lerp_(self.flat.detach(), (1.0 - decay) / (1.0 - decay**step))
-
-    def _batch_seeds(self) -> list[int]:
-        """What plain networks draw from for one batch (dropout), one seed an active member; compiled ones draw nothing."""
-        if not is_plain(self.network):
-            return []
-        return [
-            int(torch.randint(2**63 - 1, (), generator=self.generators[member]))
-            for member in self.active.tolist()
-        ]
-
-    def _predict(
-        self,
-        parameters: dict[str, Tensor],
-        data: _Prepared,
-        starts: Tensor,
-        seeds: Sequence[int] = (),
-    ) -> Tensor:
-        state = parameters | {name: values[self.active] for name, values in self.fixed.items()}
-        compiled = self.settings.compiled
-        return predict_members(
-            self.network, state, data.series, starts, data.n_window, compiled=compiled, seeds=seeds
-        )
-
     def _judge(self, train_loss: Tensor) -> None:
-        """Validate the weights, or their average where there is one; keep the best, and let members leave whose patience is over."""
-        judged = self.flat.detach() if self.average is None else self.average
+        """Validate the weights or their average; members that are over leave the batch."""
+        weights = self.batch.averaged()
         self.network.eval()
         with torch.no_grad():
             starts = self.validation.starts.expand(len(self.active), -1)
-            prediction = self._predict(self.layout.views(judged), self.validation, starts)
+            prediction = self.batch.predict(weights, self.validation, starts)
             loss = (prediction.double() - self.validation.targets.double()).square().mean(dim=1)
-        for member, *losses in zip(
-            self.active.tolist(), train_loss.tolist(), loss.tolist(), strict=True
-        ):
-            for values, value in zip(self.history[member], losses, strict=True):
-                values.append(value)
-            if not math.isfinite(losses[1]):
-                self._return_to_best(member, losses[1])
-        better = loss < self.best_loss[self.active]
-        improved = self.active[better]
-        self.best[improved] = judged[better]
-        self.best_loss[improved] = loss[better]
-        self.best_epoch[improved] = self.epoch
-        waited_from = torch.maximum(self.best_epoch, self.returned_at)[self.active]
-        going_on = self.epoch - waited_from < self.settings.patience
-        going_on &= torch.isfinite(loss)
-        if not bool(going_on.all()):
-            self.active = self.active[going_on]
-            self._go_on_with(self._rows(going_on))
+        is_training = [
+            self._record_losses(index, *values)
+            for index, *values in zip(
+                self.active, weights, train_loss.tolist(), loss.tolist(), strict=True
+            )
+        ]
+        if not all(is_training):
+            remaining = [row for row, goes_on in enumerate(is_training) if goes_on]
+            self._activate(
+                [self.active[row] for row in remaining],
+                self.batch.rows(torch.tensor(remaining, dtype=torch.int64)),
+            )
         self.context.on_progress(
             Progress(
                 self.epoch,
                 self.settings.max_epochs,
                 len(self.active),
                 len(self.networks),
-                float(self.best_loss.min()),
+                min(member.best_loss for member in self.members),
             )
         )
         if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
             self._save(self._checkpoints())
 
-    def _return_to_best(self, member: int, loss: float) -> None:
-        """Note that a member goes on alone from its best weights, or that it is over: in its last epoch, or
-        after `MAX_HALVINGS` halvings.
+    def _record_losses(
+        self, index: int, weights: Tensor, train_loss: float, validation_loss: float
+    ) -> bool:
+        """Note the losses of an epoch; return whether the member trains on in this batch.
 
-        Raises `DataError`: it is over and no epoch of it was finite.
+        A member that diverged continues alone from its best weights, unless this was its last epoch
+        or its step size was halved `MAX_HALVINGS` times. Raises `DataError`: no epoch was finite.
         """
-        if self.halvings[member] < MAX_HALVINGS and self.epoch < self.settings.max_epochs:
-            self.halvings[member] += 1
-            self.returned_at[member] = self.epoch
-            self.diverged[member] = {}
-            return
-        if not self.best_epoch[member]:
+        member = self.members[index]
+        member.train_loss.append(train_loss)
+        member.validation_loss.append(validation_loss)
+        if math.isfinite(validation_loss):
+            if validation_loss < member.best_loss:
+                member.best = weights.clone()
+                member.best_loss = validation_loss
+                member.best_epoch = self.epoch
+            return self.epoch - member.patience_start() < self.settings.patience
+        if member.halvings < MAX_HALVINGS and self.epoch < self.settings.max_epochs:
+            member.halvings += 1
+            member.returned_at = self.epoch
+            self.diverged[index] = {}
+            return False
+        if not member.best_epoch:
             raise DataError(
-                f"training: the validation loss of member {member} is {loss} after epoch {self.epoch}; "
-                f"lower training.learning_rate or check the data with 'vehest data check'"
+                f"training: the validation loss of member {index} is {validation_loss} after epoch "
+                f"{self.epoch}; lower training.learning_rate or check the data with 'vehest data check'"
             )
-        self.has_diverged[member] = True
+        member.has_diverged = True
+        return False
 
     def _checkpoints(self) -> list[Checkpoint]:
-        """The state of every member, each by itself, so that any of them can go on without the others."""
-        row_of = {member: row for row, member in enumerate(self.active.tolist())}
+        """The state of every member, each by itself, so that any of them can go on without the
+        others.
+        """
+        row_of = {index: row for row, index in enumerate(self.active)}
         checkpoints = []
-        for member, (train_loss, validation_loss) in enumerate(self.history):
-            tensors = {"best": self.best[member].clone()}
-            if member in row_of:
-                tensors |= {
-                    "generator": self.generators[member].get_state(),
-                    **self._rows(row_of[member]),
-                }
-            if member in self.diverged:
-                rows = {
+        for index, member in enumerate(self.members):
+            state: dict[str, Tensor] = {}
+            if index in row_of:
+                state = self.batch.rows(row_of[index])
+            elif index in self.diverged:
+                state = {
                     name: row if row.dim() == 0 else row[0]
-                    for name, row in self.diverged[member].items()
+                    for name, row in self.diverged[index].items()
                 }
-                tensors |= {"generator": self.generators[member].get_state(), **rows}
-            values = {
-                "finished": member not in row_of and member not in self.diverged,
-                "halvings": self.halvings[member],
-                "returned_at": int(self.returned_at[member]),
-                "has_diverged": self.has_diverged[member],
-                "epoch": len(validation_loss),
-                "best_epoch": int(self.best_epoch[member]),
-                "best_loss": float(self.best_loss[member]),
-                "train_loss": list(train_loss),
-                "validation_loss": list(validation_loss),
-            }
-            checkpoints.append(Checkpoint(tensors, values))
+            is_finished = index not in row_of and index not in self.diverged
+            checkpoints.append(member.checkpoint(state, is_finished))
         return checkpoints
 
     def _save(self, checkpoints: Sequence[Checkpoint]) -> None:
@@ -346,11 +463,13 @@ class _Run:
             save_checkpoint(folder, checkpoint)
 
     def resume(self) -> None:
-        """Go on from the members' checkpoints, if all have one and those that are not finished agree in the epoch."""
+        """Go on from the members' checkpoints, if all have one and those that are not finished
+        agree in the epoch.
+        """
         loaded = [load_checkpoint(folder) for folder in self.context.checkpoint_folders]
         checkpoints = [checkpoint for checkpoint in loaded if checkpoint is not None]
         if len(checkpoints) < len(self.networks) or any(
-            c.tensors["best"].shape != self.best[0].shape for c in checkpoints
+            c.tensors["best"].shape != self.members[0].best.shape for c in checkpoints
         ):
             return
         unfinished = [
@@ -362,47 +481,32 @@ class _Run:
         epochs = {checkpoints[member].values["epoch"] for member in together}
         if len(epochs) > 1:
             return
-        for member, (tensors, values) in enumerate(checkpoints):
-            self.best[member] = tensors["best"]
-            self.best_loss[member] = values["best_loss"]
-            self.best_epoch[member] = values["best_epoch"]
-            self.halvings[member] = values.get("halvings", 0)
-            self.returned_at[member] = values.get("returned_at", 0)
-            self.has_diverged[member] = values.get("has_diverged", False)
-            self.history[member] = (values["train_loss"], values["validation_loss"])
-        self.active = torch.tensor(together, dtype=torch.int64)
+        states = [
+            member.load(checkpoint)
+            for member, checkpoint in zip(self.members, checkpoints, strict=True)
+        ]
+        self.active = together
         self.epoch = (
             epochs.pop()
             if epochs
             else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
         )
-        states = {member: dict(checkpoints[member].tensors) for member in unfinished}
-        for member, state in states.items():
-            self.generators[member].set_state(state.pop("generator"))
-            del state["best"]
         if together:
-            self._go_on_with(_stacked([states[member] for member in together]))
+            self._activate(together, _stacked([states[member] for member in together]))
         for member in unfinished:
             if member not in together:
                 self.diverged[member] = _stacked([states[member]])
 
     def finish(self) -> list[FitRecord]:
-        """Put the best weights into the networks."""
+        """Copy the best weights into the networks."""
         seconds = (time.monotonic() - self.started) / len(self.networks)
-        records = []
-        for member, (network, losses) in enumerate(zip(self.networks, self.history, strict=True)):
-            self.layout.unpack(self.best[member], network.eval())
-            figures = {
-                "best_epoch": int(self.best_epoch[member]),
-                "best_validation_loss": min(filter(math.isfinite, losses[1]), default=math.nan),
-                **divergence_metrics(self.halvings[member], self.has_diverged[member]),
-            }
-            is_unfinished = member in self.active.tolist() or member in self.diverged
-            unfinished = self.interrupted and is_unfinished
-            records.append(
-                record_of_epochs(*losses, {**figures, "train_seconds": seconds}, unfinished)
-            )
-        return records
+        unfinished = {*self.active, *self.diverged} if self.interrupted else set()
+        layout = FlatParameters(self.network)
+        for network, member in zip(self.networks, self.members, strict=True):
+            layout.unpack(member.best, network.eval())
+        return [
+            member.record(seconds, index in unfinished) for index, member in enumerate(self.members)
+        ]
 
 
 def _stacked(states: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -431,5 +535,7 @@ class _Prepared:
 
 
 def _shuffle_seed(seed: int) -> int:
-    """A stream for shuffling that has nothing to do with the one the initial weights were drawn from."""
+    """A stream for shuffling that has nothing to do with the one the initial weights were drawn
+    from.
+    """
     return int(np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -1,7 +1,14 @@
-"""Training of a filter's model: as a one-step predictor, and through the filter, on sequences that start at the true state.
+"""Training of a filter's model: as a one-step predictor, and through the filter, on sequences that
+start at the true state.
 
-Knows neither cars nor which filter it is: ``filtering`` is a module with ``mirror``, ``moved``, ``begin_noise``, ``estimated`` and
-``estimate_for_validation``, as `vehest.estimators.filtering.car_filter.CarFilter` has them.
+    drives --sequences_of, placed--> batches --filtering.estimated--> errors --loss--> gradients
+
+`one_step_phase` and `filter_phases` return `Phase`s, which `vehest.training.sequences.train_phases`
+runs.
+
+The module uses no property of cars or of a certain filter: ``filtering`` is a module with
+``mirror``, ``moved``, ``begin_noise``, ``estimated`` and ``estimate_for_validation``, as
+`vehest.estimators.filtering.car_filter.CarFilter` has them.
 
 Source: Węgrzynowski et al. 2024, Section III-B.4.
 """
@@ -31,7 +38,9 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class ThroughFilterSettings(Group):
-    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors' code)."""
+    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors'
+    code).
+    """
 
     group = "training"
     version: ClassVar[str] = "1"
@@ -103,7 +112,9 @@ class ThroughFilterSettings(Group):
 
 
 class Weights(NamedTuple):
-    """Weight of each state's squared error, (n,): of the one-step prediction, through the filter, and when judging epochs."""
+    """Weight of each state's squared error, (n,): of the one-step prediction, through the filter,
+    and when judging epochs.
+    """
 
     one_step: Tensor
     training: Tensor
@@ -118,7 +129,10 @@ def one_step_phase(
     settings: ThroughFilterSettings,
     trainable: Callable[[str], bool],
 ) -> Phase:
-    """The model as a predictor of the next sample."""
+    """Phase that trains the model as a predictor of the next sample, without the filter.
+
+    Loss: mean over pairs of samples of Σ_i w_i (f(x, u)_i - x⁺_i)², with w = ``weights.one_step``.
+    """
     before, inputs, after = _pairs(train)
     judged = _pairs(validation)
     signs = [before.new_tensor(list(filtering.mirror[part])) for part in (0, 1)]
@@ -130,9 +144,10 @@ def one_step_phase(
     def loss(batch: tuple[Tensor, Tensor]) -> Tensor:
         rows, turned = batch
         states = torch.where(turned, signs[0], 1.0)
-        own = torch.where(turned, signs[1], 1.0)
+        input_signs = torch.where(turned, signs[1], 1.0)
         return _weighted(
-            filtering.moved(states * before[rows], own * inputs[rows]) - states * after[rows],
+            filtering.moved(states * before[rows], input_signs * inputs[rows])
+            - states * after[rows],
             weights.one_step,
         )
 
@@ -148,13 +163,20 @@ def filter_phases(
     validation: Sequence[Drive],
     weights: Weights,
     settings: ThroughFilterSettings,
-    how: PhaseSettings,
+    phase_settings: PhaseSettings,
     trainable: Callable[[str], bool],
     name: str,
 ) -> list[Phase]:
-    """Through the filter: one phase a length of the curriculum, the last on whole sequences.
+    """Phases that train through the filter: one for each length of the curriculum, then full
+    length.
 
-    Raises `DataError`: no training or validation drive is long enough.
+    Loss of a batch: mean over its samples of Σ_i w_i (x̂_i - x_i)², with w = ``weights.training``,
+    plus ``settings.likelihood`` times `gaussian_surprise`.
+
+    Raises
+    ------
+    DataError
+        No training or validation drive is long enough.
     """
     judged = sequences_of(validation, settings.validation_steps)
     judged_by = torch.nonzero(weights.validation).flatten()
@@ -177,46 +199,61 @@ def filter_phases(
             for rows in order.split(settings.batch_size):
                 turned = _chosen(len(rows), settings.mirrored, generator).unsqueeze(-1)
                 signs = [
-                    torch.where(turned, part.new_tensor(list(own)), 1.0)
-                    for part, own in zip(drives, filtering.mirror, strict=True)
+                    torch.where(turned, part.new_tensor(list(mirror_signs)), 1.0)
+                    for part, mirror_signs in zip(drives, filtering.mirror, strict=True)
                 ]
-                own = Drive(*(part[rows] * own for part, own in zip(drives, signs, strict=True)))
-                start = own.states[:, 0].clone()
+                batch = Drive(
+                    *(part[rows] * sign for part, sign in zip(drives, signs, strict=True))
+                )
+                start = batch.states[:, 0].clone()
                 if settings.start_spread:
-                    off = 2.0 * torch.rand(len(rows), generator=generator, dtype=start.dtype) - 1.0
-                    start[:, -1] = start[:, -1] + settings.start_spread * off
-                yield own, start
+                    offset = (
+                        2.0 * torch.rand(len(rows), generator=generator, dtype=start.dtype) - 1.0
+                    )
+                    start[:, -1] = start[:, -1] + settings.start_spread * offset
+                yield batch, start
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
             drives, start = batch
             truncated = settings.truncate_steps or None
-            kept = slice(settings.drop_steps, None)
+            scored = slice(settings.drop_steps, None)
             estimated, covariance = filtering.estimated(drives, start, truncated)
-            error = (estimated - drives.states)[:, kept]
+            error = (estimated - drives.states)[:, scored]
             squares = _weighted(error, weights.training)
             if not settings.likelihood:
                 return squares
-            covariance = covariance[:, kept][..., judged_by, :][..., judged_by]
+            covariance = covariance[:, scored][..., judged_by, :][..., judged_by]
             return squares + settings.likelihood * gaussian_surprise(
                 error[..., judged_by], covariance
             )
 
-        own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
+        length_settings = PhaseSettings(**{**vars(phase_settings), "max_epochs": epochs})
         return Phase(
-            label, own, filtering, batches, loss, judge, trainable, prepare if first else None
+            label,
+            length_settings,
+            filtering,
+            batches,
+            loss,
+            judge,
+            trainable,
+            prepare if first else None,
         )
 
     lengths = [
         (steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum
     ]
-    lengths.append((settings.steps, how.max_epochs, name))
+    lengths.append((settings.steps, phase_settings.max_epochs, name))
     return [phase(*length, first=number == 0) for number, length in enumerate(lengths)]
 
 
 def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
-    """Drives cut from their start into sequences of so many steps, without overlap; a remainder is left out.
+    """Drives cut from their start into sequences of so many steps, without overlap; a remainder is
+    left out.
 
-    Raises `DataError`: no drive is long enough.
+    Raises
+    ------
+    DataError
+        No drive is long enough.
     """
     starts = [
         (drive, first)
@@ -261,7 +298,8 @@ def _pairs(drives: Sequence[Drive]) -> list[Tensor]:
 
 
 def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
-    """Mean negative log-likelihood of errors, (..., k), under normal distributions of these covariances, (..., k, k) [nat], scalar.
+    """Mean negative log-likelihood of errors, (..., k), under normal distributions of these
+    covariances, (..., k, k) [nat], scalar.
 
     ½ (eᵀ P⁻¹ e + ln det P + k ln 2π), by the Cholesky factor of P.
     """

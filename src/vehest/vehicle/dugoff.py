@@ -1,6 +1,7 @@
 """Dugoff's tyres under pure lateral slip, plain and smooth, and the single track on them, in torch.
 
-State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed, road-wheel angle, longitudinal acceleration.
+State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed,
+road-wheel angle, longitudinal acceleration.
 
     v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz                             (Eq. 2)
     α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u)
@@ -8,10 +9,12 @@ State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): 
     f = λ (2 - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10)
     F_zF = m (g l_R - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
 
-Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is infinite at α = 0 and its gradient is not a
-number, though F is as smooth as C tan α there; λ is kept below a largest value at which f is 1 to the last digit, and its gradient none.
+Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is
+infinite at α = 0 and its gradient is not a number, though F is as smooth as C tan α there; λ is
+kept below a largest value at which f is 1 to the last digit, and its gradient none.
 
-Source: Bertipaglia, Alirezaei, Happee & Shyrokau, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
+Source: Bertipaglia, Alirezaei, Happee & Shyrokau, IEEE Transactions on Vehicular Technology 73 (9),
+2024, Section III.
 """
 
 from __future__ import annotations
@@ -37,9 +40,13 @@ Tyres = Literal["plain", "smooth"]
 
 @dataclass(frozen=True)
 class LoadedCar:
-    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
+    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves
+    them; a BMW 545i by default.
 
-    Raises `ValueError`: a number outside of `vehest.vehicle.parameters.RANGES`.
+    Raises
+    ------
+    ValueError
+        a number outside of `vehest.vehicle.parameters.RANGES`.
 
     Source: Bertipaglia et al. 2024, Eq. 2.
     """
@@ -56,7 +63,9 @@ class LoadedCar:
         check_parameters(self)
 
     def loads(self, ax: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertical force on the front and on the rear axle under longitudinal accelerations (...) [m/s²], (...) [N] each."""
+        """Vertical force on the front and on the rear axle under longitudinal accelerations (...)
+        [m/s²], (...) [N] each.
+        """
         wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
         transfer = ax * (self.cg_height / wheelbase)
         front, rear = (
@@ -78,10 +87,12 @@ class DugoffAxle(NamedTuple):
     reduction: Any  # e_r, share of the friction that is lost per m/s of sliding [s/m]
 
     def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
-        """Lateral force of the axle in the wheels' axes, positive to the left, (...) [N]; everything broadcasts.
+        """Lateral force of the axle in the wheels' axes, positive to the left, (...) [N];
+        everything broadcasts.
 
-        It is differentiable everywhere, at a slip of zero too. The tangent is of the slip angle, positive where it makes a force to the
-        left; ``load`` the vertical force [N], ``vx`` the forward speed [m/s]; ``tyres`` are ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+        It is differentiable everywhere, at a slip of zero too. The tangent is of the slip angle,
+        positive where it makes a force to the left; ``load`` the vertical force [N], ``vx`` the
+        forward speed [m/s]; ``tyres`` are ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
         """
         slide = tangent.abs()
         half = (
@@ -91,8 +102,8 @@ class DugoffAxle(NamedTuple):
             / (2.0 * self.cornering_stiffness)
         )
         ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
-        used = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
-        force: Tensor = self.cornering_stiffness * tangent * used
+        force_share = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
+        force: Tensor = self.cornering_stiffness * tangent * force_share
         return force
 
 
@@ -100,7 +111,8 @@ class DugoffAxle(NamedTuple):
 class DugoffTrack:
     """The single track on Dugoff's tyres, as a filter takes it.
 
-    Below the minimum speed wheels roll without slip, v = l_R u δ/L and r = u δ/L, whatever the state was.
+    Below the minimum speed wheels roll without slip, v = l_R u δ/L and r = u δ/L, whatever the
+    state was.
     """
 
     car: LoadedCar  # the car
@@ -111,7 +123,9 @@ class DugoffTrack:
     minimum_speed: float = 3.0  # see above [m/s]
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""
+        """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs
+        (..., 3): (...) [N] each.
+        """
         vx = inputs[..., 0].clamp(min=self.minimum_speed)
         steer = inputs[..., 1]
         ax = inputs[..., 2]
@@ -149,9 +163,11 @@ class DugoffTrack:
         return torch.stack([self.car.cg_to_rear_axle * turn, turn], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 5); Eq. 4.
+        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 5);
+        Eq. 4.
 
-        Axle forces are those across the body, as the channels hold them; the paper's transducers turn with the wheels.
+        Axle forces are those across the body, as the channels hold them; the paper's transducers
+        turn with the wheels.
         """
         front, rear = self.forces(states, inputs)
         sideslip = torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed))

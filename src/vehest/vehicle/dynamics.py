@@ -1,6 +1,8 @@
-"""Planar cars that differ in what of them is a network: x = (vx, vy, yaw rate, rim speed, friction), u = (steering angle, motor current).
+"""Planar cars that differ in what of them is a network: x = (vx, vy, yaw rate, rim speed,
+friction), u = (steering angle, motor current).
 
-Source: Węgrzynowski et al. 2024, Section III-B.2; sizes, inputs and start values as in its authors' code.
+Source: Węgrzynowski et al. 2024, Section III-B.2; sizes, inputs and start values as in its authors'
+code.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from vehest.vehicle.planar import F1TENTH, KNOWN, LEARNT, Motion, PlanarCar
+from vehest.vehicle.planar import F1TENTH, FIXED_PARAMETERS, LEARNT, Motion, PlanarCar
 from vehest.vehicle.tyres import PacejkaTyres, Slips, TyreForces
 
 STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
@@ -33,7 +35,9 @@ UNSCALED = 0.4  # factor of the forces of a tyre network that does not know the 
 
 
 class Perceptron(nn.Sequential):
-    """Fully connected layers with sigmoids between them; inputs are divided and outputs multiplied by fixed scales, 1 to begin with."""
+    """Fully connected layers with sigmoids between them; inputs are divided and outputs multiplied
+    by fixed scales, 1 to begin with.
+    """
 
     input_scale: Tensor
     output_scale: Tensor
@@ -52,7 +56,9 @@ class Perceptron(nn.Sequential):
         return scaled * self.output_scale
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw weights and offsets anew, uniform within one over the root of a layer's inputs (torch's way)."""
+        """Draw weights and offsets anew, uniform within one over the root of a layer's inputs
+        (torch's way).
+        """
         with torch.no_grad():
             for layer in self:
                 if isinstance(layer, nn.Linear):
@@ -77,7 +83,9 @@ class Perceptron(nn.Sequential):
 def rk4(
     derivative: Callable[[Tensor, Tensor], Tensor], state: Tensor, inputs: Tensor, step: float
 ) -> Tensor:
-    """The state, (..., n), one step [s] later by the classical Runge-Kutta method (Kutta 1901), inputs (..., p) held over it."""
+    """The state, (..., n), one step [s] later by the classical Runge-Kutta method (Kutta 1901),
+    inputs (..., p) held over it.
+    """
     first = derivative(state, inputs)
     second = derivative(state + 0.5 * step * first, inputs)
     third = derivative(state + 0.5 * step * second, inputs)
@@ -92,9 +100,12 @@ class Dynamics(nn.Module):
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """Rates of vx, vy, yaw rate and rim speed, and what an accelerometer reads.
 
-        Args:
-            state: (..., 5).
-            inputs: (..., 2).
+        Parameters
+        ----------
+        state : Tensor
+            (..., 5).
+        inputs : Tensor
+            (..., 2).
         """
 
     def rates(self, state: Tensor, inputs: Tensor) -> Tensor:
@@ -121,7 +132,9 @@ class Dynamics(nn.Module):
 
 
 class PacejkaCar(Dynamics):
-    """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not the state's."""
+    """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not
+    the state's.
+    """
 
     def __init__(self, car: Mapping[str, float] = F1TENTH, *, with_curvature: bool = False) -> None:
         super().__init__()
@@ -168,11 +181,13 @@ class NeuralCar(Dynamics):
 class TyreNetworkCar(Dynamics):
     """NNTF and NNT: single track with a network for the tyres (Eqs. 6 and 5).
 
-    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network sees vx, vy, yaw rate, rim speed, friction, steering angle and slips.
-    NNT: forces are 0.4 o, and it sees the motor's current too.
+    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network sees vx, vy, yaw rate, rim speed,
+    friction, steering angle and slips. NNT: forces are 0.4 o, and it sees the motor's current too.
 
-    Args:
-        friction_scaled: whether forces are scaled by friction (NNTF).
+    Parameters
+    ----------
+    friction_scaled : bool, default True
+        Whether forces are scaled by friction (NNTF).
     """
 
     def __init__(
@@ -190,13 +205,13 @@ class TyreNetworkCar(Dynamics):
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
         """Forces of both axles [N]."""
         steer, current = inputs.unbind(-1)
-        seen = [*state.unbind(-1), steer, slips.front, slips.rear, slips.ratio]
+        features = [*state.unbind(-1), steer, slips.front, slips.rear, slips.ratio]
         if not self.friction_scaled:
             rear_x, front_x, rear_y, front_y = (
-                UNSCALED * self.network(torch.stack([*seen, current], -1))
+                UNSCALED * self.network(torch.stack([*features, current], -1))
             ).unbind(-1)
             return TyreForces(front_x, front_y, rear_x, rear_y)
-        rear_x, front_x, rear_y, front_y = self.network(torch.stack(seen, -1)).unbind(-1)
+        rear_x, front_x, rear_y, front_y = self.network(torch.stack(features, -1)).unbind(-1)
         mu = state[..., 4]
         return TyreForces(
             mu * front_x,
@@ -213,11 +228,13 @@ class TyreNetworkCar(Dynamics):
 
 
 def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
-    """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and known ones as `KNOWN`; 0 and 1 where a car has none."""
+    """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and fixed ones as
+    `FIXED_PARAMETERS`; 0 and 1 where a car has none.
+    """
     car = getattr(dynamics, "car", None)
     tyres = getattr(dynamics, "tyres", None)
     if not isinstance(car, PlanarCar):
-        return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(KNOWN)
+        return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(FIXED_PARAMETERS)
     learnt = torch.stack([car.learnt[name] for name in LEARNT])
     curves = (
         torch.stack([tyres.parameters_of[name] for name in PACEJKA])

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 
 class Range(NamedTuple):
-    """Least and greatest value that makes sense."""
+    """Smallest and largest plausible value of a quantity, in its SI unit."""
 
-    least: float
-    most: float
+    lower: float
+    upper: float
 
 
-# from a car of 40 g on a table to the heaviest road vehicle
+# From a car of 40 g on a table to the heaviest road vehicle.
 MASS = Range(1e-3, 1e6)  # [kg]
 YAW_INERTIA = Range(1e-7, 1e8)  # [kg m²]
 LENGTH = Range(1e-3, 30.0)  # [m]
@@ -43,7 +43,9 @@ def check_parameters(parameters: Any) -> None:
 
 @dataclass(frozen=True)
 class SingleTrackParameters:
-    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number outside of `RANGES`."""
+    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number
+    outside of `RANGES`.
+    """
 
     mass: float  # [kg]
     yaw_inertia: float  # about the vertical axis through the centre of gravity [kg m²]
@@ -64,7 +66,8 @@ FERRARI_250LM = SingleTrackParameters(
     cornering_stiffness_front=0.7e5,
     cornering_stiffness_rear=1.2e5,
 )
-"""Ferrari 250 LM Berlinetta GT, as Leanza, Reina & Blanco-Claraco (Sensors 21 (16), 5409, 2021) have it in their public code.
+"""Ferrari 250 LM Berlinetta GT, as Leanza, Reina & Blanco-Claraco (Sensors 21 (16), 5409, 2021)
+have it in their public code.
 
 The yaw inertia is that of a plate of 1.70 m by 4.09 m: 982 kg / 12 · (1.70² + 4.09²) m².
 """

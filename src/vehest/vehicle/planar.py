@@ -1,4 +1,5 @@
-"""A single track with a powertrain, in the plane: x = (vx, vy, yaw rate, rim speed), u = (steering angle, motor current).
+"""A single track with a powertrain, in the plane: x = (vx, vy, yaw rate, rim speed), u = (steering
+angle, motor current).
 
     dvx/dt = (F_xr + F_xf cos δ - F_yf sin δ - F_drag)/m + vy r
     dvy/dt = (F_xf sin δ + F_yr + F_yf cos δ)/m - vx r
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY
-from vehest.vehicle.tyres import STILL, PositiveParameters, Slips, TyreForces
+from vehest.vehicle.tyres import SLIP_SPEED_OFFSET, PositiveParameters, Slips, TyreForces
 
 F1TENTH: Mapping[str, float] = {
     "mass": 5.1,
@@ -33,9 +34,11 @@ F1TENTH: Mapping[str, float] = {
     "friction_viscous": 0.304115174,
     "friction_coulomb": 0.50421894,
 }
-"""A car: what is known, and from where on the rest is learnt; as in the public code of Węgrzynowski et al. 2024, whose paper has 4.5 kg."""
-KNOWN = ("mass", "wheelbase", "wheel_radius")  # [kg, m, m]
-LEARNT = tuple(name for name in F1TENTH if name not in KNOWN)
+"""A car: fixed parameters, and start values of the learnt ones; as in the public code of
+Węgrzynowski et al. 2024, whose paper has 4.5 kg.
+"""
+FIXED_PARAMETERS = ("mass", "wheelbase", "wheel_radius")  # [kg, m, m]
+LEARNT = tuple(name for name in F1TENTH if name not in FIXED_PARAMETERS)
 
 
 class Motion(NamedTuple):
@@ -49,15 +52,17 @@ class Motion(NamedTuple):
 class PlanarCar(nn.Module):
     """The car without its tyres.
 
-    Args:
-        car: values by name, as `F1TENTH`.
+    Parameters
+    ----------
+    car : Mapping[str, float], default F1TENTH
+        Values by name, as `F1TENTH`.
     """
 
     def __init__(self, car: Mapping[str, float] = F1TENTH) -> None:
         super().__init__()
-        self.mass, self.wheelbase, self.wheel_radius = (car[name] for name in KNOWN)
+        self.mass, self.wheelbase, self.wheel_radius = (car[name] for name in FIXED_PARAMETERS)
         self.learnt = PositiveParameters(
-            {name: value for name, value in car.items() if name not in KNOWN}
+            {name: value for name, value in car.items() if name not in FIXED_PARAMETERS}
         )
 
     @property
@@ -68,11 +73,11 @@ class PlanarCar(nn.Module):
     def slips(self, state: Tensor, inputs: Tensor) -> Slips:
         """How the tyres slide; as in the authors' code."""
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
-        along = vx + STILL
+        vx_safe = vx + SLIP_SPEED_OFFSET
         return Slips(
-            torch.atan((vy + self.to_front_axle * yaw_rate) / along) - inputs[..., 0],
-            torch.atan((vy - self.learnt["cg_to_rear_axle"] * yaw_rate) / along),
-            (rim_speed - vx) / along,
+            torch.atan((vy + self.to_front_axle * yaw_rate) / vx_safe) - inputs[..., 0],
+            torch.atan((vy - self.learnt["cg_to_rear_axle"] * yaw_rate) / vx_safe),
+            (rim_speed - vx) / vx_safe,
         )
 
     def loads(self) -> tuple[Tensor, Tensor]:
@@ -83,8 +88,8 @@ class PlanarCar(nn.Module):
     def motion(self, state: Tensor, inputs: Tensor, forces: TyreForces) -> Motion:
         """Rates under given tyre forces.
 
-        The state is vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more); inputs are steering angle [rad]
-        and motor current [A], (..., 2).
+        The state is vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4
+        or more); inputs are steering angle [rad] and motor current [A], (..., 2).
         """
         p = self.learnt
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
@@ -102,11 +107,13 @@ class PlanarCar(nn.Module):
         turning = (sideways * self.to_front_axle - forces.rear_y * p["cg_to_rear_axle"]) / p[
             "yaw_inertia"
         ]
-        lost = p["friction_viscous"] * rim_speed + p["friction_coulomb"] * torch.sign(rim_speed)
+        resistance = p["friction_viscous"] * rim_speed + p["friction_coulomb"] * torch.sign(
+            rim_speed
+        )
         torque = (
             p["torque_constant"] * current
             - self.wheel_radius * (forces.front_x + forces.rear_x)
-            - lost
+            - resistance
         )
         spinning = self.wheel_radius / p["powertrain_inertia"] * torque
         return Motion(

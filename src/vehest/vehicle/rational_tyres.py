@@ -1,9 +1,11 @@
-"""Axle curves of a single track: lateral force over slip angle, linear or rational, with their derivatives.
+"""Axle curves of a single track: lateral force over slip angle, linear or rational, with their
+derivatives.
 
     F = c₂ μ α c₁(μ + 1)/(α² + c₁(μ + 1)) = c₂ μ α/(1 + q),   q = α²/(c₁(μ + 1))
 
-At friction μ = 1: cornering stiffness c₂ [N/rad], largest force c₂ √(2c₁)/2 at the slip angle √(2c₁), none as the slip grows without end.
-With c₁ = ∞ the tyre is linear, F = c₂ μ α. The axle carries its load at rest. Source: Di Biase, Lenzo & Timpone 2020, Eqs. 3 and 4.
+At friction μ = 1: cornering stiffness c₂ [N/rad], largest force c₂ √(2c₁)/2 at the slip angle
+√(2c₁), none as the slip grows without end. With c₁ = ∞ the tyre is linear, F = c₂ μ α. The axle
+carries its load at rest. Source: Di Biase, Lenzo & Timpone 2020, Eqs. 3 and 4.
 """
 
 from __future__ import annotations
@@ -24,11 +26,16 @@ class AxleForce(NamedTuple):
 def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:
     """Force and derivatives; tensors, arrays or numbers that broadcast, and compiled code.
 
-    Args:
-        slip: slip angle α of the axle, positive where it makes a force to the left [rad].
-        c1: where the curve bends [rad²]; infinite: nowhere.
-        c2: cornering stiffness at friction 1 [N/rad].
-        friction: between tyre and road, μ [1].
+    Parameters
+    ----------
+    slip : Any
+        Slip angle α of the axle, positive where it makes a force to the left [rad].
+    c1 : Any
+        Where the curve bends [rad²]; infinite: nowhere.
+    c2 : Any
+        Cornering stiffness at friction 1 [N/rad].
+    friction : Any
+        Between tyre and road, μ [1].
     """
     bend = slip * slip / (c1 * (friction + 1.0))
     share = 1.0 / (1.0 + bend)

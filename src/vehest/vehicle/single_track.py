@@ -1,12 +1,14 @@
 """The linear single track: sideslip and yaw rate of a car with tyres in their linear range.
 
-State (β, r): sideslip angle [rad] and yaw rate [rad/s]; input δ: road-wheel angle [rad]. Forward speed u is known at every time.
+State (β, r): sideslip angle [rad] and yaw rate [rad/s]; input δ: road-wheel angle [rad]. Forward
+speed u is known at every time.
 
     dβ/dt = -(Cf + Cr)/(m u) β - (1 + (lf Cf - lr Cr)/(m u²)) r + Cf/(m u) δ
     dr/dt = -(lf Cf - lr Cr)/J β - (lf² Cf + lr² Cr)/(J u) r + lf Cf/J δ
     a_y   = -(Cf + Cr)/m β - (lf Cf - lr Cr)/(m u) r + Cf/m δ
 
-Small angles, no load transfer, no banking. Source: Riekert & Schunck 1940, in the form of Leanza, Reina & Blanco-Claraco 2021.
+Small angles, no load transfer, no banking. Source: Riekert & Schunck 1940, in the form of Leanza,
+Reina & Blanco-Claraco 2021.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ class LateralModel(NamedTuple):
     D: FloatArray  # (...)
 
     def in_steps(self, step: float) -> LateralModel:
-        """Forward Euler, x⁺ = (I + τA) x + τB δ; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2."""
+        """Forward Euler, x⁺ = (I + τA) x + τB δ; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr²
+        Cr)/(J u) stay below about 2.
+        """
         return self._replace(A=np.eye(2) + step * self.A, B=step * self.B)
 
 
@@ -40,19 +44,19 @@ def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
     lf = car.cg_to_front_axle
     lr = car.cg_to_rear_axle
     moment = lf * front - lr * rear
-    same = np.ones_like(u)
+    ones = np.ones_like(u)
     per_momentum = 1.0 / (car.mass * u)
     A = [
         -(front + rear) * per_momentum,
         -(1.0 + moment * (1.0 / (car.mass * u * u))),
-        -moment / car.yaw_inertia * same,
+        -moment / car.yaw_inertia * ones,
         -(lf * lf * front + lr * lr * rear) * (1.0 / (car.yaw_inertia * u)),
     ]
-    B = [front * per_momentum, lf * front / car.yaw_inertia * same]
-    C = [-(front + rear) / car.mass * same, -moment * per_momentum]
+    B = [front * per_momentum, lf * front / car.yaw_inertia * ones]
+    C = [-(front + rear) / car.mass * ones, -moment * per_momentum]
     return LateralModel(
         np.stack(A, -1).reshape(*u.shape, 2, 2),
         np.stack(B, -1),
         np.stack(C, -1),
-        front / car.mass * same,
+        front / car.mass * ones,
     )

@@ -1,14 +1,17 @@
-"""The single track of tyres that adapt: state, motion and measurements of the filters of Di Biase, Lenzo & Timpone 2020, in torch.
+"""The single track of tyres that adapt: state, motion and measurements of the filters of Di Biase,
+Lenzo & Timpone 2020, in torch.
 
-State (β, r, β', r', θ…): sideslip angle [rad], yaw rate [rad/s], their rates, and logarithms of tyre parameters over nominal ones.
-Inputs (u, δ): forward speed [m/s] and road-wheel angle [rad]. In steps of Δt (Eqs. 22 to 25, 47, 48), forward Euler:
+State (β, r, β', r', θ…): sideslip angle [rad], yaw rate [rad/s], their rates, and logarithms of
+tyre parameters over nominal ones. Inputs (u, δ): forward speed [m/s] and road-wheel angle [rad]. In
+steps of Δt (Eqs. 22 to 25, 47, 48), forward Euler:
 
     β⁺ = β + Δt β',   r⁺ = r + Δt r',   θ⁺ = θ
     β'⁺ = (F_F + F_R)/(M u) - r,   r'⁺ = (a_F F_F - a_R F_R)/J
     α_F = δ - β - a_F r/u,   α_R = -β + a_R r/u
     measured: r and a_y = u (β' + r)
 
-Logarithms keep parameters positive and put them all on one scale; the paper has the parameters themselves as states.
+Logarithms keep parameters positive and put them all on one scale; the paper has the parameters
+themselves as states.
 """
 
 from __future__ import annotations
@@ -37,7 +40,9 @@ class TyreTrack:
     step: float  # Δt [s]
 
     def parameters(self, states: Tensor) -> list[Tensor]:
-        """Tyre parameters in the order of `TYRE_PARAMETERS`, of states (..., n): five of shape (...)."""
+        """Tyre parameters in the order of `TYRE_PARAMETERS`, of states (..., n): five of shape
+        (...).
+        """
         values = [states.new_full(states.shape[:-1], value) for value in self.nominal]
         for column, index in enumerate(self.adapted, len(MOTION)):
             values[index] = values[index] * torch.exp(states[..., column])
@@ -67,14 +72,17 @@ class TyreTrack:
         return torch.cat([moved, torch.stack(rates, -1), states[..., 4:]], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n), (..., 2); Eqs. 38 to 40."""
+        """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n), (..., 2); Eqs. 38 to
+        40.
+        """
         return torch.stack([states[..., 1], inputs[..., 0] * (states[..., 2] + states[..., 1])], -1)
 
     def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: float) -> Tensor:
         """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n), of states (..., n) and inputs (..., 2).
 
-        The steering angle changes the next state by the first column of B (Eqs. 52, 60). Standard deviations: ``steer`` of it for a
-        second's step [rad √s], ``tyres`` of the logarithms of the adapted parameters [1/√s].
+        The steering angle changes the next state by the first column of B (Eqs. 52, 60). Standard
+        deviations: ``steer`` of it for a second's step [rad √s], ``tyres`` of the logarithms of the
+        adapted parameters [1/√s].
         """
         front, _ = self.axles(states, inputs)
         slope = torch.zeros_like(states)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-STILL = 1e-6  # added to speeds that slips are divided by [m/s]
+SLIP_SPEED_OFFSET = 1e-6  # added to speeds that slips are divided by [m/s]
 
 
 class Slips(NamedTuple):
@@ -51,7 +51,8 @@ def magic_formula(
 ) -> Tensor:
     """Pacejka's curve for a peak of 1: sin(C atan(B s - E (B s - atan(B s)))).
 
-    The slip s is an angle [rad] or a ratio, the stiffness B [1/rad] or [1]; a curvature E of 0 is left out.
+    The slip s is an angle [rad] or a ratio, the stiffness B [1/rad] or [1]; a curvature E of 0 is
+    left out.
 
     Source: Pacejka & Bakker 1992.
     """
@@ -62,13 +63,19 @@ def magic_formula(
 class PacejkaTyres(nn.Module):
     """Pacejka's curves of both axles, without combined slip.
 
-    F_x = μ D_x F_z sin(C_x atan(B_x κ …)), the same for both axles; F_y = -μ D_y F_z sin(C_y atan(B_y α …)), an axle each.
+    F_x = μ D_x F_z sin(C_x atan(B_x κ …)), the same for both axles; F_y = -μ D_y F_z sin(C_y
+    atan(B_y α …)), an axle each.
 
-    Args:
-        start: values to begin with of ``friction``, ``B_x``, ``C_x``, ``D_x``, and ``B``, ``C``, ``D`` with ``_front`` and ``_rear``.
-        with_curvature: whether E is learnt too, from 0 on, for all three curves.
+    Parameters
+    ----------
+    start : Mapping[str, float]
+        Values to begin with of ``friction``, ``B_x``, ``C_x``, ``D_x``, and ``B``, ``C``, ``D``
+        with ``_front`` and ``_rear``.
+    with_curvature : bool, default False
+        Whether E is learnt too, from 0 on, for all three curves.
 
-    Source: Węgrzynowski et al. 2024, Eq. 3, with the sign of a slip angle that is positive to the left.
+    Source: Węgrzynowski et al. 2024, Eq. 3, with the sign of a slip angle that is positive to the
+    left.
     """
 
     def __init__(self, start: Mapping[str, float], *, with_curvature: bool = False) -> None:

@@ -31,7 +31,7 @@ def scoring(part: PartArtefacts, reading: str = "") -> str:
     protocol = part.protocol
     return (
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first {protocol.skip_seconds:g} s of each "
-        f"{protocol.piece} are not scored.{protocol.start_in_words}"
+        f"{protocol.piece} are not scored.{protocol.start_description}"
         f"{protocol.describe_sideslip(part.split.datasets)}"
     )
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.evaluation.blocks import LEAST_BLOCKS
+from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.significance import (
     CONFIDENCE,
     Contrast,
@@ -134,7 +134,7 @@ class Pair:
     def is_testable(self) -> bool:
         """Whether there are blocks enough, with errors above zero, for an interval."""
         positive = (self.first > 0).all(axis=0) & (self.second > 0).all(axis=0)
-        return int(positive.sum()) >= LEAST_BLOCKS
+        return int(positive.sum()) >= MIN_BLOCKS
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]
         return None, Figure(math.nan, math.nan, math.nan)
     value = float(sums.sum(axis=1).mean() / sizes.sum())
     exponent = exponent_of(metric)
-    if len(sizes) < LEAST_BLOCKS or not value > 0:
+    if len(sizes) < MIN_BLOCKS or not value > 0:
         error = value**exponent if value >= 0 else math.nan
         return None, Figure(error, math.nan, math.nan)
     contrast = _scaled(log_ratio_of_pooled(sums, sizes[None]), exponent)
@@ -580,7 +580,7 @@ def _measure(claim: Claim, errors: BlockErrors) -> Measured:
     is_ratio = claim.other is not None and claim.limit > 0 and bool((values > 0).all())
     # what is measured of the trained weights alone has one block: its trainings are what varies
     units = values.T if n_blocks == 1 else values
-    if units.shape[1] < LEAST_BLOCKS:
+    if units.shape[1] < MIN_BLOCKS:
         mean = float(values.mean()) if values.size else math.nan
         figure = Figure(mean, math.nan, math.nan)
         return Measured(None, is_ratio, figure, n_blocks, n_seeds, n_diverged)

@@ -124,7 +124,7 @@ def scored_of(part: PartArtefacts, model: EvaluatedModel, test: str) -> list[Sco
             name: (reference[name][first:end], reference[REFERENCES[name]][first:end])
             for name in ("vx", "yaw_rate")
         }
-        completed.append(replace(own, others=others))
+        completed.append(replace(own, other_states=others))
     return completed
 
 

@@ -52,8 +52,9 @@ LEAST_ENTROPY = -9.0  # [nat] of the process noise
 class CarFilter(nn.Module):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
-    Covariances of noise are constant or depend on the state, and are ``correlated`` or diagonal. The step is in s, ``least`` the smallest
-    possible vx [m/s] and friction; ``repair``: lost definiteness is repaired.
+    Covariances of noise are constant or depend on the state, and are ``correlated`` or diagonal.
+    The step is in s, ``least`` the smallest possible vx [m/s] and friction; ``repair``: lost
+    definiteness is repaired.
 
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
@@ -133,13 +134,21 @@ class CarFilter(nn.Module):
     ) -> NonlinearFiltered:
         """Filter sequences.
 
-        Args:
-            measurements: (B, T, 4), NaN where nothing was measured.
-            inputs: (B, T, 2).
-            initial: at the first sample, mean (B, 5).
-            states: true ones, (B, T, 5), that the noise then depends on; none: it depends on the estimate, and has no gradients.
-            model: what `point_model` returned, to use it again.
-            gate: which measurements are refused; none: all are taken.
+        Parameters
+        ----------
+        measurements : Tensor
+            (B, T, 4), NaN where nothing was measured.
+        inputs : Tensor
+            (B, T, 2).
+        initial : Gaussian[Tensor]
+            At the first sample, mean (B, 5).
+        states : Tensor | None, default None
+            True ones, (B, T, 5), that the noise then depends on; none: it depends on the estimate,
+            and has no gradients.
+        model : PointModel | None, default None
+            What `point_model` returned, to use it again.
+        gate : Gate | None, default None
+            Which measurements are refused; none: all are taken.
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
@@ -166,18 +175,22 @@ class CarFilter(nn.Module):
             return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(
                 self.observation_noise
             )
-        nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
+        zero_state = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            process = with_entropy(self.process_noise(nothing, nothing), LEAST_ENTROPY)
-            return process.numpy(), self.observation_noise(nothing, nothing).numpy()
+            process = with_entropy(self.process_noise(zero_state, zero_state), LEAST_ENTROPY)
+            return process.numpy(), self.observation_noise(zero_state, zero_state).numpy()
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states of drives.
 
-        The friction, which the true states hold as a constant, and the initial state keep the variances that they have, but for a friction
-        that may start anywhere within a spread: it has the variance of that.
+        The friction, which the true states hold as a constant, and the initial state keep the
+        variances that they have, but for a friction that may start anywhere within a spread: it has
+        the variance of that.
 
-        Raises `DataError`: the residuals have no positive definite covariance.
+        Raises
+        ------
+        DataError
+            The residuals have no positive definite covariance.
         """
         with torch.no_grad():
             steps = torch.cat(
@@ -211,7 +224,8 @@ class CarFilter(nn.Module):
         self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """States of training sequences, which start from ``start``, (B, 5), and their covariances, (B, T, 5, 5), differentiable.
+        """States of training sequences, which start from ``start``, (B, 5), and their covariances,
+        (B, T, 5, 5), differentiable.
 
         Gradients reach back ``steps`` samples; none: all.
         """
@@ -221,7 +235,8 @@ class CarFilter(nn.Module):
         means = []
         covariances = []
         for first in range(0, total, steps or total):
-            # a later stretch starts with the last sample of the one before, which is not measured twice
+            # a later stretch starts with the last sample of the one before, which is not measured
+            # twice
             begin = max(first - 1, 0)
             end = min(first + (steps or total), total)
             measurements = drives.measurements[:, begin:end]
@@ -239,7 +254,9 @@ class CarFilter(nn.Module):
         return torch.cat(means, 1), torch.cat(covariances, 1)
 
     def estimate_for_validation(self, drives: Drive) -> Tensor:
-        """Estimated states, (B, T, 5), as in use: without gradients, and without any true state but the first."""
+        """Estimated states, (B, T, 5), as in use: without gradients, and without any true state but
+        the first.
+        """
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean

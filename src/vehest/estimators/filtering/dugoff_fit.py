@@ -17,7 +17,7 @@ from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres
 
 BOUNDS = ((2.0, 60.0), (0.3, 2.0), (0.0, 0.05))
 """Cornering stiffness over the axle's load at rest [1/rad], friction [1], reduction [s/m]."""
-MOST_SAMPLES = 1500  # evenly thinned to
+MAX_SAMPLES = 1500  # evenly thinned to
 POPULATION = 15  # a parameter
 
 
@@ -42,16 +42,27 @@ def fit_dugoff(
 ) -> DugoffFit:
     """The three parameters of each axle with the smallest squared error of force over slip angle.
 
-    Args:
-        recordings: as `axle_motion` takes them, with ``ax``; forces across the body are turned into the front wheels' axes.
-        minimum_speed: slower samples are left out [m/s].
-        measured_forces: take forces from the channels ``fy_*``, instead of from accelerations.
-        seed: of the first restart; the others follow it.
-        restarts: searches, of which the best counts, of so many ``generations`` each at most.
+    Parameters
+    ----------
+    recordings : Sequence[Recording]
+        As `axle_motion` takes them, with ``ax``; forces across the body are turned into the front
+        wheels' axes.
+    minimum_speed : float, default 3.0
+        Slower samples are left out [m/s].
+    measured_forces : bool, default True
+        Take forces from the channels ``fy_*``, instead of from accelerations.
+    seed : int, default 0
+        Of the first restart; the others follow it.
+    restarts : int, default 3
+        Searches, of which the best counts, of so many ``generations`` each at most.
 
-    Raises `DataError`: a channel is missing, ``ax`` has gaps, or hardly any samples are left.
+    Raises
+    ------
+    DataError
+        A channel is missing, ``ax`` has gaps, or hardly any samples are left.
 
-    Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal of Global Optimization 11, 1997.
+    Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal
+    of Global Optimization 11, 1997.
     """
     for recording in recordings:
         if np.isnan(recording["ax"]).any():
@@ -59,12 +70,12 @@ def fit_dugoff(
                 f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known"
             )
     motion = axle_motion(recordings, car, minimum_speed, measured_forces=measured_forces)
-    thin = max(1, -(-motion.slip.shape[1] // MOST_SAMPLES))
+    thin = max(1, -(-motion.slip.shape[1] // MAX_SAMPLES))
     vx, steer, ax = (torch.as_tensor(row) for row in motion.driven[:, ::thin])
     forces = motion.force[:, ::thin] / np.stack([np.cos(steer.numpy()), np.ones(len(steer))])
     loads = car.loads(ax)
     at_rest = car.loads(torch.zeros(()))
-    found = []
+    fits = []
     for axle in (0, 1):
         tangent = torch.as_tensor(np.tan(motion.slip[axle, ::thin]))
         scale = np.array([float(at_rest[axle]), 1.0, 1.0])
@@ -99,5 +110,5 @@ def fit_dugoff(
         ]
         parameters = np.array([search.x * scale for search in searches])
         best = min(searches, key=lambda search: float(search.fun))
-        found.append((best.x * scale, 0.5 * np.ptp(parameters, axis=0), float(best.fun) * rms))
-    return DugoffFit(*(np.array(part) for part in zip(*found, strict=True)))
+        fits.append((best.x * scale, 0.5 * np.ptp(parameters, axis=0), float(best.fun) * rms))
+    return DugoffFit(*(np.array(part) for part in zip(*fits, strict=True)))

@@ -10,7 +10,9 @@ from vehest.filters.gating import Gate
 
 
 class GatedFilter(Estimator):
-    """A filter that may refuse measurements in use; it learns without, because noise that is too small would close the gate."""
+    """A filter that may refuse measurements in use; it learns without, because noise that is too
+    small would close the gate.
+    """
 
     gate: float | None = setting(
         None,

@@ -1,4 +1,6 @@
-"""Base of filters of sideslip angle and yaw rate over a single track: settings, the model of a recording, estimates."""
+"""Base of filters of sideslip angle and yaw rate over a single track: settings, the model of a
+recording, estimates.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
 MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
-KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol hands over
+# rad and rad/s, standard deviation of a state that a protocol hands over
+EXACT_STATE_DEVIATION = 1e-6
 
 
 class FilteredStates(NamedTuple):
@@ -41,17 +44,25 @@ class FilteredStates(NamedTuple):
     last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:
-        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured, of some rows; (T,) each."""
-        (first, both), (_, second) = np.moveaxis(self.innovation_covariance[rows], 0, 2)
-        one, other = self.innovation[rows].T
-        nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (
-            first * second - both**2
+        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured, of some rows;
+        (T,) each.
+        """
+        (first_variance, covariance), (_, second_variance) = np.moveaxis(
+            self.innovation_covariance[rows], 0, 2
         )
+        first_error, second_error = self.innovation[rows].T
+        nis = (
+            second_variance * first_error**2
+            - 2.0 * covariance * first_error * second_error
+            + first_variance * second_error**2
+        ) / (first_variance * second_variance - covariance**2)
         return nis, np.sum(self.measured[rows], axis=1, dtype=np.float64)
 
 
 class FilterState(NamedTuple):
-    """What a filter carries on: the last sample, which is filtered again without its measurements, and the state after it."""
+    """What a filter carries on: the last sample, which is filtered again without its measurements,
+    and the state after it.
+    """
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
     state: Gaussian[FloatArray]  # after that sample, or before the first
@@ -59,7 +70,9 @@ class FilterState(NamedTuple):
 
 
 class SideslipFilter(GatedFilter, Recursive):
-    """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan β."""
+    """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan
+    β.
+    """
 
     channels = ("yaw_rate", "vx", "ay", "steer")
     skippable = ("yaw_rate", "ay")
@@ -73,28 +86,32 @@ class SideslipFilter(GatedFilter, Recursive):
     )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
-        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k]."""
+        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k],
+        a_y[k] = C[k] x[k] + D[k] δ[k].
+        """
         return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(
             1.0 / self.rate_hz
         )
 
     def first_motion(
-        self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]
+        self, sample: FloatArray, deviation: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over."""
+        """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too,
+        or what a protocol hands over.
+        """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
-        if "vy" in given:
-            mean[0] = math.atan2(given["vy"], max(sample[1], self.minimum_speed))
-            variance[0] = KNOWN**2
-        if "yaw_rate" in given:
-            mean[1] = given["yaw_rate"]
-            variance[1] = KNOWN**2
+        if "vy" in initial_state:
+            mean[0] = math.atan2(initial_state["vy"], max(sample[1], self.minimum_speed))
+            variance[0] = EXACT_STATE_DEVIATION**2
+        if "yaw_rate" in initial_state:
+            mean[1] = initial_state["yaw_rate"]
+            variance[1] = EXACT_STATE_DEVIATION**2
         return Gaussian(mean, np.diag(variance))
 
     @abstractmethod
     def first_gaussian(
-        self, sample: FloatArray, given: Mapping[str, float]
+        self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
         """State before the first sample; see `first_state`."""
 
@@ -105,7 +122,9 @@ class SideslipFilter(GatedFilter, Recursive):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement; ``refused``: see `Gate`."""
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its
+        measurement; ``refused``: see `Gate`.
+        """
         raise NotImplementedError(
             f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'"
         )
@@ -114,14 +133,18 @@ class SideslipFilter(GatedFilter, Recursive):
         """What further states, (T, n), say: name -> (T,)."""
         return {}
 
-    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> FilterState:
+    def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> FilterState:
         """State before the first sample, its gate closed."""
         return FilterState(
-            None, self.first_gaussian(sample, given), np.zeros(len(self.skippable), np.int64)
+            None,
+            self.first_gaussian(sample, initial_state),
+            np.zeros(len(self.skippable), np.int64),
         )
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
-        """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what further states say."""
+        """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what
+        further states say.
+        """
         rows = samples
         refused = state.refused.copy()
         if state.sample is not None:
@@ -129,9 +152,9 @@ class SideslipFilter(GatedFilter, Recursive):
             rows[0] = state.sample
             rows[1:] = samples
             rows[0, MEASURED] = np.nan
-        found = self.filter_samples(rows, state.state, self.gate_in_use(), refused)
-        own = slice(len(rows) - len(samples), None)
-        mean = found.mean[own]
+        filtered = self.filter_samples(rows, state.state, self.gate_in_use(), refused)
+        new_rows = slice(len(rows) - len(samples), None)
+        mean = filtered.mean[new_rows]
         vx = samples[:, 1]
         tangent = np.tan(mean[:, 0])
         scale = np.ones((len(samples), 2))
@@ -139,31 +162,31 @@ class SideslipFilter(GatedFilter, Recursive):
         values = {
             "vy": vx * tangent,
             "yaw_rate": mean[:, 1].copy(),
-            "covariance": found.covariance[own] * scale[:, :, None] * scale[:, None, :],
-            "innovations": partial(found.nis, own),
+            "covariance": filtered.covariance[new_rows] * scale[:, :, None] * scale[:, None, :],
+            "innovations": partial(filtered.nis, new_rows),
         }
-        return values | self.quantities(mean), FilterState(samples[-1], found.last, refused)
+        return values | self.quantities(mean), FilterState(samples[-1], filtered.last, refused)
 
 
 def read_levels(
-    recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0
+    recordings: Sequence[Recording], names: Sequence[str], cutoff: float, min_level: float = 0.0
 ) -> dict[str, float]:
     """Standard deviations of measured channels of all recordings above a frequency, by name.
 
-    The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise. Raises `DataError`: a channel has too many
-    gaps, or no noise.
+    The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise.
+    Raises `DataError`: a channel has too many gaps, or no noise.
     """
-    among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+    label = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
     levels = {}
     for name in names:
         try:
             levels[name] = high_passed_level([recording[name] for recording in recordings], cutoff)
         except ValueError as error:
             raise DataError(
-                f"{among}: channel '{name}': {error}; give estimator.noise.{name}"
+                f"{label}: channel '{name}': {error}; give estimator.noise.{name}"
             ) from None
-        if not levels[name] > least:
+        if not levels[name] > min_level:
             raise DataError(
-                f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}"
+                f"{label}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}"
             )
     return levels

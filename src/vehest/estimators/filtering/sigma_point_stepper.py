@@ -1,4 +1,6 @@
-"""Sigma-point filters online: one stepper for all families that filter by `vehest.filters.unscented_scan`."""
+"""Sigma-point filters online: one stepper for all families that filter by
+`vehest.filters.unscented_scan`.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """A sample of ``channels``, (C,), as the filter takes it; ``memory`` is what earlier samples left, empty at first."""
+        """A sample of ``channels``, (C,), as the filter takes it; ``memory`` is what earlier
+        samples left, empty at first.
+        """
 
     @abstractmethod
     def new_filter(self, first: FilterStep) -> UnscentedStepper:

@@ -1,4 +1,6 @@
-"""The unscented filter of a single track on Dugoff's tyres, over batches of drives; differentiable in measurements and noise."""
+"""The unscented filter of a single track on Dugoff's tyres, over batches of drives; differentiable
+in measurements and noise.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,21 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
 
-UNKNOWN = (
+UNKNOWN_MOTION = (
     0.5,
     0.2,
 )  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
-ROLLING = np.diag(np.square(UNKNOWN))
-KNOWN = 1e-6  # the same of a state that is handed over
+ROLLING = np.diag(np.square(UNKNOWN_MOTION))
+EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is handed over
 KAPPA = 1.0  # n + κ = 3
 
 
 class TrackFilter:
-    """States v and r; measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward speed, steering angle and ax.
+    """States v and r; measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward
+    speed, steering angle and ax.
 
-    Where the car is slower than the track's minimum speed, nothing counts as measured, and the state is that of rolling wheels, with the
-    deviations `UNKNOWN`.
+    Where the car is slower than the track's minimum speed, nothing counts as measured, and the
+    state is that of rolling wheels, with the deviations `UNKNOWN`.
     """
 
     def __init__(self, track: DugoffTrack) -> None:
@@ -53,17 +56,29 @@ class TrackFilter:
         initial: Gaussian[Tensor] | None = None,
         gate: Gate | None = None,
     ) -> NonlinearFiltered:
-        """Filter sequences of one length; means and covariances are differentiable in measurements and noise.
+        """Filter sequences of one length; means and covariances are differentiable in measurements
+        and noise.
 
-        Args:
-            measurements: (B, T, 4), or (B, T, 5) with a sideslip angle [rad]; NaN where nothing was measured.
-            inputs: (B, T, 3), finite.
-            process_noise: covariance of each sample's step, (B, T, 2, 2) or what broadcasts to it.
-            observation_noise: (B, T, m, m) or what broadcasts to it.
-            initial: state before the first measurement, mean (2,) or (B, 2); none: `start` of every sequence.
-            gate: which measurements are refused; none: all are taken.
+        Parameters
+        ----------
+        measurements : Tensor
+            (B, T, 4), or (B, T, 5) with a sideslip angle [rad]; NaN where nothing was measured.
+        inputs : Tensor
+            (B, T, 3), finite.
+        process_noise : Tensor
+            Covariance of each sample's step, (B, T, 2, 2) or what broadcasts to it.
+        observation_noise : Tensor
+            (B, T, m, m) or what broadcasts to it.
+        initial : Gaussian[Tensor] | None, default None
+            State before the first measurement, mean (2,) or (B, 2); none: `start` of every
+            sequence.
+        gate : Gate | None, default None
+            Which measurements are refused; none: all are taken.
 
-        Raises `ValueError`: shapes do not fit each other.
+        Raises
+        ------
+        ValueError
+            Shapes do not fit each other.
         """
         slow = (inputs[..., 0] < self.track.minimum_speed)[..., None]
         if bool(slow.any()):
@@ -85,29 +100,35 @@ class TrackFilter:
     def start(
         self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None
     ) -> Gaussian[Tensor]:
-        """State before the first measurement: straight ahead and unknown, rolling where the car is slow, or what is handed over.
+        """State before the first measurement: straight ahead and unknown, rolling where the car is
+        slow, or what is handed over.
 
-        Args:
-            inputs: at the first sample, (B, 3).
-            states: a mapping a sequence of `TRACK_STATES` that are known.
+        Parameters
+        ----------
+        inputs : Tensor
+            At the first sample, (B, 3).
+        states : Sequence[Mapping[str, float] | None] | None, default None
+            A mapping a sequence of `TRACK_STATES` that are known.
         """
         slow = (inputs[:, :1] < self.track.minimum_speed).to(inputs.dtype)
         mean = slow * self.track.rolling(inputs)
-        deviation = torch.tensor(UNKNOWN, dtype=inputs.dtype).repeat(len(inputs), 1)
-        for row, given in enumerate(states or ()):
+        deviation = torch.tensor(UNKNOWN_MOTION, dtype=inputs.dtype).repeat(len(inputs), 1)
+        for row, state in enumerate(states or ()):
             for column, name in enumerate(TRACK_STATES):
-                if given and name in given:
-                    mean[row, column] = given[name]
-                    deviation[row, column] = KNOWN
+                if state and name in state:
+                    mean[row, column] = state[name]
+                    deviation[row, column] = EXACT_STATE_DEVIATION
         return Gaussian(mean, torch.diag_embed(deviation.square()))
 
 
 def in_nonlinear_range(
     ay: FloatArray, enter: float, leave: float, before: bool = False
 ) -> NDArray[np.bool_]:
-    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, less than that.
+    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay|
+    ≤ ``leave``, less than that.
 
-    Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first sample.
+    Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first
+    sample.
 
     Source: Bertipaglia et al. 2024, Section IV-C, which gives no thresholds.
     """
@@ -118,10 +139,12 @@ def in_nonlinear_range(
 
 
 def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
-    """One figure of the errors of several recordings, of each the sum of its squared errors, and over how many samples.
+    """One figure of the errors of several recordings, of each the sum of its squared errors, and
+    over how many samples.
 
-    ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the recordings' root mean squared errors, in
-    which a recording counts by its error, not by the square of it. Recordings without a sample do not count.
+    ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the
+    recordings' root mean squared errors, in which a recording counts by its error, not by the
+    square of it. Recordings without a sample do not count.
     """
     if over == "samples":
         total = 0.0
@@ -134,11 +157,13 @@ def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
     return float(np.mean(roots)) ** 2 if roots else 0.0
 
 
-def groups_of(lengths: Sequence[int], most: int) -> Iterator[list[int]]:
-    """Rows of similar length, so many that together, padded to the longest, they hold at most so many samples; one at least."""
+def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
+    """Rows of similar length, so many that together, padded to the longest, they hold at most so
+    many samples; one at least.
+    """
     rows: list[int] = []
-    for row in sorted(range(len(lengths)), key=lambda own: -lengths[own]):
-        if rows and (len(rows) + 1) * lengths[rows[0]] > most:
+    for row in sorted(range(len(lengths)), key=lambda index: -lengths[index]):
+        if rows and (len(rows) + 1) * lengths[rows[0]] > max_samples:
             yield rows
             rows = []
         rows.append(row)
@@ -147,7 +172,9 @@ def groups_of(lengths: Sequence[int], most: int) -> Iterator[list[int]]:
 
 
 def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
-    """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with their last row (none)."""
+    """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with
+    their last row (none).
+    """
     longest = max(len(array) for array in arrays)
     return np.stack(
         [

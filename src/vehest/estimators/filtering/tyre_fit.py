@@ -1,11 +1,12 @@
 """Fit of axle curves, force over slip angle, to drives whose sideslip angle was measured.
 
-A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small steering angles taken for granted
-(Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
+A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small
+steering angles taken for granted (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
 
     F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,   α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
 
-The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle carries what it carries at rest.
+The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle
+carries what it carries at rest.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ PEAK_SLIP = math.radians(
     9.0
 )  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
 PEAK_SPREAD = 0.4  # standard deviation of its logarithm
-KNOWN_C1 = (
+ROAD_TYRE_LOG_C1 = (
     math.log(0.5 * PEAK_SLIP**2),
     2.0 * PEAK_SPREAD,
 )  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
-LEAST_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
+MIN_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
 PASSES = 3  # of weighing what is known against what the drives leave unexplained
 SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
 SMOOTHING_ORDER = 2
 BLOCK_SECONDS = 10.0  # residuals further apart than this count as independent
-FEWEST_SAMPLES = 100
+MIN_SAMPLES = 100
 NORMAL_95 = 1.959964
 
 
@@ -84,7 +85,8 @@ class TyreFit:
 
 
 def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArray:
-    """Lateral force of an axle at slip angles (...) [rad], (...) [N]; parameters in the order of `PARAMETERS`, (P,).
+    """Lateral force of an axle at slip angles (...) [rad], (...) [N]; parameters in the order of
+    `PARAMETERS`, (P,).
 
     C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
     """
@@ -102,16 +104,27 @@ def axle_motion(
 ) -> AxleMotion:
     """Slip angles and forces of the axles along drives.
 
-    Yaw acceleration is the slope of a second-order polynomial through half a second of the yaw rate (Savitzky and Golay); whatever else
-    enters is smoothed by the same polynomial, so that slips and forces belong together. Future samples are used.
+    Yaw acceleration is the slope of a second-order polynomial through half a second of the yaw rate
+    (Savitzky and Golay); whatever else enters is smoothed by the same polynomial, so that slips and
+    forces belong together. Future samples are used.
 
-    Args:
-        recordings: with ``yaw_rate``, ``vx``, ``ay``, ``steer`` and ``sideslip_ref``, or ``vy_ref`` in its place.
-        parameters: mass, inertia and the places of the axles; cornering stiffnesses are not used.
-        minimum_speed: slower samples are left out [m/s].
-        measured_forces: take forces from the channels ``fy_fl`` to ``fy_rr``, which simulated cars have, instead of from accelerations.
+    Parameters
+    ----------
+    recordings : Sequence[Recording]
+        With ``yaw_rate``, ``vx``, ``ay``, ``steer`` and ``sideslip_ref``, or ``vy_ref`` in its
+        place.
+    parameters : SingleTrackParameters | LoadedCar
+        Mass, inertia and the places of the axles; cornering stiffnesses are not used.
+    minimum_speed : float, default 3.0
+        Slower samples are left out [m/s].
+    measured_forces : bool, default False
+        Take forces from the channels ``fy_fl`` to ``fy_rr``, which simulated cars have, instead of
+        from accelerations.
 
-    Raises `DataError`: a channel is missing, or hardly any samples are left.
+    Raises
+    ------
+    DataError
+        A channel is missing, or hardly any samples are left.
     """
     parts: list[AxleMotion] = []
     first_block = 0
@@ -137,13 +150,13 @@ def axle_motion(
             AxleMotion(slip[:, usable], force[:, usable], block[usable], inputs[:, usable])
         )
     count = sum(len(part.block) for part in parts)
-    if count < FEWEST_SAMPLES:
+    if count < MIN_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
         raise DataError(
-            f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {FEWEST_SAMPLES} are needed "
+            f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {MIN_SAMPLES} are needed "
             f"(recordings: {named})"
         )
-    return AxleMotion(*(np.concatenate(own, axis=-1) for own in zip(*parts, strict=True)))
+    return AxleMotion(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
 
 
 def _motion_of(
@@ -205,13 +218,15 @@ def _motion_of(
 def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
     """Least squares of both axle curves; raises `DataError` where forces run against slips.
 
-    Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well as `PEAK_SLIP` says of road tyres, a
-    block of 10 s counting as one sample against it.
+    Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well
+    as `PEAK_SLIP` says of road tyres, a block of 10 s counting as one sample against it.
 
-    The covariance is that of least squares whose residuals hang together within blocks of 10 s and may differ in size (a sandwich of
-    blocks): residuals of neighbouring samples are hardly independent, and to count them so would make intervals far too narrow.
+    The covariance is that of least squares whose residuals hang together within blocks of 10 s and
+    may differ in size (a sandwich of blocks): residuals of neighbouring samples are hardly
+    independent, and to count them so would make intervals far too narrow.
 
-    Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
+    Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang
+    & Zeger, Biometrika 73 (1), 1986.
     """
     axles = [
         _fitted(kind, slip, force, motion.block)
@@ -226,7 +241,9 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
 def _fitted(
     kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted, so that all stay positive."""
+    """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted,
+    so that all stay positive.
+    """
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
     squares = float(slip @ slip)
@@ -240,32 +257,39 @@ def _fitted(
         raise DataError(
             f"tyre curves: forces run against slip angles (slope {stiffness:.3g} N/rad); check the signs of steer, ay and vy_ref"
         )
-    guess = {"cornering_stiffness": stiffness, "c1": math.exp(KNOWN_C1[0]), "c2": 1.2 * stiffness}
+    guess = {
+        "cornering_stiffness": stiffness,
+        "c1": math.exp(ROAD_TYRE_LOG_C1[0]),
+        "c2": 1.2 * stiffness,
+    }
     logarithms = np.clip(np.log([guess[name] for name in names]), low, high)
     _, member = np.unique(block, return_inverse=True)
     blocks = int(member.max()) + 1
     spread = math.sqrt(float(np.mean((force - stiffness * slip) ** 2)))
 
-    def misfit(at: FloatArray, weight: float) -> FloatArray:
-        left = weight * (axle_force(kind, np.exp(at), slip) - force)
+    def misfit(log_parameters: FloatArray, weight: float) -> FloatArray:
+        residuals = weight * (axle_force(kind, np.exp(log_parameters), slip) - force)
         return (
-            np.append(left, (at[names.index("c1")] - KNOWN_C1[0]) / KNOWN_C1[1])
+            np.append(
+                residuals,
+                (log_parameters[names.index("c1")] - ROAD_TYRE_LOG_C1[0]) / ROAD_TYRE_LOG_C1[1],
+            )
             if "c1" in names
-            else left
+            else residuals
         )
 
     for _ in range(PASSES):
-        weight = math.sqrt(blocks / len(slip)) / max(spread, LEAST_SPREAD * scale)
-        found = optimize.least_squares(
+        weight = math.sqrt(blocks / len(slip)) / max(spread, MIN_SPREAD * scale)
+        solution = optimize.least_squares(
             misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,)
         )
-        logarithms = found.x
-        spread = math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight
-    of_data = found.jac[: len(slip)]
-    of_knowledge = found.jac[len(slip) :]
-    scores = of_data * found.fun[: len(slip), None]
+        logarithms = solution.x
+        spread = math.sqrt(float(np.mean(solution.fun[: len(slip)] ** 2))) / weight
+    of_data = solution.jac[: len(slip)]
+    of_knowledge = solution.jac[len(slip) :]
+    scores = of_data * solution.fun[: len(slip), None]
     sums = np.stack([np.bincount(member, weights=column) for column in scores.T], axis=1)
-    curvature = np.linalg.pinv(found.jac.T @ found.jac)
+    curvature = np.linalg.pinv(solution.jac.T @ solution.jac)
     spread_of_scores = sums.T @ sums * blocks / max(blocks - 1, 1) + of_knowledge.T @ of_knowledge
     covariance = curvature @ spread_of_scores @ curvature
     parameters = np.exp(logarithms)

@@ -1,4 +1,6 @@
-"""Functions for compiled loops that become vector instructions in float32; tanh and the logistic function also of `vehest.lanes`."""
+"""Functions for compiled loops that become vector instructions in float32; tanh and the logistic
+function also of `vehest.lanes`.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ _F = numba.float32
 
 
 def tanh(x: Any) -> Any:
-    """tanh(x); in compiled float32 code a rational function, whose loops become vector instructions."""
+    """tanh(x); in compiled float32 code a rational function, whose loops become vector
+    instructions.
+    """
     return each(math.tanh, x)
 
 
@@ -37,7 +41,8 @@ def arctan(x: Any) -> Any:
 
 
 def rational_tanh(x: Any) -> Any:
-    """tanh by Lambert's continued fraction n/d at x/4, then tanh(2y) = 2nd/(d² + n²) twice, divided once; error below 2e-7.
+    """tanh by Lambert's continued fraction n/d at x/4, then tanh(2y) = 2nd/(d² + n²) twice, divided
+    once; error below 2e-7.
 
     Source: Abramowitz & Stegun, equations 4.5.70 and 4.5.24.
     """
@@ -76,7 +81,9 @@ def _of_bits(typing: Any, bits: Any) -> Any:
 
 @overload(softplus)
 def _compiled_softplus(x):  # type: ignore[no-untyped-def]
-    """exp(-|x|) = 2ⁿ exp(r) with |r| < 0.35 (polynomial of Cephes' expf), and log(1 + e) = 2 artanh(e/(2 + e)) by its series."""
+    """exp(-|x|) = 2ⁿ exp(r) with |r| < 0.35 (polynomial of Cephes' expf), and log(1 + e) = 2
+    artanh(e/(2 + e)) by its series.
+    """
     if x != types.float32:
         return lambda x: max(x, x * 0) + math.log1p(math.exp(-abs(x)))
 

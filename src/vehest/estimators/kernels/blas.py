@@ -12,6 +12,8 @@ _controller = cache(ThreadpoolController)
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Matrix products within stay on their thread: those of small blocks gain nothing from more, and several threads call them."""
+    """Matrix products within stay on their thread: those of small blocks gain nothing from more,
+    and several threads call them.
+    """
     limited: AbstractContextManager[object] = _controller().limit(limits=1, user_api="blas")
     return limited

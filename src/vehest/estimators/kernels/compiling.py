@@ -1,8 +1,10 @@
-"""How kernels whose sums may be reordered are compiled: with the same digits on the first run as on every later one.
+"""How kernels whose sums may be reordered are compiled: with the same digits on the first run as on
+every later one.
 
-A compiled function that calls another has a copy of it in its own object, optimised once more for where it stands. The process
-that compiles runs the callee's first version, one that reads the cache runs the copy; where sums may be reordered, their last
-digits differ. So a callee is made part of its callers, and exists nowhere else.
+A compiled function that calls another has a copy of it in its own object, optimised once more for
+where it stands. The process that compiles runs the callee's first version, one that reads the cache
+runs the copy; where sums may be reordered, their last digits differ. So a callee is made part of
+its callers, and exists nowhere else.
 """
 
 from __future__ import annotations
@@ -16,14 +18,18 @@ import numba
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that Python calls, kept in the compile cache; ``options`` as those of ``numba.njit``."""
+    """Decorator of a function that Python calls, kept in the compile cache; ``options`` as those of
+    ``numba.njit``.
+    """
     return numba.njit(cache=True, error_model="numpy", **options)  # type: ignore[no-any-return]
 
 
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that only compiled functions call; ``options`` as those of ``numba.njit``.
+    """Decorator of a function that only compiled functions call; ``options`` as those of
+    ``numba.njit``.
 
-    With ``_nrt=False`` it counts no references of arrays, which compiles sooner; it may then neither make nor return one.
+    With ``_nrt=False`` it counts no references of arrays, which compiles sooner; it may then
+    neither make nor return one.
     """
     return numba.njit(  # type: ignore[no-any-return]
         forceinline=True,
@@ -34,9 +40,11 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     )
 
 
-def has_to_compile(where: str) -> bool:
-    """Whether an entry, ``module:function``, compiles on this machine before it first runs; later runs load the result."""
-    name, _, entry_name = where.partition(":")
+def has_to_compile(location: str) -> bool:
+    """Whether an entry, ``module:function``, compiles on this machine before it first runs; later
+    runs load the result.
+    """
+    name, _, entry_name = location.partition(":")
     if not name:
         return False
     module = importlib.import_module(name)
@@ -45,7 +53,7 @@ def has_to_compile(where: str) -> bool:
         return False
     folder = function.stats.cache_path
     source = Path(str(module.__file__))
-    kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{entry_name}-*.nbi")
+    index_files = [] if folder is None else Path(folder).glob(f"{source.stem}.{entry_name}-*.nbi")
     return folder is not None and not any(
-        index.stat().st_mtime >= source.stat().st_mtime for index in kept
+        index.stat().st_mtime >= source.stat().st_mtime for index in index_files
     )

@@ -1,7 +1,16 @@
-"""Sigma points through the single track on Dugoff's tyres (`DugoffTrack`), compiled, with the adjoint.
+"""Sigma points through the single track on Dugoff's tyres (`DugoffTrack`), compiled, with the
+adjoint.
 
-A point's derivatives are those of two numbers by two others: they are written out, and the adjoint multiplies by those of both axles'
-forces, which are left for it beside the inputs.
+Equations: see `vehest.vehicle.dugoff`, which is the readable definition in torch. With F_F, F_R the
+axle forces and F' their derivatives by the lateral velocity of their axle, which the forward pass
+saves beside the inputs:
+
+    v⁺ = v + Δt ((F_F + F_R)/m - u r),   r⁺ = r + Δt (l_F F_F - l_R F_R)/I_zz
+    F̄_F = Δt (v̄⁺/m + l_F r̄⁺/I_zz) F_F',   F̄_R = Δt (v̄⁺/m - l_R r̄⁺/I_zz) F_R'
+    v̄ = v̄⁺ + F̄_F + F̄_R,   r̄ = r̄⁺ - Δt u v̄⁺ + l_F F̄_F - l_R F̄_R
+
+The observation (a_y, r, F_F, F_R and, for five measurements, β = atan v/u) is treated alike. There
+are no sums over points.
 """
 
 from __future__ import annotations
@@ -16,7 +25,8 @@ from vehest.filters.unscented_steps import at_row, compiled, piece
 from vehest.lanes import choose, each, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
-DRIVEN = 3  # rows of inputs before those that are kept
+# rows of inputs (speed, steering angle, longitudinal acceleration) before saved derivatives
+DRIVEN = 3
 PLAIN = LARGEST_RATIO["plain"]
 SMOOTH = LARGEST_RATIO["smooth"]
 
@@ -25,7 +35,7 @@ class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
 
     is_compiled = True
-    kept = 4
+    scratch_rows = 4
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
@@ -47,23 +57,26 @@ class CompiledDugoffTrack(PointModel):
 
 
 @piece
-def _put(values, row, b, vector, end):  # type: ignore[no-untyped-def]
+def _set_row(values, row, b, vector, end):  # type: ignore[no-untyped-def]
+    """Write a vector to a row of the sequences from b to ``end``."""
     store_some(values, row * values.shape[values.ndim - 1] + b, vector, end - b)
 
 
 @piece
-def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
-    """Of one sample: speed, tangent and cosine of the steering angle, loads of both axles."""
+def _input_terms(inputs, b, car):  # type: ignore[no-untyped-def]
+    """Terms of one sample that all points share: speed, tangent and cosine of the steering angle,
+    loads of both axles.
+    """
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
     transfer = at_row(inputs, 2, b) * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
     front = gravity * rear_arm / wheelbase
     rear = gravity * front_arm / wheelbase
-    least = car.dtype.type(LEAST_LOAD)
+    min_load_share = car.dtype.type(LEAST_LOAD)
     steer = at_row(inputs, 1, b)
-    load_front = mass * most(front - transfer, least * front)
-    load_rear = mass * most(rear + transfer, least * rear)
+    load_front = mass * most(front - transfer, min_load_share * front)
+    load_rear = mass * most(rear + transfer, min_load_share * rear)
     return (
         most(at_row(inputs, 0, b), minimum_speed),
         each(math.tan, steer),
@@ -77,41 +90,45 @@ def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
 def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
-    one = axle.dtype.type(1.0)
-    least = axle.dtype.type(LEAST_SHARE)
+    unity = axle.dtype.type(1.0)
+    min_share = axle.dtype.type(LEAST_SHARE)
     slide = abs(tangent)
-    share = one - reduction * vx * slide
-    per_slide = choose(share < least, 0.0, -reduction * vx)
-    share = choose(share < least, least, share)
+    share = unity - reduction * vx * slide
+    per_slide = choose(share < min_share, 0.0, -reduction * vx)
+    share = choose(share < min_share, min_share, share)
     half = friction * share * load / (2 * stiffness)
     largest = axle.dtype.type(SMOOTH if smooth else PLAIN)
     linear = half >= largest * slide
     ratio = half / slide
     by_slide = per_slide / share * ratio - ratio / slide
     if smooth:
-        used = each(math.tanh, choose(linear, 0.0, 2 * ratio))
-        by_ratio = 2 * (one - used * used)
+        force_share = each(math.tanh, choose(linear, 0.0, 2 * ratio))
+        by_ratio = 2 * (unity - force_share * force_share)
     else:
-        used = ratio * (2 - ratio)
+        force_share = ratio * (2 - ratio)
         by_ratio = 2 - 2 * ratio
     force = stiffness * tangent
-    slope = stiffness * (used + slide * by_ratio * by_slide)
-    return choose(linear, force, force * used), choose(linear, stiffness, slope)
+    slope = stiffness * (force_share + slide * by_ratio * by_slide)
+    return choose(linear, force, force * force_share), choose(linear, stiffness, slope)
 
 
 @piece
-def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
-    """Forces across the body at point s, front and rear, and the derivative of each by the lateral velocity of its axle."""
-    vx, turned, cosine, load_front, load_rear = settled
+def _forces(points, s, b, input_terms, track):  # type: ignore[no-untyped-def]
+    """Forces across the body at point s, front and rear, and the derivative of each by the lateral
+    velocity of its axle.
+    """
+    vx, turned, cosine, load_front, load_rear = input_terms
     car, axles, smooth = track
     vy = at_row(points, 2 * s, b)
     yaw_rate = at_row(points, 2 * s + 1, b)
     course_front = (vy + car[2] * yaw_rate) / vx
     course_rear = (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
-    least = axles.dtype.type(LEAST_COSINE)
-    tangent = (turned - course_front) / choose(across > least, across, least)
-    by_course = choose(across > least, -(1 + turned * turned) / (across * across), -1 / least)
+    min_cosine = axles.dtype.type(LEAST_COSINE)
+    tangent = (turned - course_front) / choose(across > min_cosine, across, min_cosine)
+    by_course = choose(
+        across > min_cosine, -(1 + turned * turned) / (across * across), -1 / min_cosine
+    )
     front, front_slope = _axle(tangent, load_front, vx, axles[0], smooth)
     rear, rear_slope = _axle(-course_rear, load_rear, vx, axles[1], smooth)
     return (
@@ -125,16 +142,19 @@ def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _keep(inputs, entry, s, b, by_front, by_rear, end):  # type: ignore[no-untyped-def]
-    """Leave what the forces at point s change by the lateral velocities of their axles, where inputs have rows for it."""
+def _save_slopes(inputs, entry, s, b, by_front, by_rear, end):  # type: ignore[no-untyped-def]
+    """Save the derivatives of the forces at point s by the lateral velocities of their axles, where
+    inputs have rows for them.
+    """
     row = DRIVEN + 4 * s + 2 * entry
     if row < inputs.shape[0]:
-        _put(inputs, row, b, by_front, end)
-        _put(inputs, row + 1, b, by_rear, end)
+        _set_row(inputs, row, b, by_front, end)
+        _set_row(inputs, row + 1, b, by_rear, end)
 
 
 @piece
-def _kept(inputs, entry, s, b):  # type: ignore[no-untyped-def]
+def _saved_slopes(inputs, entry, s, b):  # type: ignore[no-untyped-def]
+    """Derivatives that `_save_slopes` saved for point s."""
     row = DRIVEN + 4 * s + 2 * entry
     return at_row(inputs, row, b), at_row(inputs, row + 1, b)
 
@@ -144,16 +164,16 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled = _settled(inputs, b, car)
+        input_terms = _input_terms(inputs, b, car)
         rolls = at_row(inputs, 0, b) < minimum_speed
         turn = at_row(inputs, 0, b) * at_row(inputs, 1, b) / (front_arm + rear_arm)
         for s in range(points.shape[0]):
-            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, settled, track)
-            _keep(inputs, 0, s, b, by_front, by_rear, end)
-            across = vy + step * ((front + rear) / mass - settled[0] * yaw_rate)
+            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, input_terms, track)
+            _save_slopes(inputs, 0, s, b, by_front, by_rear, end)
+            across = vy + step * ((front + rear) / mass - input_terms[0] * yaw_rate)
             turning = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
-            _put(out, 2 * s, b, choose(rolls, rear_arm * turn, across), end)
-            _put(out, 2 * s + 1, b, choose(rolls, turn, turning), end)
+            _set_row(out, 2 * s, b, choose(rolls, rear_arm * turn, across), end)
+            _set_row(out, 2 * s + 1, b, choose(rolls, turn, turning), end)
 
 
 @compiled
@@ -161,16 +181,16 @@ def _observation(points, inputs, track, out, first, end):  # type: ignore[no-unt
     car = track[0]
     m = out.shape[1]
     for b in range(first, end, width(points)):
-        settled = _settled(inputs, b, car)
+        input_terms = _input_terms(inputs, b, car)
         for s in range(points.shape[0]):
-            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, settled, track)
-            _keep(inputs, 1, s, b, by_front, by_rear, end)
-            _put(out, m * s, b, (front + rear) / car[0], end)
-            _put(out, m * s + 1, b, yaw_rate, end)
-            _put(out, m * s + 2, b, front, end)
-            _put(out, m * s + 3, b, rear, end)
+            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, input_terms, track)
+            _save_slopes(inputs, 1, s, b, by_front, by_rear, end)
+            _set_row(out, m * s, b, (front + rear) / car[0], end)
+            _set_row(out, m * s + 1, b, yaw_rate, end)
+            _set_row(out, m * s + 2, b, front, end)
+            _set_row(out, m * s + 3, b, rear, end)
             if m == 5:
-                _put(out, m * s + 4, b, each(math.atan, vy / settled[0]), end)
+                _set_row(out, m * s + 4, b, each(math.atan, vy / input_terms[0]), end)
 
 
 @compiled
@@ -181,14 +201,14 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
         vx = most(at_row(inputs, 0, b), minimum_speed)
         rolls = at_row(inputs, 0, b) < minimum_speed
         for s in range(points.shape[0]):
-            by_front, by_rear = _kept(inputs, 0, s, b)
+            by_front, by_rear = _saved_slopes(inputs, 0, s, b)
             across = at_row(upstream, 2 * s, b)
             turning = at_row(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
             spun = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
-            _put(out, 2 * s, b, choose(rolls, 0.0, across + front_bar + rear_bar), end)
-            _put(out, 2 * s + 1, b, choose(rolls, 0.0, spun), end)
+            _set_row(out, 2 * s, b, choose(rolls, 0.0, across + front_bar + rear_bar), end)
+            _set_row(out, 2 * s + 1, b, choose(rolls, 0.0, spun), end)
 
 
 @compiled
@@ -200,15 +220,15 @@ def _observation_adjoint(points, inputs, track, upstream, out, gradients, first,
         vx = most(at_row(inputs, 0, b), minimum_speed)
         for s in range(points.shape[0]):
             vy = at_row(points, 2 * s, b)
-            (by_front, by_rear) = _kept(inputs, 1, s, b)
+            (by_front, by_rear) = _saved_slopes(inputs, 1, s, b)
             across = at_row(upstream, m * s, b) / mass
             front_bar = (across + at_row(upstream, m * s + 2, b)) * by_front
             rear_bar = (across + at_row(upstream, m * s + 3, b)) * by_rear
             bar = front_bar + rear_bar
             if m == 5:
                 bar += at_row(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
-            _put(out, 2 * s, b, bar, end)
-            _put(
+            _set_row(out, 2 * s, b, bar, end)
+            _set_row(
                 out,
                 2 * s + 1,
                 b,

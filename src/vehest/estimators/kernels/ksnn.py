@@ -1,10 +1,30 @@
 """The KS-NN recursion, compiled: predictions and, in the same pass, their derivatives.
 
-Windows lie side by side in lanes. The parameters of local models that enter linearly are blended before they are used, and the neurons are
-those of each lane's two active models.
+One step of a window (Da Lio et al. 2023, Eq. 7), with φ_p the weights of the local models p at |ω|
+(Eq. 9), e = û - u, γ = Σ_p φ_p γ_p and likewise β, and f_i(e) = b_i + w_i e + Σ_j w₃ tanh(w₂ e +
+b₂) blended likewise (Eq. 8):
 
-A row of local model p holds [γ₁, γ₂, β₁, β₂, w₁, b of f₁, w₁, b of f₂, then (w₂, b₂, w₃) of each neuron of f₁ and of f₂] in the notation of
-Da Lio et al. 2023, Eqs. 7 and 8. A parameter is added to the entry of the rows that its slot names.
+    v⁺ = γ₁ v + β₁ τ (a_y - u ω) - ω f₁(e)
+    û⁺ = γ₂ û + β₂ τ (a_x + v ω) - f₂(e)
+
+The readable definition of the same equations in torch is `vehest.estimators.networks.ksnn`.
+Adjoint, with f̄₁ = -ω v̄⁺, f̄₂ = -û̄⁺:
+
+    v̄ = γ₁ v̄⁺ + β₂ τ ω û̄⁺,   û̄ = γ₂ û̄⁺ + Σ_i f_i' f̄_i
+    γ̄₁,p += φ_p v v̄⁺,  β̄₁,p += φ_p τ (a_y - u ω) v̄⁺,  γ̄₂,p, β̄₂,p likewise with û̄⁺
+    w̄_i,p += φ_p e f̄_i,  b̄_i,p += φ_p f̄_i,  and through tanh' = 1 - tanh² to w₂, b₂, w₃ of the active models
+
+Order of sums: local models in order of p, then neurons in order of j; gradients over samples
+backwards in time, lane by lane, and over lanes at the end of a batch.
+
+    flat parameters --slots--> theta --_forward, k = 0 … N-1--> predictions --slopes_of--> _backward, k = N-1 … 0 --> gradient
+
+Windows lie side by side in lanes. The parameters of local models that enter linearly are blended
+before they are used, and the neurons are those of each lane's two active models.
+
+A row of local model p holds [γ₁, γ₂, β₁, β₂, w₁, b of f₁, w₁, b of f₂, then (w₂, b₂, w₃) of each
+neuron of f₁ and of f₂] in the notation of Da Lio et al. 2023, Eqs. 7 and 8. A parameter is added to
+the entry of the rows that its slot names.
 """
 
 from __future__ import annotations
@@ -28,7 +48,8 @@ from vehest.estimators.kernels.recursion import (
 from vehest.lanes import choose, least, load, most, store, total, width
 
 LINEAR = 8  # parameters of a local model besides its neurons
-KEPT = 7  # rows that a step leaves for its adjoint: v, û, and the blended γ₁, γ₂, β₂ and two w₁
+# rows that a step saves for its adjoint: v, û, and the blended γ₁, γ₂, β₂ and both w₁
+SAVED_ROWS = 7
 CHANNELS = 4
 
 
@@ -47,7 +68,9 @@ def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int
 
 
 def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
-    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6 Q)."""
+    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6
+    Q).
+    """
     p = parameters
     gamma = parameters["gamma"]
     bias = p.get("linear_bias", np.zeros_like(gamma))
@@ -70,7 +93,9 @@ def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
 def c_tables(
     theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool
 ) -> dict[str, Any]:
-    """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their biases are left out."""
+    """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their
+    biases are left out.
+    """
     n_local = len(theta)
     n_hidden = (theta.shape[1] - LINEAR) // 6
     return {
@@ -87,25 +112,26 @@ def c_tables(
 
 
 def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
-    """The recursion of a network with parameters in the order of `shapes_of`; its last local model is centred at a yaw rate [rad/s]."""
-    own = settings
+    """The recursion of a network with parameters in the order of `shapes_of`; its last local model
+    is centred at a yaw rate [rad/s].
+    """
     views = {}
     first = 0
-    shapes = shapes_of(own.n_local, own.n_hidden, bias=own.bias)
-    one = np.eye(sum(int(np.prod(shape)) for shape in shapes.values()))
+    shapes = shapes_of(settings.n_local, settings.n_hidden, bias=settings.bias)
+    identity = np.eye(sum(int(np.prod(shape)) for shape in shapes.values()))
     for name, shape in shapes.items():
-        views[name] = one[:, first : first + int(np.prod(shape))].reshape(-1, *shape)
+        views[name] = identity[:, first : first + int(np.prod(shape))].reshape(-1, *shape)
         first += int(np.prod(shape))
-    slots = packed(views).reshape(len(one), -1).argmax(1)
-    step = 1.0 / own.rate_hz
-    per_width = (own.n_local - 1) / yaw_rate_max
+    slots = packed(views).reshape(len(identity), -1).argmax(1)
+    step = 1.0 / settings.rate_hz
+    per_width = (settings.n_local - 1) / yaw_rate_max
     return Recursion(
         loop,
         lambda number: (
             slots,
-            own.n_local,
-            own.n_hidden,
-            own.window,
+            settings.n_local,
+            settings.n_hidden,
+            settings.window,
             number(step),
             number(per_width),
         ),
@@ -113,9 +139,9 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
 
 
 @entry(nogil=True)
-def loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
+def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
     """See `vehest.estimators.kernels.recursion.Recursion`."""
-    slots, n_local, n_hidden, n_window, step, per_width = given
+    slots, n_local, n_hidden, n_window, step, per_width = constants
     lanes = width(series)
     neurons = 4 * n_hidden
     theta = np.empty(n_local * (LINEAR + 6 * n_hidden), flat.dtype)
@@ -123,31 +149,31 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
     scratch = np.empty(lanes, flat.dtype)
     measured = series.ravel()
     rows = np.empty(lanes, np.int64)
-    seen = np.empty(n_window * CHANNELS * lanes, flat.dtype)
-    kept = np.empty(n_window * KEPT * lanes, flat.dtype)
+    windows = np.empty(n_window * CHANNELS * lanes, flat.dtype)
+    saved = np.empty(n_window * SAVED_ROWS * lanes, flat.dtype)
     outputs = np.empty(max(n_window * neurons * 3, 1) * lanes, flat.dtype)
     car = (theta, n_local, n_hidden, step, per_width)
-    room = (seen, kept, outputs)
+    room = (windows, saved, outputs)
     for m in range(flat.shape[0]):
         for number, start in enumerate(range(0, starts.shape[1], batch)):
             end = min(start + batch, starts.shape[1])
-            own = values[m, start:end]
+            predictions = values[m, start:end]
             theta[:] = 0
             for j in range(slots.size):
                 theta[slots[j]] += flat[m, j]
             sums[:] = 0
-            for first in range(0, own.size, lanes):
-                gather(measured, CHANNELS, starts[m, start:end], first, rows, seen, CHANNELS)
+            for first in range(0, predictions.size, lanes):
+                gather(measured, CHANNELS, starts[m, start:end], first, rows, windows, CHANNELS)
                 v = load(scratch, 0) * 0
-                v = load(seen, lanes) * 0
-                u = load(seen, lanes)
+                v = load(windows, lanes) * 0
+                u = load(windows, lanes)
                 for k in range(n_window):
                     v, u = _forward(car, room, k, v, u)
                 store(scratch, 0, v)
-                for lane in range(min(lanes, own.size - first)):
-                    own[first + lane] = scratch[lane]
+                for lane in range(min(lanes, predictions.size - first)):
+                    predictions[first + lane] = scratch[lane]
                 if gradient.size:
-                    slopes_of(own, targets[m, start:end], first, losses.size > 0, scratch)
+                    slopes_of(predictions, targets[m, start:end], first, losses.size > 0, scratch)
                     v = load(scratch, 0)
                     u = load(scratch, 0) * 0
                     for k in range(n_window - 1, -1, -1):
@@ -158,22 +184,24 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 for j in range(slots.size):
                     gradient[m, j] = theta[slots[j]]
             if losses.size:
-                losses[m] += squared_error(own, targets[m, start:end])
+                losses[m] += squared_error(predictions, targets[m, start:end])
                 step_of_adam(flat[m], gradient[m], adam, m, number + 1)
 
 
 @part(_nrt=False)
 def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
-    """v and û after a step of all lanes."""
+    """v and û after step k in all lanes; leaves ``saved`` rows and neurons' ``outputs`` for
+    `_backward`.
+    """
     theta, n_local, n_hidden, step, per_width = car
-    seen, kept, outputs = room
+    windows, saved, outputs = room
     lanes = width(theta)
     row = LINEAR + 6 * n_hidden
-    now = k * CHANNELS * lanes
-    then = k * KEPT * lanes
+    window_at = k * CHANNELS * lanes
+    saved_at = k * SAVED_ROWS * lanes
     neuron = k * 4 * n_hidden * 3 * lanes
-    omega = load(seen, now)
-    speed = load(seen, now + lanes)
+    omega = load(windows, window_at)
+    speed = load(windows, window_at + lanes)
     position = least(abs(omega) * per_width, n_local - 1)
     phi = most(1 - position, 0)
     g1 = phi * theta[0]
@@ -186,23 +214,23 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
     f2 = phi * theta[7]
     for p in range(1, n_local):
         phi = most(1 - abs(position - p), 0)
-        own = p * row
-        g1 = g1 + phi * theta[own + 0]
-        g2 = g2 + phi * theta[own + 1]
-        b1 = b1 + phi * theta[own + 2]
-        b2 = b2 + phi * theta[own + 3]
-        w1 = w1 + phi * theta[own + 4]
-        f1 = f1 + phi * theta[own + 5]
-        w2 = w2 + phi * theta[own + 6]
-        f2 = f2 + phi * theta[own + 7]
+        base = p * row
+        g1 = g1 + phi * theta[base + 0]
+        g2 = g2 + phi * theta[base + 1]
+        b1 = b1 + phi * theta[base + 2]
+        b2 = b2 + phi * theta[base + 3]
+        w1 = w1 + phi * theta[base + 4]
+        f1 = f1 + phi * theta[base + 5]
+        w2 = w2 + phi * theta[base + 6]
+        f2 = f2 + phi * theta[base + 7]
     error = u - speed
     f1 = f1 + w1 * error
     f2 = f2 + w2 * error
     if n_hidden:
         model = _model(position, n_local)
         for side in range(min(2, n_local)):
-            beyond = position - model
-            phi = beyond if side == 1 else 1 - beyond
+            fraction = position - model
+            phi = fraction if side == 1 else 1 - fraction
             for i in range(2):
                 value = error * 0
                 for j in range(n_hidden):
@@ -218,15 +246,15 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
                     f1 = f1 + phi * value
                 else:
                     f2 = f2 + phi * value
-    store(kept, then, v)
-    store(kept, then + lanes, u)
-    store(kept, then + 2 * lanes, g1)
-    store(kept, then + 3 * lanes, g2)
-    store(kept, then + 4 * lanes, b2)
-    store(kept, then + 5 * lanes, w1)
-    store(kept, then + 6 * lanes, w2)
-    slip = step * (load(seen, now + 2 * lanes) - speed * omega)
-    thrust = step * (load(seen, now + 3 * lanes) + v * omega)
+    store(saved, saved_at, v)
+    store(saved, saved_at + lanes, u)
+    store(saved, saved_at + 2 * lanes, g1)
+    store(saved, saved_at + 3 * lanes, g2)
+    store(saved, saved_at + 4 * lanes, b2)
+    store(saved, saved_at + 5 * lanes, w1)
+    store(saved, saved_at + 6 * lanes, w2)
+    slip = step * (load(windows, window_at + 2 * lanes) - speed * omega)
+    thrust = step * (load(windows, window_at + 3 * lanes) + v * omega)
     return g1 * v + b1 * slip - omega * f1, g2 * u + b2 * thrust - f2
 
 
@@ -247,70 +275,73 @@ def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
     w3 = model * 0 + theta[column + 2]
     for p in range(1, n_local - 1):
         at = column + p * row
-        here = model == p
-        w2 = choose(here, theta[at], w2)
-        b2 = choose(here, theta[at + 1], b2)
-        w3 = choose(here, theta[at + 2], w3)
+        is_active = model == p
+        w2 = choose(is_active, theta[at], w2)
+        b2 = choose(is_active, theta[at + 1], b2)
+        w3 = choose(is_active, theta[at + 2], w3)
     return w2, b2, w3
 
 
 @part(_nrt=False)
-def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
-    """Adjoint of one step: derivatives by v and û before it from those after it; ``sums`` adds up those by parameters."""
+def _backward(car, room, k, v_bar, u_bar, sums):  # type: ignore[no-untyped-def]
+    """Adjoint of step k: v̄ and û̄ before it from those after it; adds the gradients of parameters
+    to ``sums``.
+    """
     theta, n_local, n_hidden, step, per_width = car
-    seen, kept, outputs = room
+    windows, saved, outputs = room
     lanes = width(theta)
     row = LINEAR + 6 * n_hidden
-    now = k * CHANNELS * lanes
-    then = k * KEPT * lanes
+    window_at = k * CHANNELS * lanes
+    saved_at = k * SAVED_ROWS * lanes
     neuron = k * 4 * n_hidden * 3 * lanes
-    omega = load(seen, now)
-    speed = load(seen, now + lanes)
-    v = load(kept, then)
-    u = load(kept, then + lanes)
+    omega = load(windows, window_at)
+    speed = load(windows, window_at + lanes)
+    v = load(saved, saved_at)
+    u = load(saved, saved_at + lanes)
     error = u - speed
     position = least(abs(omega) * per_width, n_local - 1)
-    slip = step * (load(seen, now + 2 * lanes) - speed * omega)
-    thrust = step * (load(seen, now + 3 * lanes) + v * omega)
-    to_f1 = -omega * to_v
-    to_f2 = -to_u
+    slip = step * (load(windows, window_at + 2 * lanes) - speed * omega)
+    thrust = step * (load(windows, window_at + 3 * lanes) + v * omega)
+    f1_bar = -omega * v_bar
+    f2_bar = -u_bar
     for p in range(n_local):
         phi = most(1 - abs(position - p), 0)
         at = p * row * lanes
-        add(sums, at, phi * to_v * v)
-        add(sums, at + lanes, phi * to_u * u)
-        add(sums, at + 2 * lanes, phi * to_v * slip)
-        add(sums, at + 3 * lanes, phi * to_u * thrust)
-        add(sums, at + 4 * lanes, phi * to_f1 * error)
-        add(sums, at + 5 * lanes, phi * to_f1)
-        add(sums, at + 6 * lanes, phi * to_f2 * error)
-        add(sums, at + 7 * lanes, phi * to_f2)
-    next_v = (
-        load(kept, then + 2 * lanes) * to_v + load(kept, then + 4 * lanes) * step * omega * to_u
+        add(sums, at, phi * v_bar * v)
+        add(sums, at + lanes, phi * u_bar * u)
+        add(sums, at + 2 * lanes, phi * v_bar * slip)
+        add(sums, at + 3 * lanes, phi * u_bar * thrust)
+        add(sums, at + 4 * lanes, phi * f1_bar * error)
+        add(sums, at + 5 * lanes, phi * f1_bar)
+        add(sums, at + 6 * lanes, phi * f2_bar * error)
+        add(sums, at + 7 * lanes, phi * f2_bar)
+    v_bar_before = (
+        load(saved, saved_at + 2 * lanes) * v_bar
+        + load(saved, saved_at + 4 * lanes) * step * omega * u_bar
     )
-    next_u = (
-        load(kept, then + 3 * lanes) * to_u
-        + load(kept, then + 5 * lanes) * to_f1
-        + load(kept, then + 6 * lanes) * to_f2
+    u_bar_before = (
+        load(saved, saved_at + 3 * lanes) * u_bar
+        + load(saved, saved_at + 5 * lanes) * f1_bar
+        + load(saved, saved_at + 6 * lanes) * f2_bar
     )
     if n_hidden:
         model = _model(position, n_local)
         for side in range(min(2, n_local)):
-            beyond = position - model
-            phi = beyond if side == 1 else 1 - beyond
+            fraction = position - model
+            phi = fraction if side == 1 else 1 - fraction
             for i in range(2):
-                a = phi * (to_f1 if i == 0 else to_f2)
+                a = phi * (f1_bar if i == 0 else f2_bar)
                 for j in range(n_hidden):
                     at = neuron + ((2 * side + i) * n_hidden + j) * 3 * lanes
                     h = load(outputs, at + 2 * lanes)
                     inner = a * load(outputs, at + lanes) * (1 - h * h)
-                    next_u = next_u + inner * load(outputs, at)
+                    u_bar_before = u_bar_before + inner * load(outputs, at)
                     column = side * row + LINEAR + 3 * (i * n_hidden + j)
                     for p in range(max(n_local - 1, 1)):
-                        here = model == p
+                        is_active = model == p
                         slot = (column + p * row) * lanes
-                        own = choose(here, inner, 0)
-                        add(sums, slot, own * error)
-                        add(sums, slot + lanes, own)
-                        add(sums, slot + 2 * lanes, choose(here, a * h, 0))
-    return next_v, next_u
+                        active_inner = choose(is_active, inner, 0)
+                        add(sums, slot, active_inner * error)
+                        add(sums, slot + lanes, active_inner)
+                        add(sums, slot + 2 * lanes, choose(is_active, a * h, 0))
+    return v_bar_before, u_bar_before

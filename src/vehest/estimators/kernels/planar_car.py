@@ -1,13 +1,25 @@
 """Sigma points through the planar cars of `vehicle.dynamics`, compiled, with the adjoint.
 
-Points lie side by side in columns, so that what is computed of each runs along rows; columns are as many as fill whole vectors, and those
-beyond the points repeat the last one and have no gradient. A network sees a point a row, its units side by side: its matrix products are as
-fast for a few points as for many. The adjoint computes stages again instead of keeping them. Blocks of sequences are small enough for a
-core's own cache; matrix products stay on their thread.
+    points (S, n, B) --_gather_points--> columns --_stages: _motion, _rates--> x⁺ --_scatter_points--> points
 
-In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three layers, then their weights transposed;
-learnt numbers in the order of `LEARNT` and `PACEJKA`; known ones; and which car. ``room`` is what a motion leaves for its adjoint
-(`_room`).
+Equations: see `vehest.vehicle.dynamics` (cars, network) and `vehest.vehicle.planar` (chassis), the
+readable definitions in torch. A step is x⁺ = x + Δt/6 (k₁ + 2 k₂ + 2 k₃ + k₄). Its adjoint computes
+the stages again and passes x̄⁺ through them from the last to the first: k̄₄ = Δt/6 x̄⁺, k̄₃ = Δt/3
+x̄⁺ + Δt J₄ᵀ k̄₄ and so on, x̄ = x̄⁺ + Σ J_iᵀ k̄_i, with J_i the Jacobian of the rates at stage i.
+
+Order of sums: sums may be reordered (``fastmath``); gradients of parameters are added over points
+in order, stage by stage.
+
+
+Points lie side by side in columns, so that what is computed of each runs along rows; columns are as
+many as fill whole vectors, and those beyond the points repeat the last one and have no gradient. A
+network sees a point a row, its units side by side: its matrix products are as fast for a few points
+as for many. The adjoint computes stages again instead of storing them. Blocks of sequences are
+small enough for a core's own cache; matrix products stay on their thread.
+
+In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three
+layers, then their weights transposed; learnt numbers in the order of `LEARNT` and `PACEJKA`; fixed
+ones; and which car. ``room`` is what a motion saves for its adjoint (`_room`).
 """
 
 from __future__ import annotations
@@ -37,7 +49,7 @@ from vehest.vehicle.dynamics import (
     TyreNetworkCar,
     physical_of,
 )
-from vehest.vehicle.tyres import STILL
+from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
 
 BLOCK = 110  # points at a time
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
@@ -49,7 +61,9 @@ piece = part(**_FAST)
 
 @piece
 def copy_rows(rows, out):  # type: ignore[no-untyped-def]
-    """The first rows of ``out`` become ``rows``. An assignment would take longer to compile: it checks shapes and words a message."""
+    """The first rows of ``out`` become ``rows``. An assignment would take longer to compile: it
+    checks shapes and words a message.
+    """
     for i in range(rows.shape[0]):
         for p in range(rows.shape[1]):
             out[i, p] = rows[i, p]
@@ -58,11 +72,16 @@ def copy_rows(rows, out):  # type: ignore[no-untyped-def]
 class CompiledPlanarCar(PointModel):
     """A planar car for the unscented filter.
 
-    Args:
-        dynamics: the car, one that `is_compilable`; gradients go to its parameters where they are wanted.
-        step: [s].
-        lower: smallest possible value of each state.
-        dtype: precision of the arrays.
+    Parameters
+    ----------
+    dynamics : Dynamics
+        The car, one that `is_compilable`; gradients go to its parameters where they are wanted.
+    step : float
+        [s].
+    lower : Sequence[float] | None
+        Smallest possible value of each state.
+    dtype : torch.dtype
+        Precision of the arrays.
     """
 
     is_compiled = True
@@ -76,7 +95,7 @@ class CompiledPlanarCar(PointModel):
             layers = [W1.mT, b1, W2.mT, b2, W3, b3]  # as their gradients are fastest
         else:
             layers = [torch.zeros(0, 0), torch.zeros(0)] * 3
-        learnt, known = physical_of(dynamics)
+        learnt, fixed = physical_of(dynamics)
         tensors = [tensor.to(dtype) for tensor in (*layers, learnt)]
         arrays = [tensor.detach().contiguous().numpy() for tensor in tensors]
         learning = any(tensor.requires_grad for tensor in tensors)
@@ -84,7 +103,7 @@ class CompiledPlanarCar(PointModel):
         self.lower = lower
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
-        numbers = [*known, step, TURN, UNSCALED, STILL, flat, GRAVITY]
+        numbers = [*fixed, step, TURN, UNSCALED, SLIP_SPEED_OFFSET, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
         self.car = (
             (*arrays[:6], *matrices),
@@ -123,8 +142,10 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 
 
 @piece
-def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
-    """Points of some sequences side by side; columns beyond them are ``rest`` times the last one."""
+def _columns(points, first, end, padding, x):  # type: ignore[no-untyped-def]
+    """Points of some sequences side by side; columns beyond them are ``padding`` times the last
+    one.
+    """
     count, n = points.shape[:2]
     for b in range(first, end):
         for s in range(count):
@@ -133,7 +154,7 @@ def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
     last = (end - first) * count - 1
     for i in range(n):
         for p in range(last + 1, x.shape[1]):
-            x[i, p] = rest * x[i, last]
+            x[i, p] = padding * x[i, last]
 
 
 @piece
@@ -150,7 +171,7 @@ def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
+def _scatter_points(rows, points, first, end):  # type: ignore[no-untyped-def]
     """Rows back into points of some sequences."""
     count = points.shape[0]
     for b in range(first, end):
@@ -161,6 +182,7 @@ def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
 
 @piece
 def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
+    """A hidden layer: above = σ(below Wᵀ + offset)."""
     np.dot(below, transposed, above)
     for p in range(above.shape[0]):
         for i in range(above.shape[1]):
@@ -169,7 +191,8 @@ def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
 
 @piece
 def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
-    """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
+    """Slope of a squashed value, its distances from both ends multiplied; none where it has reached
+    one but for rounding.
 
     At a crawl slips change by a million per m/s, and rounding would count.
     """
@@ -178,6 +201,7 @@ def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
 
 @piece
 def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
+    """Outputs o (4, P) of the network for features f (P, F); columns beyond the points are zero."""
     T1, b1, T2, b2, _, b3, _, _, T3 = layers
     _hidden(f, T1, b1, h1)
     _hidden(h1, T2, b2, h2)
@@ -217,17 +241,19 @@ def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients)
 
 @piece
 def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
-    one = rows.dtype.type(1)
+    """Multiply gradients of a hidden layer by its slope σ (1 - σ), in place."""
+    unity = rows.dtype.type(1)
     nothing = rows.dtype.type(0)
     for p in range(rows.shape[0]):
         for i in range(rows.shape[1]):
-            rows_bar[p, i] *= _rise(rows[p, i], one - rows[p, i], flat, nothing)
+            rows_bar[p, i] *= _rise(rows[p, i], unity - rows[p, i], flat, nothing)
 
 
 @piece
-def _add_product(one, other, out):  # type: ignore[no-untyped-def]
+def _add_product(first, second, out):  # type: ignore[no-untyped-def]
+    """out += firstᵀ second."""
     product = np.empty_like(out)
-    np.dot(one.T, other, product)
+    np.dot(first.T, second, product)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] += product[i, j]
@@ -235,23 +261,24 @@ def _add_product(one, other, out):  # type: ignore[no-untyped-def]
 
 @piece
 def _add_rows(rows, out):  # type: ignore[no-untyped-def]
+    """out += sum of the rows."""
     for p in range(rows.shape[0]):
         for i in range(rows.shape[1]):
             out[i] += rows[p, i]
 
 
 @piece
-def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
-    """Slips (front, rear, ratio), and what the network sees."""
+def _slips_and_features(x, u, car, f, slips):  # type: ignore[no-untyped-def]
+    """Write slips (front, rear, ratio), and the features that the network receives."""
     _, theta, constants, kind = car
     lr = theta[0]
-    still = constants[6]
+    speed_offset = constants[6]
     lf = constants[1] - lr
     for p in range(x.shape[1]):
-        along = x[0, p] + still
-        slips[0, p] = arctan((x[1, p] + lf * x[2, p]) / along) - u[0, p]
-        slips[1, p] = arctan((x[1, p] - lr * x[2, p]) / along)
-        slips[2, p] = (x[3, p] - x[0, p]) / along
+        vx_safe = x[0, p] + speed_offset
+        slips[0, p] = arctan((x[1, p] + lf * x[2, p]) / vx_safe) - u[0, p]
+        slips[1, p] = arctan((x[1, p] - lr * x[2, p]) / vx_safe)
+        slips[2, p] = (x[3, p] - x[0, p]) / vx_safe
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
         for p in range(f.shape[0]):
             for i in range(5):
@@ -270,11 +297,11 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _curve(slip, stiffness, shape, one):  # type: ignore[no-untyped-def]
+def _curve(slip, stiffness, shape, unity):  # type: ignore[no-untyped-def]
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
     angle = arctan(stiffness * slip)
     slope = math.cos(shape * angle)
-    steep = slope * shape / (one + stiffness * slip * stiffness * slip)
+    steep = slope * shape / (unity + stiffness * slip * stiffness * slip)
     return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
 
 
@@ -292,7 +319,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     points = x.shape[1]
     turn = constants[4]
     unscaled = constants[5]
-    one = theta.dtype.type(1)
+    unity = theta.dtype.type(1)
     if kind == FRICTION_SCALED:
         for k in range(2):
             for p in range(points):
@@ -307,22 +334,24 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
         _, front_load, rear_load = _loads(theta, constants)
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         for p in range(points):
-            along = friction * Dx * _curve(slips[2, p], Bx, Cx, one)[0]
-            forces[0, p] = rear_load * along
-            forces[1, p] = front_load * along
-            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr, one)[0]
-            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf, one)[0]
+            vx_safe = friction * Dx * _curve(slips[2, p], Bx, Cx, unity)[0]
+            forces[0, p] = rear_load * vx_safe
+            forces[1, p] = front_load * vx_safe
+            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr, unity)[0]
+            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf, unity)[0]
 
 
 @piece
 def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
-    """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and adds to the others."""
+    """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and
+    adds to the others.
+    """
     _, theta, constants, kind = car
     points = x.shape[1]
     turn = constants[4]
     unscaled = constants[5]
     flat = constants[7]
-    one = theta.dtype.type(1)
+    unity = theta.dtype.type(1)
     nothing = theta.dtype.type(0)
     slips_bar[:] = 0
     if kind == FRICTION_SCALED:
@@ -335,7 +364,10 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
                 slips_bar[1 - k, p] = (
-                    through * size * turn * _rise(one - direction, one + direction, flat, nothing)
+                    through
+                    * size
+                    * turn
+                    * _rise(unity - direction, unity + direction, flat, nothing)
                 )
                 x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
     elif kind == UNSCALED_FORCES:
@@ -347,7 +379,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         total = np.zeros_like(theta)
         for p in range(points):
-            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx, one)
+            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx, unity)
             up = slope[0, p] * rear_load + slope[1, p] * front_load
             slips_bar[2, p] = up * friction * Dx * rise
             total[0] += (slope[1, p] - slope[0, p]) * weight * friction * Dx * peak
@@ -355,7 +387,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[10] += up * friction * Dx * stiffer
             total[11] += up * friction * Dx * rounder
             total[12] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf, one)
+            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf, unity)
             up = -slope[3, p] * front_load
             slips_bar[0, p] = up * friction * Df * rise
             total[0] -= slope[3, p] * weight * friction * Df * peak
@@ -363,7 +395,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[13] += up * friction * Df * stiffer
             total[14] += up * friction * Df * rounder
             total[15] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr, one)
+            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr, unity)
             up = -slope[2, p] * rear_load
             slips_bar[1, p] = up * friction * Dr * rise
             total[0] += slope[2, p] * weight * friction * Dr * peak
@@ -412,7 +444,9 @@ def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
 
 @piece
 def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the forces, rows of ``slope``, and adds to the others; ``out`` is what `_chassis` wrote."""
+    """Writes the gradients of the forces, rows of ``slope``, and adds to the others; ``out`` is
+    what `_chassis` wrote.
+    """
     _, theta, constants, _ = car
     mass, wheelbase, radius = constants[:3]
     lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta[:9]
@@ -443,10 +477,10 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
         turning = out_bar[2, p] / inertia
         spinning = out_bar[3, p]
         twisting = spinning * radius / powertrain
-        along = ax * cosine + ay * sine + turning * sine * lf
+        vx_safe = ax * cosine + ay * sine + turning * sine * lf
         across = ay * cosine - ax * sine + turning * cosine * lf
         slope[0, p] = ax - radius * twisting
-        slope[1, p] = along - radius * twisting
+        slope[1, p] = vx_safe - radius * twisting
         slope[2, p] = ay - turning * lr
         slope[3, p] = across
         x_bar[0, p] -= ax * (drag1 + two * drag2 * vx)
@@ -475,10 +509,10 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
 
 @piece
 def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
-    """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is kept for the adjoint."""
+    """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is saved for the adjoint."""
     layers, _, _, kind = car
     f, slips, h1, h2, o, forces, plain = room
-    _seen(x, u, car, f, slips)
+    _slips_and_features(x, u, car, f, slips)
     if kind != PACEJKA_FORCES:
         _network(layers, f, h1, h2, o)
     if kind == RATES:
@@ -538,9 +572,12 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
 
 @piece
 def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+    """Add the gradients of slips to those of the state and, when learning, of the distance of the
+    rear axle.
+    """
     lf = constants[1] - lr
-    still = constants[6]
-    one = x.dtype.type(1)
+    speed_offset = constants[6]
+    unity = x.dtype.type(1)
     d_lf = x.dtype.type(0)
     d_lr = x.dtype.type(0)
     for p in range(x.shape[1]):
@@ -548,13 +585,15 @@ def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # typ
         vy = x[1, p]
         yaw_rate = x[2, p]
         rim = x[3, p]
-        along = vx + still
-        front = (vy + lf * yaw_rate) / along
-        rear = (vy - lr * yaw_rate) / along
-        front_bar = slips_bar[0, p] / (one + front * front) / along
-        rear_bar = slips_bar[1, p] / (one + rear * rear) / along
-        ratio_bar = slips_bar[2, p] / along
-        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + one)
+        vx_safe = vx + speed_offset
+        front = (vy + lf * yaw_rate) / vx_safe
+        rear = (vy - lr * yaw_rate) / vx_safe
+        front_bar = slips_bar[0, p] / (unity + front * front) / vx_safe
+        rear_bar = slips_bar[1, p] / (unity + rear * rear) / vx_safe
+        ratio_bar = slips_bar[2, p] / vx_safe
+        x_bar[0, p] -= (
+            front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / vx_safe + unity)
+        )
         x_bar[1, p] += front_bar + rear_bar
         x_bar[2, p] += front_bar * lf - rear_bar * lr
         x_bar[3, p] += ratio_bar
@@ -566,6 +605,7 @@ def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # typ
 
 @piece
 def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
+    """dx/dt from accelerations: dvx/dt = ax + vy r, dvy/dt = ay - vx r; friction stays."""
     for p in range(x.shape[1]):
         rates[0, p] = motion[0, p] + x[1, p] * x[2, p]
         rates[1, p] = motion[1, p] - x[0, p] * x[2, p]
@@ -577,14 +617,16 @@ def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
 @piece
 def _block_of(sequences, count):  # type: ignore[no-untyped-def]
     """Sequences in a block, so that blocks are about equal."""
-    most = max(BLOCK // count, 1)
-    pieces = (sequences + most - 1) // most
+    max_sequences = max(BLOCK // count, 1)
+    pieces = (sequences + max_sequences - 1) // max_sequences
     return (sequences + pieces - 1) // pieces
 
 
 @piece
-def _taken(points, inputs, first, end):  # type: ignore[no-untyped-def]
-    """Points of some sequences and their inputs, in as many columns as fill whole vectors; see `_columns` and `_driven`."""
+def _gather_points(points, inputs, first, end):  # type: ignore[no-untyped-def]
+    """Points of some sequences and their inputs, in as many columns as fill whole vectors; see
+    `_columns` and `_driven`.
+    """
     count, n, _ = points.shape
     lanes = width(points)
     columns = ((end - first) * count + lanes - 1) // lanes * lanes
@@ -597,7 +639,9 @@ def _taken(points, inputs, first, end):  # type: ignore[no-untyped-def]
 
 @piece
 def _room(points, x, car):  # type: ignore[no-untyped-def]
-    """For what the network sees of so many points, slips, both hidden layers, its outputs, forces, and rates without what it adds."""
+    """For what the network sees of so many points, slips, both hidden layers, its outputs, forces,
+    and rates without what it adds.
+    """
     (T1, _, T2) = car[0][:3]
     columns = x.shape[1]
     dtype = x.dtype
@@ -641,7 +685,7 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        x0, u = _taken(points, inputs, first, end)
+        x0, u = _gather_points(points, inputs, first, end)
         room = _room((end - first) * count, x0, car)
         _, rates = _stages(x0, u, car, (room, room, room, room))
         for i in range(n):
@@ -649,7 +693,7 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
                 x0[i, p] += sixth * (
                     rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p]
                 )
-        _put(x0, out, first, end)
+        _scatter_points(x0, out, first, end)
 
 
 @compiled
@@ -658,13 +702,13 @@ def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-unty
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        x, u = _taken(points, inputs, first, end)
+        x, u = _gather_points(points, inputs, first, end)
         expected = np.empty_like(u)
         _motion(x, u, car, _room((end - first) * count, x, car), expected)
         for p in range(x.shape[1]):
             expected[2, p] = x[2, p]
             expected[3, p] = x[3, p]
-        _put(expected, out, first, end)
+        _scatter_points(expected, out, first, end)
 
 
 @compiled
@@ -676,10 +720,15 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        x0, u = _taken(points, inputs, first, end)
-        own = (end - first) * count
+        x0, u = _gather_points(points, inputs, first, end)
+        n_points = (end - first) * count
         columns = x0.shape[1]
-        rooms = (_room(own, x0, car), _room(own, x0, car), _room(own, x0, car), _room(own, x0, car))
+        rooms = (
+            _room(n_points, x0, car),
+            _room(n_points, x0, car),
+            _room(n_points, x0, car),
+            _room(n_points, x0, car),
+        )
         x, _ = _stages(x0, u, car, rooms)
         up = np.empty_like(x0)
         _columns(upstream, first, end, 0, up)
@@ -705,7 +754,7 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
             for i in range(n):
                 for p in range(columns):
                     total[i, p] += stage_bar[i, p]
-        _put(total, out, first, end)
+        _scatter_points(total, out, first, end)
 
 
 @compiled
@@ -715,7 +764,7 @@ def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, s
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        x, u = _taken(points, inputs, first, end)
+        x, u = _gather_points(points, inputs, first, end)
         room = _room((end - first) * count, x, car)
         up = np.empty_like(u)
         x_bar = np.zeros_like(x)
@@ -727,4 +776,4 @@ def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, s
             up[2, p] = 0
             up[3, p] = 0
         _motion_adjoint(x, u, car, room, up, x_bar, learning, gradients)
-        _put(x_bar, out, first, end)
+        _scatter_points(x_bar, out, first, end)

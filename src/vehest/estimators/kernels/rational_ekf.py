@@ -1,7 +1,18 @@
-"""The extended Kalman filter over `TyreTrack`, compiled: analytic Jacobians, one pass over a recording.
+"""The extended Kalman filter over `TyreTrack`, compiled: analytic Jacobians, one pass over a
+recording.
 
-The derivatives are those of Di Biase, Lenzo & Timpone 2020, Eqs. 28 to 36 and 58 and the appendix, with respect to logarithms of the tyre
-parameters and derived anew, since several lines of the printed ones are damaged.
+For each sample, with A = ∂f/∂x, H = ∂h/∂x (the readable definition of f and h in torch is
+`vehest.vehicle.tyre_track`):
+
+    x⁻ = f(x, u),  P⁻ = A P Aᵀ + Δt B Λ Bᵀ                       `_move`, `_propagate`, `_add_noise`
+    e = y - h(x⁻),  S = H P⁻ Hᵀ + R,  K = P⁻ Hᵀ S⁻¹               `_innovate`, `_gain`
+    x = x⁻ + K e,  P = (I - K H) P⁻ (I - K H)ᵀ + K R Kᵀ           `_reduce`
+
+Order of sums: over states in order of their index; P is made symmetric after prediction and update.
+
+The derivatives are those of Di Biase, Lenzo & Timpone 2020, Eqs. 28 to 36 and 58 and the appendix,
+with respect to logarithms of the tyre parameters and derived anew, since several lines of the
+printed ones are damaged.
 """
 
 from __future__ import annotations
@@ -19,39 +30,54 @@ _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, out):  # type: ignore[no-untyped-def]
+def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, out):  # type: ignore[no-untyped-def]
     """Filter samples of yaw_rate, vx, ay, steer, (T, 4); NaN in yaw_rate and ay is skipped.
 
-    Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, and tyre parameters are held. States are β, r, β', r', the
-    logarithms of the adapted tyre parameters and, optionally, the pull of a crossfall b = g sin φ [m/s²]:
+    Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, and tyre parameters
+    stay. States are β, r, β', r', the logarithms of the adapted tyre parameters and, optionally,
+    the pull of a crossfall b = g sin φ [m/s²]:
 
         β'⁺ = (F_F + F_R)/(M u) - r + b/u,   a_y = u (β' + r) - b,   b⁺ = b
 
-    Args:
-        samples: (T, 4).
-        track: mass, yaw inertia, a_F and a_R; tyre parameters in the order of `TYRE_PARAMETERS`, (5,); which of them are states, (p,),
-            p = n - 4, or n - 5 where the last state is b; Δt [s]; the minimum speed [m/s]; and the lateral acceleration |u r| below which
-            the states from the fifth on are held [m/s²].
-        variances: of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (3 + n - 4,).
-        bounds: largest absolute value of each state, (n,).
-        start_tyres: covariance of the logarithms of the adapted parameters at the start, (p, p).
-        guessed: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well:
-            they are taken to be the reason; variance of β [rad²] from which on the motion alone is guessed anew, since without
-            measurements the model may be unstable; and variances of the first four states of a car that rolls, (4,).
-        gate: its deviations squared, inf: none; its patience in samples; and how often on end yaw rate and ay were refused before the first
-            sample, (2,), after the last one on return.
-        state: mean (n,) and covariance (n, n) at the first sample before its measurement; at the last sample after it on return.
-        out: means and deviations of states, (T, n) each, covariance of β and r, (T, 2, 2), innovation, (T, 2), its covariance,
-            (T, 2, 2), and what was measured, (T, 2).
+    Parameters
+    ----------
+    samples
+        (T, 4).
+    track
+        Mass, yaw inertia, a_F and a_R; tyre parameters in the order of `TYRE_PARAMETERS`, (5,);
+        which of them are states, (p,), p = n - 4, or n - 5 where the last state is b; Δt [s]; the
+        minimum speed [m/s]; and the lateral acceleration |u r| below which the states from the
+        fifth on stay [m/s²].
+    variances
+        Of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (3 + n -
+        4,).
+    bounds
+        Largest absolute value of each state, (n,).
+    start_tyres
+        Covariance of the logarithms of the adapted parameters at the start, (p, p).
+    restart
+        Sideslip angle [rad] beyond which motion and tyres restart, the motion as that of a car that
+        rolls; variance of β [rad²] beyond which the motion alone restarts, since without
+        measurements the model may be unstable; and variances of the first four states of a car that
+        rolls, (4,).
+    gate
+        Its deviations squared, inf: none; its patience in samples; and how often on end yaw rate
+        and ay were refused before the first sample, (2,), after the last one on return.
+    state
+        Mean (n,) and covariance (n, n) at the first sample before its measurement; at the last
+        sample after it on return.
+    out
+        Means and deviations of states, (T, n) each, covariance of β and r, (T, 2, 2), innovation,
+        (T, 2), its covariance, (T, 2, 2), and what was measured, (T, 2).
     """
     car, nominal, adapted, step, minimum_speed, adapt_above = track
-    (largest, lost, rolling) = guessed
+    (max_sideslip, lost_variance, rolling) = restart
     (limit, patience, refused) = gate
     (mean, cov) = state
     means, deviations, sideslip_cov, innovation, innovation_cov, measured = out
     n = len(mean)
     tyres = 4 + len(adapted)
-    left = np.empty((n, n))
+    product = np.empty((n, n))
     gain = np.empty((n, 2))
     cross = np.empty((n, 2))
     per_rate = np.zeros(n)
@@ -61,8 +87,8 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
         vx = samples[k, 1]
         steer = samples[k, 3]
         if vx < minimum_speed:
-            _roll(mean, cov, rolling, car, vx, steer)
-            _note(k, mean, cov, means, deviations, sideslip_cov)
+            roll_without_slip(mean, cov, rolling, car, vx, steer)
+            _record(k, mean, cov, means, deviations, sideslip_cov)
             innovation[k] = 0.0
             measured[k] = False
             innovation_cov[k] = np.eye(2)
@@ -74,16 +100,16 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
             front = _move(
                 mean, car, parameters, adapted, speed, samples[k - 1, 3], step, per_rate, per_turn
             )
-            _spread(cov, per_rate, per_turn, step, left)
+            _propagate(cov, per_rate, per_turn, step, product)
             _add_noise(cov, front, car, speed, step, variances, abs(speed * mean[1]) >= adapt_above)
             _clip(mean, bounds)
-            if not abs(mean[0]) < largest:
-                _roll(mean, cov, rolling, car, vx, steer)
+            if not abs(mean[0]) < max_sideslip:
+                roll_without_slip(mean, cov, rolling, car, vx, steer)
                 mean[4:tyres] = 0.0
                 cov[4:tyres, 4:tyres] = start_tyres
-            elif not cov[0, 0] < lost:
-                _roll(mean, cov, rolling, car, vx, steer)
-        held = abs(vx * mean[1]) < adapt_above
+            elif not cov[0, 0] < lost_variance:
+                roll_without_slip(mean, cov, rolling, car, vx, steer)
+        holds_tyres = abs(vx * mean[1]) < adapt_above
         _innovate(
             mean,
             cov,
@@ -98,17 +124,19 @@ def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, o
             innovation_cov[k],
             measured[k],
         )
-        _gain(cross, innovation_cov[k], held, gain)
+        _gain(cross, innovation_cov[k], holds_tyres, gain)
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
         _clip(mean, bounds)
-        _reduce(cov, gain, cross, vx, tyres < n, variances, measured[k], left)
-        _note(k, mean, cov, means, deviations, sideslip_cov)
+        _reduce(cov, gain, cross, vx, tyres < n, variances, measured[k], product)
+        _record(k, mean, cov, means, deviations, sideslip_cov)
 
 
 @numba.njit(inline="always")
 def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):  # type: ignore[no-untyped-def]
-    """f: mean one step later, in place; writes the rows of A for β' and r', returns the front axle's force and slopes."""
+    """f: mean one step later, in place; writes the rows of A for β' and r', returns the front
+    axle's force and slopes.
+    """
     mass, inertia, front_arm, rear_arm = car
     turn = mean[1] / speed
     front = _axle(steer - mean[0] - front_arm * turn, parameters[0], parameters[1], parameters[4])
@@ -149,38 +177,42 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
 
 
 @numba.njit(inline="always")
-def _spread(cov, per_rate, per_turn, step, left):  # type: ignore[no-untyped-def]
-    """A P Aᵀ, in place: β and r are moved by their rates, β' and r' come from all states, tyre parameters stay."""
+def _propagate(cov, per_rate, per_turn, step, product):  # type: ignore[no-untyped-def]
+    """A P Aᵀ, in place: β and r are moved by their rates, β' and r' come from all states, tyre
+    parameters stay.
+    """
     n = len(cov)
     for j in range(n):  # A P
-        left[0, j] = cov[0, j] + step * cov[2, j]
-        left[1, j] = cov[1, j] + step * cov[3, j]
+        product[0, j] = cov[0, j] + step * cov[2, j]
+        product[1, j] = cov[1, j] + step * cov[3, j]
         first = 0.0
         second = 0.0
         for i in range(n):
             first += per_rate[i] * cov[i, j]
             second += per_turn[i] * cov[i, j]
-        left[2, j] = first
-        left[3, j] = second
+        product[2, j] = first
+        product[3, j] = second
         for i in range(4, n):
-            left[i, j] = cov[i, j]
+            product[i, j] = cov[i, j]
     for i in range(n):
-        cov[i, 0] = left[i, 0] + step * left[i, 2]
-        cov[i, 1] = left[i, 1] + step * left[i, 3]
+        cov[i, 0] = product[i, 0] + step * product[i, 2]
+        cov[i, 1] = product[i, 1] + step * product[i, 3]
         first = 0.0
         second = 0.0
         for j in range(n):
-            first += left[i, j] * per_rate[j]
-            second += left[i, j] * per_turn[j]
+            first += product[i, j] * per_rate[j]
+            second += product[i, j] * per_turn[j]
         cov[i, 2] = first
         cov[i, 3] = second
         for j in range(4, n):
-            cov[i, j] = left[i, j]
+            cov[i, j] = product[i, j]
 
 
 @numba.njit(inline="always")
 def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ignore[no-untyped-def]
-    """Q = Δt B Λ Bᵀ of the steering angle and, where they wander, of the tyre parameters; Eqs. 41 to 45."""
+    """Q = Δt B Λ Bᵀ of the steering angle and, where they wander, of the tyre parameters; Eqs. 41
+    to 45.
+    """
     rate = front.per_slip * (1.0 / (car[0] * speed))
     acceleration = car[2] * front.per_slip / car[1]
     spread = step * variances[2]
@@ -209,7 +241,8 @@ def _innovate(  # type: ignore[no-untyped-def]
     S,
     measured,
 ):
-    """Innovations of yaw rate and ay, their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0.
+    """Innovations of yaw rate and ay, their covariance S and P Hᵀ; of what was not measured 0, the
+    identity's rows and 0.
 
     What is refused counts as not measured.
     """
@@ -243,40 +276,45 @@ def _innovate(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _gain(cross, S, held, gain):  # type: ignore[no-untyped-def]
-    """K = P Hᵀ S⁻¹, the rows of states that are held 0."""
+def _gain(cross, S, holds_tyres, gain):  # type: ignore[no-untyped-def]
+    """K = P Hᵀ S⁻¹; the rows of tyre parameters are 0 where these stay."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
     for i in range(len(gain)):
         gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
         gain[i, 1] = (cross[i, 1] * S[0, 0] - cross[i, 0] * S[0, 1]) / determinant
-    if held:
+    if holds_tyres:
         gain[4:] = 0.0
 
 
 @numba.njit(inline="always")
-def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type: ignore[no-untyped-def]
-    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row: Joseph's form, which holds for any gain."""
+def _reduce(cov, gain, cross, vx, crossfall, variances, measured, product):  # type: ignore[no-untyped-def]
+    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row: Joseph's form, which holds for any
+    gain.
+    """
     n = len(cov)
     for i in range(n):
         for j in range(n):
-            left[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
+            product[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
     for i in range(n):
-        seen_rate = left[i, 1]
-        seen_ay = vx * (left[i, 2] + left[i, 1])
+        rate_covariance = product[i, 1]
+        ay_covariance = vx * (product[i, 2] + product[i, 1])
         if crossfall:
-            seen_ay -= left[i, -1]
+            ay_covariance -= product[i, -1]
         for j in range(n):
-            total = left[i, j]
+            total = product[i, j]
             if measured[0]:
-                total += (gain[i, 0] * variances[0] - seen_rate) * gain[j, 0]
+                total += (gain[i, 0] * variances[0] - rate_covariance) * gain[j, 0]
             if measured[1]:
-                total += (gain[i, 1] * variances[1] - seen_ay) * gain[j, 1]
+                total += (gain[i, 1] * variances[1] - ay_covariance) * gain[j, 1]
             cov[i, j] = total
     make_symmetric(cov)
 
 
 @numba.njit(inline="always")
-def _roll(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
+def roll_without_slip(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
+    """Set the motion to that of a car that rolls, with variances ``rolling``, independent of all
+    else.
+    """
     turn = steer / (car[2] + car[3])
     mean[0] = car[3] * turn
     mean[1] = vx * turn
@@ -290,7 +328,8 @@ def _roll(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _note(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-untyped-def]
+def _record(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-untyped-def]
+    """Write mean, deviations and the covariance of β and r of sample k."""
     means[k] = mean
     for i in range(len(mean)):
         deviations[k, i] = math.sqrt(max(cov[i, i], 0.0))
@@ -301,5 +340,6 @@ def _note(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-unt
 
 @numba.njit(inline="always")
 def _clip(mean, bounds):  # type: ignore[no-untyped-def]
+    """Clip states to ±bounds, in place."""
     for i in range(len(mean)):
         mean[i] = min(max(mean[i], -bounds[i]), bounds[i])

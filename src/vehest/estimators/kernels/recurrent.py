@@ -1,7 +1,23 @@
-"""The GRU and LSTM recursions with their read-out, compiled; equations in `vehest.estimators.gru` and `vehest.estimators.lstm`.
+"""The GRU and LSTM recursions with their read-out, compiled, and their adjoints.
 
-Parameters of a member are those of `RecurrentNetwork` in their order: weights of inputs (G, H, C), of states (G, H, H), biases (G, H), and
-weight (H,) and offset of the read-out. Windows lie side by side in lanes.
+GRU (Cho et al. 2014), with reset r, update z and candidate n; LSTM (Hochreiter & Schmidhuber 1997),
+with input, forget and output gates i, f, o, candidate g and cell c:
+
+    r, z = σ(W x + U h + b),  n = tanh(W_n x + b_n + r (U_n h)),  h⁺ = n + z (h - n)
+    i, f, o = σ(W x + U h + b),  g = tanh(W_g x + U_g h + b_g),  c⁺ = f c + i g,  h⁺ = o tanh c⁺
+
+Read-out: v = (wᵀ h + b) scale + mean after the last sample. Adjoint of a step, with ā of a gate's
+argument: h̄ = Σ_gates Uᵀ ā + z h̄⁺ (GRU), c̄ = f c̄⁺ (LSTM); σ' = σ (1 - σ), tanh' = 1 - tanh²; W̄
+= Σ ā xᵀ, Ū = Σ ā hᵀ, b̄ = Σ ā over all steps.
+
+Order of sums: bias, measurements, then states in order of their index; gradients over samples in
+order of time (`_sum`), and over lanes at the end of a batch. The readable definitions in torch are
+`torch.nn.GRU` and `torch.nn.LSTM` (`vehest.estimators.networks.recurrent`).
+
+
+Parameters of a member are those of `RecurrentNetwork` in their order: weights of inputs (G, H, C),
+of states (G, H, H), biases (G, H), and weight (H,) and offset of the read-out. Windows lie side by
+side in lanes.
 """
 
 from __future__ import annotations
@@ -15,56 +31,56 @@ from vehest.lanes import load, store, total, width
 
 GRU = 3
 LSTM = 4  # gates
-KEPT = 6  # rows of the hidden state's size that a step leaves: the gates and two more
+SAVED_ROWS = 6  # rows of the hidden state's size that a step saves: the gates and two more
 BLOCK = 4  # inputs whose weights' gradients are summed together
 
 
 @entry(nogil=True)
-def loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
+def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
     """See `vehest.estimators.kernels.recursion.Recursion`."""
-    gates, states, n_window, mean, scale = given
+    gates, states, n_window, mean, scale = constants
     lanes = width(series)
     channels = series.shape[1]
     measured = series.ravel()
     rows = np.empty(lanes, np.int64)
     scratch = np.empty(lanes, flat.dtype)
     inputs = channels + states  # rows of ``seen`` a sample: measurements, and the state before
-    seen = np.empty(n_window * inputs * lanes, flat.dtype)
+    windows = np.empty(n_window * inputs * lanes, flat.dtype)
     state = np.empty(2 * states * lanes, flat.dtype)
-    kept = np.empty(n_window * KEPT * states * lanes, flat.dtype)
+    saved = np.empty(n_window * SAVED_ROWS * states * lanes, flat.dtype)
     sums = np.empty(flat.shape[1] * lanes, flat.dtype)
     size = (gates, states, channels)
-    room = (seen, kept, state)
-    read = gates * states * (inputs + 1)  # where the read-out's weights begin
+    room = (windows, saved, state)
+    readout = gates * states * (inputs + 1)  # where the read-out's weights begin
     for m in range(flat.shape[0]):
-        own = flat[m]
+        parameters = flat[m]
         for number, start in enumerate(range(0, starts.shape[1], batch)):
             end = min(start + batch, starts.shape[1])
             out = values[m, start:end]
             sums[:] = 0
             for first in range(0, out.size, lanes):
-                gather(measured, channels, starts[m, start:end], first, rows, seen, inputs)
+                gather(measured, channels, starts[m, start:end], first, rows, windows, inputs)
                 state[:] = 0
                 for k in range(n_window):
-                    at = _arguments(own, size, room, k)
+                    at = _arguments(parameters, size, room, k)
                     if gates == GRU:
-                        _gru(states * lanes, kept, state, at)
+                        _gru(states * lanes, saved, state, at)
                     else:
-                        _lstm(states * lanes, kept, state, at)
-                value = load(state, 0) * 0 + own[read + states]
+                        _lstm(states * lanes, saved, state, at)
+                value = load(state, 0) * 0 + parameters[readout + states]
                 for i in range(states):
-                    value = value + own[read + i] * load(state, i * lanes)
+                    value = value + parameters[readout + i] * load(state, i * lanes)
                 store(scratch, 0, value * scale + mean)
                 for lane in range(min(lanes, out.size - first)):
                     out[first + lane] = scratch[lane]
                 if gradient.size:
                     slopes_of(out, targets[m, start:end], first, losses.size > 0, scratch)
                     slope = load(scratch, 0) * scale
-                    add(sums, (read + states) * lanes, slope)
+                    add(sums, (readout + states) * lanes, slope)
                     for i in range(states):
-                        add(sums, (read + i) * lanes, slope * load(state, i * lanes))
+                        add(sums, (readout + i) * lanes, slope * load(state, i * lanes))
                         store(
-                            state, i * lanes, slope * own[read + i]
+                            state, i * lanes, slope * parameters[readout + i]
                         )  # from here on the adjoint of the state
                         store(state, (states + i) * lanes, slope * 0)
                     for k in range(n_window - 1, -1, -1):
@@ -72,139 +88,150 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                             _gru_adjoint(size, room, k)
                         else:
                             _lstm_adjoint(size, room, k)
-                        _to_state(own, size, kept, k * KEPT * states * lanes, state)
+                        _to_state(parameters, size, saved, k * SAVED_ROWS * states * lanes, state)
                     _sum(size, room, sums)
             if gradient.size:
-                for j in range(own.size):
+                for j in range(parameters.size):
                     gradient[m, j] = total(load(sums, j * lanes))
             if losses.size:
                 losses[m] += squared_error(out, targets[m, start:end])
-                step_of_adam(own, gradient[m], adam, m, number + 1)
+                step_of_adam(parameters, gradient[m], adam, m, number + 1)
 
 
 @part(_nrt=False)
 def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
-    """Arguments of the gates at step k; a candidate's is without U_n h, which is one row later. Returns where they are kept."""
+    """Save the arguments of the gates at step k and return where; a GRU candidate's is without U_n
+    h, which is one row later.
+    """
     gates, states, channels = size
-    seen, kept, state = room
+    windows, saved, state = room
     lanes = width(flat)
     row = states * width(flat)
-    now = k * (channels + states) * lanes
-    at = k * KEPT * row
+    window_at = k * (channels + states) * lanes
+    at = k * SAVED_ROWS * row
     for i in range(states):
-        store(seen, now + (channels + i) * lanes, load(state, i * lanes))
+        store(windows, window_at + (channels + i) * lanes, load(state, i * lanes))
     biases = gates * states * (channels + states)
     weights = gates * states * channels
     for unit in range(gates * states):
-        recurrent = load(seen, now) * 0
+        recurrent = load(windows, window_at) * 0
         driven = recurrent + flat[biases + unit]
         for c in range(channels):
-            driven = driven + flat[unit * channels + c] * load(seen, now + c * lanes)
+            driven = driven + flat[unit * channels + c] * load(windows, window_at + c * lanes)
         for j in range(states):
             recurrent = recurrent + flat[weights + unit * states + j] * load(state, j * lanes)
         if gates == GRU and unit >= 2 * states:
-            store(kept, at + unit * lanes, driven)
-            store(kept, at + unit * lanes + row, recurrent)
+            store(saved, at + unit * lanes, driven)
+            store(saved, at + unit * lanes + row, recurrent)
         else:
-            store(kept, at + unit * lanes, driven + recurrent)
+            store(saved, at + unit * lanes, driven + recurrent)
     return at
 
 
 @part(_nrt=False)
-def _gru(row, kept, state, first):  # type: ignore[no-untyped-def]
-    """One step from its gates' arguments; leaves reset, update, candidate and U_n h."""
+def _gru(row, saved, state, first):  # type: ignore[no-untyped-def]
+    """One step of a GRU from its gates' arguments; saves reset, update, candidate and U_n h."""
     lanes = width(state)
     for at in range(first, first + 2 * row, lanes):
-        store(kept, at, sigmoid(load(kept, at)))
+        store(saved, at, sigmoid(load(saved, at)))
     for unit in range(0, row, lanes):
         at = first + unit
-        candidate = tanh(load(kept, at + 2 * row) + load(kept, at) * load(kept, at + 3 * row))
-        store(kept, at + 2 * row, candidate)
-        store(state, unit, candidate + load(kept, at + row) * (load(state, unit) - candidate))
+        candidate = tanh(load(saved, at + 2 * row) + load(saved, at) * load(saved, at + 3 * row))
+        store(saved, at + 2 * row, candidate)
+        store(state, unit, candidate + load(saved, at + row) * (load(state, unit) - candidate))
 
 
 @part(_nrt=False)
-def _lstm(row, kept, state, first):  # type: ignore[no-untyped-def]
-    """The same; leaves the four gates, tanh of the new cell, and the cell before."""
+def _lstm(row, saved, state, first):  # type: ignore[no-untyped-def]
+    """One step of an LSTM; saves the four gates, tanh of the new cell, and the cell before."""
     lanes = width(state)
     for at in range(first, first + 3 * row, lanes):
-        store(kept, at, sigmoid(load(kept, at)))
+        store(saved, at, sigmoid(load(saved, at)))
     for unit in range(0, row, lanes):
         at = first + unit
-        offer = tanh(load(kept, at + 3 * row))
+        candidate = tanh(load(saved, at + 3 * row))
         before = load(state, row + unit)
-        cell = load(kept, at + row) * before + load(kept, at) * offer
-        shown = tanh(cell)
-        store(kept, at + 3 * row, offer)
-        store(kept, at + 4 * row, shown)
-        store(kept, at + 5 * row, before)
+        cell = load(saved, at + row) * before + load(saved, at) * candidate
+        cell_output = tanh(cell)
+        store(saved, at + 3 * row, candidate)
+        store(saved, at + 4 * row, cell_output)
+        store(saved, at + 5 * row, before)
         store(state, row + unit, cell)
-        store(state, unit, load(kept, at + 2 * row) * shown)
+        store(state, unit, load(saved, at + 2 * row) * cell_output)
 
 
 @part(_nrt=False)
 def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
-    """Adjoint of one step: ``state`` is that of the state after it, then before it; what is kept becomes the arguments' adjoints."""
+    """Adjoint of `_gru`: ``state`` is the gradient of the state after the step, then before it;
+    ``saved`` becomes that of the arguments.
+    """
     _, states, channels = size
-    seen, kept, state = room
+    windows, saved, state = room
     lanes = width(state)
     row = states * width(state)
-    now = k * (channels + states) * lanes
-    first = k * KEPT * row
+    window_at = k * (channels + states) * lanes
+    first = k * SAVED_ROWS * row
     for i in range(states):
         at = first + i * lanes
         unit = i * lanes
-        reset = load(kept, at)
-        update = load(kept, at + row)
-        candidate = load(kept, at + 2 * row)
-        recurrent = load(kept, at + 3 * row)
+        reset = load(saved, at)
+        update = load(saved, at + row)
+        candidate = load(saved, at + 2 * row)
+        recurrent = load(saved, at + 3 * row)
         bar = load(state, unit)
         inner = bar * (1 - update) * (1 - candidate * candidate)
-        store(kept, at, inner * recurrent * reset * (1 - reset))
+        store(saved, at, inner * recurrent * reset * (1 - reset))
         store(
-            kept,
+            saved,
             at + row,
-            bar * (load(seen, now + (channels + i) * lanes) - candidate) * update * (1 - update),
+            bar
+            * (load(windows, window_at + (channels + i) * lanes) - candidate)
+            * update
+            * (1 - update),
         )
-        store(kept, at + 2 * row, inner)
-        store(kept, at + 3 * row, inner * reset)
+        store(saved, at + 2 * row, inner)
+        store(saved, at + 3 * row, inner * reset)
         store(state, unit, bar * update)
 
 
 @part(_nrt=False)
 def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
-    """The same; the second half of ``state`` is that of the cell."""
+    """Adjoint of `_lstm`, as `_gru_adjoint`; the second half of ``state`` is the gradient of the
+    cell.
+    """
     _, states, _ = size
-    _, kept, state = room
+    _, saved, state = room
     lanes = width(state)
     row = states * width(state)
-    first = k * KEPT * row
+    first = k * SAVED_ROWS * row
     for i in range(states):
         at = first + i * lanes
         unit = i * lanes
-        admit = load(kept, at)
-        keep = load(kept, at + row)
-        show = load(kept, at + 2 * row)
-        offer = load(kept, at + 3 * row)
-        shown = load(kept, at + 4 * row)
+        input_gate = load(saved, at)
+        forget_gate = load(saved, at + row)
+        output_gate = load(saved, at + 2 * row)
+        candidate = load(saved, at + 3 * row)
+        cell_output = load(saved, at + 4 * row)
         bar = load(state, unit)
-        cell = load(state, row + unit) + bar * show * (1 - shown * shown)
-        store(kept, at, cell * offer * admit * (1 - admit))
-        store(kept, at + row, cell * load(kept, at + 5 * row) * keep * (1 - keep))
-        store(kept, at + 2 * row, bar * shown * show * (1 - show))
-        store(kept, at + 3 * row, cell * admit * (1 - offer * offer))
-        store(state, row + unit, cell * keep)
+        cell = load(state, row + unit) + bar * output_gate * (1 - cell_output * cell_output)
+        store(saved, at, cell * candidate * input_gate * (1 - input_gate))
+        store(saved, at + row, cell * load(saved, at + 5 * row) * forget_gate * (1 - forget_gate))
+        store(saved, at + 2 * row, bar * cell_output * output_gate * (1 - output_gate))
+        store(saved, at + 3 * row, cell * input_gate * (1 - candidate * candidate))
+        store(state, row + unit, cell * forget_gate)
         store(state, unit, bar * 0)
 
 
 @part(_nrt=False)
 def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
-    """Which kept row is the adjoint of what the state adds to gate g's argument: a candidate's is its own times the reset."""
+    """Which saved row is the adjoint of what the state adds to gate g's argument: a candidate's is
+    its own times the reset.
+    """
     return 3 if gates == GRU and g == 2 else g
 
 
 @part(_nrt=False)
-def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
+def _to_state(flat, size, saved, first, state):  # type: ignore[no-untyped-def]
     """Add what goes through the gates' arguments to the adjoint of the state before."""
     gates, states, channels = size
     lanes = width(flat)
@@ -215,67 +242,78 @@ def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
             weights = gates * states * channels + g * states * states + j
             at = first + _row_of_state(gates, g) * row
             for i in range(states):
-                bar = bar + flat[weights + i * states] * load(kept, at + i * lanes)
+                bar = bar + flat[weights + i * states] * load(saved, at + i * lanes)
         store(state, j * lanes, bar)
 
 
 @part(_nrt=False)
 def _sum(size, room, sums):  # type: ignore[no-untyped-def]
-    """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in registers."""
+    """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps,
+    a few inputs at a time in registers.
+    """
     gates, states, channels = size
-    seen, kept, _ = room
+    windows, saved, _ = room
     lanes = width(sums)
     row = states * lanes
     inputs = (channels + states) * lanes
-    steps = seen.size // inputs
+    steps = windows.size // inputs
     for g in range(gates):
         for i in range(states):
             unit = g * states + i
             at = g * row + i * lanes
             offset = load(sums, (gates * states * (channels + states) + unit) * lanes)
             for k in range(steps):
-                offset = offset + load(kept, k * KEPT * row + at)
+                offset = offset + load(saved, k * SAVED_ROWS * row + at)
             store(sums, (gates * states * (channels + states) + unit) * lanes, offset)
             for first in range(
                 0, channels + 1, channels
             ):  # measurements, then states; a zero by itself would be compiled for anew
-                here = (g if first == 0 else _row_of_state(gates, g)) * row + i * lanes
+                adjoint_at = (g if first == 0 else _row_of_state(gates, g)) * row + i * lanes
                 weights, count = (
                     (unit * channels, channels)
                     if first == 0
                     else (gates * states * channels + unit * states, states)
                 )
                 _sum_block(
-                    seen, kept, sums, here, first, count, (steps, row, inputs), weights * lanes
+                    windows,
+                    saved,
+                    sums,
+                    adjoint_at,
+                    first,
+                    count,
+                    (steps, row, inputs),
+                    weights * lanes,
                 )
 
 
 @part(_nrt=False)
-def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
-    """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap the one before."""
+def _sum_block(windows, saved, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
+    """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap
+    the one before.
+    """
     steps, row, inputs = strides
     lanes = width(sums)
     for block in range(0, count, BLOCK):
         c = (first + block) * lanes
-        one = load(sums, 0) * 0
-        two = load(sums, 0) * 0
-        three = load(sums, 0) * 0
-        four = load(sums, 0) * 0
-        left = count - block
+        sum_0 = load(sums, 0) * 0
+        sum_1 = load(sums, 0) * 0
+        sum_2 = load(sums, 0) * 0
+        sum_3 = load(sums, 0) * 0
+        remaining = count - block
         for k in range(steps):
-            bar = load(kept, k * KEPT * row + at)
+            bar = load(saved, k * SAVED_ROWS * row + at)
             x = k * inputs + c
-            one = one + bar * load(seen, x)
-            if left > 1:
-                two = two + bar * load(seen, x + lanes)
-            if left > 2:
-                three = three + bar * load(seen, x + 2 * lanes)
-            if left > 3:
-                four = four + bar * load(seen, x + 3 * lanes)
-        add(sums, weights + block * lanes, one)
-        if left > 1:
-            add(sums, weights + (block + 1) * lanes, two)
-        if left > 2:
-            add(sums, weights + (block + 2) * lanes, three)
-        if left > 3:
-            add(sums, weights + (block + 3) * lanes, four)
+            sum_0 = sum_0 + bar * load(windows, x)
+            if remaining > 1:
+                sum_1 = sum_1 + bar * load(windows, x + lanes)
+            if remaining > 2:
+                sum_2 = sum_2 + bar * load(windows, x + 2 * lanes)
+            if remaining > 3:
+                sum_3 = sum_3 + bar * load(windows, x + 3 * lanes)
+        add(sums, weights + block * lanes, sum_0)
+        if remaining > 1:
+            add(sums, weights + (block + 1) * lanes, sum_1)
+        if remaining > 2:
+            add(sums, weights + (block + 2) * lanes, sum_2)
+        if remaining > 3:
+            add(sums, weights + (block + 3) * lanes, sum_3)

@@ -1,6 +1,11 @@
-"""Compiled recursions over windows, for members together: predictions, gradients, and epochs of training without a barrier between steps.
+"""Compiled recursions over windows, for members together: predictions, gradients, and batches of
+training.
 
-A network's module supplies one compiled loop over members and batches (`Recursion.loop`); windows lie side by side in `vehest.lanes`.
+    parameters (M, K), series (T, C), starts (M, B) --`Recursion.loop`--> predictions (M, B), gradient (M, K), steps of Adam
+
+A network's module supplies one compiled loop over members and batches; this one calls it on several
+threads, each for its own members, without a barrier between the steps of training. Windows lie side
+by side in `vehest.lanes`.
 """
 
 from __future__ import annotations
@@ -24,19 +29,26 @@ EPSILON = 1e-8  # of Adam
 class Recursion(NamedTuple):
     """A network's compiled recursion.
 
-    Attributes:
-        loop: ``loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam)``: for each member, a row of every
-            array but ``series``, predictions of its windows in batches. Where ``gradient`` (M, K) has rows, it becomes that of
-            Σ targets · values; if ``losses`` (M,) has, the squared error to the targets is added to it, and the parameters ``flat`` (M, K)
-            take a step of Adam after every batch.
-        given: what else it is called with, for arrays of a precision.
+    Attributes
+    ----------
+    loop : Callable[..., None]
+        ``loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam)``:
+        for each member, a row of every array but ``series``, predictions of its windows in batches.
+        Where ``gradient`` (M, K) has rows, it becomes that of Σ targets · values; if ``losses``
+        (M,) has, the squared error to the targets is added to it, and the parameters ``flat`` (M,
+        K) take a step of Adam after every batch.
+    constants : Callable[[Any], tuple[Any, ...]]
+        Function of the number type that returns the further arguments of the loop, such as sizes
+        and scales.
     """
 
     loop: Callable[..., None]
-    given: Callable[[Any], tuple[Any, ...]]
+    constants: Callable[[Any], tuple[Any, ...]]
 
     def values(self, flat: Floats, series: Floats, starts: NDArray[np.int64]) -> Floats:
-        """Predictions of parameters (M, K) after windows that begin at rows ``starts`` (M, B) of a series (T, C), (M, B)."""
+        """Predictions of parameters (M, K) after windows that begin at rows ``starts`` (M, B) of a
+        series (T, C), (M, B).
+        """
         none = np.empty((0, 0), flat.dtype)
         return self._over(flat, series, starts, none, starts.shape[1], none, np.empty(0))
 
@@ -57,17 +69,26 @@ class Recursion(NamedTuple):
         batch: int,
         adam: tuple[Any, ...],
     ) -> Floats:
-        """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,), float64.
+        """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,),
+        float64.
 
-        Args:
-            flat: parameters, (M, K).
-            series: measurements as the network takes them, (T, C).
-            starts: first row of each window in the order of the batches, (M, B).
-            targets: values to learn of each, (M, B).
-            batch: windows in a batch.
-            adam: averages of the gradient, of its square and of the parameters, (M, K) each, the last one used with averaging alone; least
-                and largest admissible values, (2, K); number of steps before these; step size; averaging, see
-                `vehest.training.supervised_settings.SupervisedSettings`.
+        Parameters
+        ----------
+        flat : Floats
+            Parameters, (M, K).
+        series : Floats
+            Measurements as the network takes them, (T, C).
+        starts : NDArray[np.int64]
+            First row of each window in the order of the batches, (M, B).
+        targets : Floats
+            Values to learn of each, (M, B).
+        batch : int
+            Windows in a batch.
+        adam : tuple[Any, ...]
+            Averages of the gradient, of its square and of the parameters, (M, K) each, the last one
+            used with averaging alone; least and largest admissible values, (2, K); number of steps
+            before these; step size; averaging, see
+            `vehest.training.supervised_settings.SupervisedSettings`.
         """
         losses = np.zeros(len(flat))
         self._over(
@@ -95,12 +116,12 @@ class Recursion(NamedTuple):
     ) -> Floats:
         """Values, (M, B), by all threads."""
         values = np.empty(starts.shape, flat.dtype)
-        given = self.given(flat.dtype.type)
+        constants = self.constants(flat.dtype.type)
         if adam is None:
             adam = (flat, flat, flat, flat, *[0.0] * 6)
 
         def work(m: int, end: int) -> None:
-            own = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
+            adam_rows = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
             parts = (
                 starts[m:end],
                 targets[m:end],
@@ -108,32 +129,35 @@ class Recursion(NamedTuple):
                 values[m:end],
                 gradient[m:end],
                 losses[m:end],
-                own,
+                adam_rows,
             )
-            self.loop(flat[m:end], given, series, *parts)
+            self.loop(flat[m:end], constants, series, *parts)
 
         over_members(work, len(flat))
         return values
 
 
 @part(_nrt=False)
-def gather(series, channels, starts, first, rows, seen, stride):  # type: ignore[no-untyped-def]
-    """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of lanes a sample, as many as fit.
+def gather(series, channels, starts, first, rows, windows, stride):  # type: ignore[no-untyped-def]
+    """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of
+    lanes a sample, as many as fit.
 
     Lanes without a window repeat the last one.
     """
     for lane in range(rows.size):
         rows[lane] = starts[min(first + lane, starts.size - 1)] * channels
-    for k in range(seen.size // (stride * rows.size)):
+    for k in range(windows.size // (stride * rows.size)):
         for c in range(channels):
             at = (k * stride + c) * rows.size
             for lane in range(rows.size):
-                seen[at + lane] = series[rows[lane] + k * channels + c]
+                windows[at + lane] = series[rows[lane] + k * channels + c]
 
 
 @part(_nrt=False)
 def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-untyped-def]
-    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0 in lanes without a window."""
+    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0
+    in lanes without a window.
+    """
     count = values.size
     for lane in range(scratch.size):
         at = first + lane
@@ -159,9 +183,11 @@ def squared_error(values, targets):  # type: ignore[no-untyped-def]
 
 @part(_nrt=False)
 def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-def]
-    """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the bounds (Kingma & Ba 2015, Algorithm 1).
+    """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the
+    bounds (Kingma & Ba 2015, Algorithm 1).
 
-    The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t (Section 7.2).
+    The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t
+    (Section 7.2).
     """
     first, second, average, bounds, before, rate, decay, decay_of_squares, epsilon, averaging = adam
     number = flat.dtype.type
@@ -174,8 +200,8 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
         second[m, j] = second[m, j] * number(decay_of_squares) + g * g * number(
             1 - decay_of_squares
         )
-        moved = flat[j] - size * first[m, j] / (np.sqrt(second[m, j]) / root + number(epsilon))
-        flat[j] = min(max(moved, bounds[0, j]), bounds[1, j])
+        stepped = flat[j] - size * first[m, j] / (np.sqrt(second[m, j]) / root + number(epsilon))
+        flat[j] = min(max(stepped, bounds[0, j]), bounds[1, j])
         if averaging:
             average[m, j] += (flat[j] - average[m, j]) * number(
                 (1 - averaging) / (1 - averaging**t)
@@ -184,5 +210,5 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
 
 @part(_nrt=False)
 def add(sums, at, value):  # type: ignore[no-untyped-def]
-    """Add to what stands in lanes from a place on."""
+    """Add a vector to the lanes of ``sums`` from a place on."""
     store(sums, at, load(sums, at) + value)

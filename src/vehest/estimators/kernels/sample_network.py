@@ -1,7 +1,18 @@
-"""Networks of two hidden layers over single samples, compiled, member by member, with masks of dropout that follow from seeds.
+"""Networks of two hidden layers over single samples, compiled, with masks of dropout that follow
+from seeds.
 
-A member's layers fit the processor's cache where those of all members together do not. A mask is not kept: what it hides is zero in the
-hidden layer, which is all that the adjoint asks for.
+    h₁ = d₁ relu(W₁ x + b₁),  h₂ = d₂ relu(W₂ h₁ + b₂),  o = W₃ h₂ + b₃,  d: 0 or 256/(256 - dropped) (dropout)
+
+Adjoint: W̄₃ = h₂ᵀ ō, b̄₃ = Σ ō, h̄₂ = ō W₃ᵀ; through a layer ā = h̄ d where h > 0, else 0; W̄, b̄
+and the layer below likewise. Order of sums: matrix products as BLAS has them; biases' gradients
+over samples in order.
+
+    inputs, parameters --outputs_of--> outputs      table, rows, parameters --losses_of--> loss and gradient of each member
+
+Members are computed one by one.
+
+A member's layers fit the processor's cache where those of all members together do not. A mask is
+not stored: what it hides is zero in the hidden layer, which is all that the adjoint asks for.
 """
 
 from __future__ import annotations
@@ -19,29 +30,38 @@ from vehest.estimators.kernels.threads import over_members
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 
-LEVELS = 256  # the share that dropout hides is a whole number of so many parts
+LEVELS = 256  # dropout drops a whole number of so many parts of hidden values
 LAYERS = 3  # two hidden ones and the output
 
 Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
-"""Of outputs (B, O) and targets (B,): the mean loss; its gradient by the outputs, (B, O), is written into the last argument."""
+"""Of outputs (B, O) and targets (B,): the mean loss; its gradient by the outputs, (B, O), is
+written into the last argument.
+"""
 
 
 def outputs_of(
     inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | None = None, dropout: float = 0.0
 ) -> Tensor:
-    """Outputs of M members, (M, B, O), differentiable in the parameters; h = d(relu(W x + b)) twice, then W h + b.
+    """Outputs of M members, (M, B, O), differentiable in the parameters; h = d(relu(W x + b))
+    twice, then W h + b.
 
-    Args:
-        inputs: (M, B, C), or (1, B, C) for all members.
-        parameters: weights and biases by turns from the inputs on, (M, C, H), (M, H), and so on.
-        seeds: one a member, int64 (M,), from which its mask follows; none: no dropout.
-        dropout: share of hidden values that are hidden, rounded to a 256th; the others are scaled so that their mean stays.
+    Parameters
+    ----------
+    inputs : Tensor
+        (M, B, C), or (1, B, C) for all members.
+    parameters : Sequence[Tensor]
+        Weights and biases by turns from the inputs on, (M, C, H), (M, H), and so on.
+    seeds : Tensor | None, default None
+        One a member, int64 (M,), from which its mask follows; none: no dropout.
+    dropout : float, default 0.0
+        Share of hidden values that are dropped, rounded to a 256th; the others are scaled so that
+        their mean stays.
 
     Source: Srivastava et al., Dropout, Journal of Machine Learning Research 15, 2014.
     """
-    hidden = round(LEVELS * dropout) if seeds is not None else 0
+    dropped_parts = round(LEVELS * dropout) if seeds is not None else 0
     drawn = np.zeros(len(parameters[0]), np.int64) if seeds is None else seeds.numpy()
-    outputs: Tensor = _Outputs.apply(inputs, drawn, hidden, *parameters)  # type: ignore[no-untyped-call]
+    outputs: Tensor = _Outputs.apply(inputs, drawn, dropped_parts, *parameters)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -56,14 +76,21 @@ def losses_of(
 ) -> Tensor:
     """Losses of M members, each on rows of its own, (M,), differentiable in the parameters.
 
-    A member's outputs, loss and gradient are computed in one go, so that nothing of one member is in the next one's way.
+    A member's outputs, loss and gradient are computed in one go, so that nothing of one member is
+    in the next one's way.
 
-    Args:
-        table: inputs, (N, C).
-        targets: (N,).
-        rows: which of them each member sees, int64 (M, B).
-        parameters: see `outputs_of`; likewise ``seeds`` and ``dropout``.
-        criterion: see `Criterion`; compiled, or it keeps members from running side by side.
+    Parameters
+    ----------
+    table : Tensor
+        Inputs, (N, C).
+    targets : Tensor
+        (N,).
+    rows : Tensor
+        Which of them each member sees, int64 (M, B).
+    parameters : Sequence[Tensor]
+        See `outputs_of`; likewise ``seeds`` and ``dropout``.
+    criterion : Criterion
+        See `Criterion`; compiled, or it keeps members from running side by side.
     """
     losses: Tensor = _Losses.apply(
         table, targets, rows, seeds, round(LEVELS * dropout), criterion, *parameters
@@ -74,7 +101,7 @@ def losses_of(
 class _Outputs(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor
+        ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], dropped_parts: int, *parameters: Tensor
     ) -> Tensor:
         x = inputs.contiguous().numpy()
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
@@ -87,37 +114,37 @@ class _Outputs(torch.autograd.Function):
 
         def work(first: int, end: int) -> None:
             for m in range(first, end):
-                own = [weight[m] for weight in weights]
+                member_weights = [weight[m] for weight in weights]
                 _forward(
                     x[m if len(x) > 1 else 0],
-                    *own,
+                    *member_weights,
                     seeds[m],
-                    hidden,
+                    dropped_parts,
                     *[layer[m] for layer in layers],
                 )
 
         over_members(work, members)
-        ctx.kept = (x, weights, layers[:-1], hidden)
+        ctx.forward_values = (x, weights, layers[:-1], dropped_parts)
         return torch.from_numpy(layers[-1])
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        x, weights, layers, hidden = ctx.kept
+        x, weights, layers, dropped_parts = ctx.forward_values
         up = upstream[0].contiguous().numpy()
         gradients = [np.empty_like(weight) for weight in weights]
 
         def work(first: int, end: int) -> None:
             for m in range(first, end):
-                own = [gradient[m] for gradient in gradients]
+                member_gradients = [gradient[m] for gradient in gradients]
                 _backward(
                     x[m if len(x) > 1 else 0],
                     weights[2][m],
                     weights[4][m],
-                    hidden,
+                    dropped_parts,
                     layers[0][m],
                     layers[1][m],
                     up[m],
-                    *own,
+                    *member_gradients,
                 )
 
         over_members(work, len(gradients[0]))
@@ -132,7 +159,7 @@ class _Losses(torch.autograd.Function):
         targets: Tensor,
         rows: Tensor,
         seeds: Tensor,
-        hidden: int,
+        dropped_parts: int,
         criterion: Criterion,
         *parameters: Tensor,
     ) -> Tensor:
@@ -148,22 +175,31 @@ class _Losses(torch.autograd.Function):
             ]
             up = np.empty_like(layers[-1])
             for m in range(first, end):
-                seen = x[chosen[m]]
-                own = [weight[m] for weight in weights]
+                member_inputs = x[chosen[m]]
+                member_weights = [weight[m] for weight in weights]
                 bars = [gradient[m] for gradient in gradients]
-                _forward(seen, *own, drawn[m], hidden, *layers)
+                _forward(member_inputs, *member_weights, drawn[m], dropped_parts, *layers)
                 losses[m] = criterion(layers[-1], y[chosen[m]], up)
-                _backward(seen, own[2], own[4], hidden, layers[0], layers[1], up, *bars)
+                _backward(
+                    member_inputs,
+                    member_weights[2],
+                    member_weights[4],
+                    dropped_parts,
+                    layers[0],
+                    layers[1],
+                    up,
+                    *bars,
+                )
 
         over_members(work, len(chosen))
-        ctx.kept = gradients
+        ctx.forward_values = gradients
         return torch.from_numpy(losses)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         scaled = (
             torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1)))
-            for gradient in ctx.kept
+            for gradient in ctx.forward_values
         )
         return (None, None, None, None, None, None, *scaled)
 
@@ -184,7 +220,8 @@ def squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
 def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-def]
     """Mean of (log v + (o - t)²/v)/2 with v = softplus(o₂) + 1e-6; a `Criterion` of two outputs.
 
-    Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017, Eq. 1.
+    Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty
+    estimation using deep ensembles, 2017, Eq. 1.
     """
     total = 0.0
     count = len(targets)
@@ -200,11 +237,11 @@ def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-
 
 
 @compiled
-def _forward(x, w1, b1, w2, b2, w3, b3, seed, hidden, first, second, out):  # type: ignore[no-untyped-def]
+def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out):  # type: ignore[no-untyped-def]
     np.dot(x, w1, first)
-    _activate(first, b1, seed, 0, hidden)
+    _activate(first, b1, seed, 0, dropped_parts)
     np.dot(first, w2, second)
-    _activate(second, b2, seed, 1, hidden)
+    _activate(second, b2, seed, 1, dropped_parts)
     np.dot(second, w3, out)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
@@ -212,26 +249,30 @@ def _forward(x, w1, b1, w2, b2, w3, b3, seed, hidden, first, second, out):  # ty
 
 
 @compiled
-def _backward(x, w2, w3, hidden, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar):  # type: ignore[no-untyped-def]
+def _backward(  # type: ignore[no-untyped-def]
+    x, w2, w3, dropped_parts, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar
+):
     np.dot(second.T, up, w3_bar)
     _summed(up, b3_bar)
     second_bar = np.empty_like(second)
     first_bar = np.empty_like(first)
     np.dot(up, w3.T, second_bar)
-    _gate(second, second_bar, hidden, b2_bar)
+    _gate(second, second_bar, dropped_parts, b2_bar)
     np.dot(first.T, second_bar, w2_bar)
     np.dot(second_bar, w2.T, first_bar)
-    _gate(first, first_bar, hidden, b1_bar)
+    _gate(first, first_bar, dropped_parts, b1_bar)
     np.dot(x.T, first_bar, w1_bar)
 
 
 @compiled
-def _activate(values, bias, seed, layer, hidden):  # type: ignore[no-untyped-def]
-    """relu(values + bias), masked and scaled, in place; eight bytes of every random word decide of eight values (SplitMix64)."""
+def _activate(values, bias, seed, layer, dropped_parts):  # type: ignore[no-untyped-def]
+    """relu(values + bias), masked and scaled, in place; eight bytes of every random word decide of
+    eight values (SplitMix64).
+    """
     rows, columns = values.shape
-    scale = values.dtype.type(256.0 / (256 - hidden))
+    scale = values.dtype.type(256.0 / (256 - dropped_parts))
     zero = values.dtype.type(0.0)
-    if hidden == 0:
+    if dropped_parts == 0:
         for row in range(rows):
             for column in range(columns):
                 values[row, column] = max(values[row, column] + bias[column], zero)
@@ -251,13 +292,13 @@ def _activate(values, bias, seed, layer, hidden):  # type: ignore[no-untyped-def
                 mask[8 * word + byte] = np.uint8(z >> np.uint64(8 * byte))
         for column in range(columns):
             value = max(values[row, column] + bias[column], zero) * scale
-            values[row, column] = value if mask[column] >= hidden else zero
+            values[row, column] = value if mask[column] >= dropped_parts else zero
 
 
 @compiled
-def _gate(values, bars, hidden, bias_bar):  # type: ignore[no-untyped-def]
+def _gate(values, bars, dropped_parts, bias_bar):  # type: ignore[no-untyped-def]
     """Adjoint of `_activate`, in place; that of the bias is written."""
-    scale = values.dtype.type(256.0 / (256 - hidden))
+    scale = values.dtype.type(256.0 / (256 - dropped_parts))
     zero = values.dtype.type(0.0)
     bias_bar[:] = zero
     for row in range(values.shape[0]):
@@ -269,6 +310,7 @@ def _gate(values, bars, hidden, bias_bar):  # type: ignore[no-untyped-def]
 
 @compiled
 def _summed(bars, total):  # type: ignore[no-untyped-def]
+    """Write the sum over samples, (B, O) -> (O,)."""
     total[:] = total.dtype.type(0.0)
     for row in range(bars.shape[0]):
         for column in range(bars.shape[1]):

@@ -1,4 +1,6 @@
-"""Members on several threads: compiled loops that let go of Python's lock, each thread on its own members."""
+"""Members on several threads: compiled loops that release Python's lock, each thread on its own
+members.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 
-PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
+PIECES = 4  # for each thread, so that a delayed thread leaves its share to the others
 _allowed = ContextVar("_allowed", default=0)
 
 
 @contextmanager
 def threads_for_members() -> Iterator[None]:
-    """Within, `over_members` has the threads that torch was allowed, and torch one: its small operations would wait for threads held up."""
+    """Within, `over_members` has the threads that torch was allowed, and torch one: its small
+    operations would wait for threads held up.
+    """
     import torch
 
     token = _allowed.set(torch.get_num_threads())
@@ -28,9 +32,11 @@ def threads_for_members() -> Iterator[None]:
 
 
 def over_members(work: Callable[[int, int], None], members: int, pieces: int = PIECES) -> None:
-    """Call ``work(first, end)`` on stretches of the members (or whatever else can be worked on one by one), ``pieces`` for each thread.
+    """Call ``work(first, end)`` on stretches of the members (or whatever else can be worked on one
+    by one), ``pieces`` for each thread.
 
-    They run side by side on as many threads as torch is allowed; what is computed does not depend on the number.
+    They run side by side on as many threads as torch is allowed; what is computed does not depend
+    on the number.
     """
     threads = 1
     if members > 1:
@@ -41,19 +47,19 @@ def over_members(work: Callable[[int, int], None], members: int, pieces: int = P
         work(0, members)
         return
     pieces = min(pieces * threads, members)
-    left = iter(
+    ranges = iter(
         [(members * piece // pieces, members * (piece + 1) // pieces) for piece in range(pieces)]
     )
 
     def take() -> None:
-        for first, end in left:  # whoever is free takes the next
+        for first, end in ranges:  # whoever is free takes the next
             work(first, end)
 
-    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
+    tasks = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
     take()
-    for other in others:
-        if not other.cancel():
-            other.result()
+    for task in tasks:
+        if not task.cancel():
+            task.result()
 
 
 @cache

@@ -1,4 +1,6 @@
-"""Compiled recursions (`vehest.estimators.kernels.recursion`) as torch uses them: differentiable, and trained several steps at a time."""
+"""Compiled recursions (`vehest.estimators.kernels.recursion`) as torch uses them: differentiable,
+and trained several steps at a time.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +37,12 @@ class CompiledNetwork(ABC):
         starts: Tensor,
         targets: Tensor,
         batch: int,
-        *rest: Any,
+        *adam_options: Any,
     ) -> Tensor:
-        """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq`` as torch names them, and ``average``."""
-        rate, bounds, averaging = rest
+        """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq``
+        as torch names them, and ``average``.
+        """
+        rate, bounds, averaging = adam_options
         names = ("exp_avg", "exp_avg_sq", "average" if "average" in moments else "exp_avg")
         adam = (
             *(moments[name].numpy() for name in names),
@@ -47,10 +51,10 @@ class CompiledNetwork(ABC):
             float(rate),
             float(averaging),
         )
-        series, rows, wanted = (
+        series, rows, learnt_targets = (
             tensor.contiguous().numpy() for tensor in (prepared, starts, targets)
         )
-        losses = self.recursion().descend(flat.numpy(), series, rows, wanted, batch, adam)
+        losses = self.recursion().descend(flat.numpy(), series, rows, learnt_targets, batch, adam)
         moments["step"] += -(-starts.shape[1] // batch)
         return torch.from_numpy(losses)
 

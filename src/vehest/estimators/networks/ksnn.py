@@ -1,4 +1,6 @@
-"""The network of the KS-NN in PyTorch, with its compiled recursion (`vehest.estimators.kernels.ksnn`) differentiable."""
+"""The network of the KS-NN in PyTorch, with its compiled recursion
+(`vehest.estimators.kernels.ksnn`) differentiable.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,12 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
     û⁺ = γ₂û + β₂τ(a_x + vω) - f₂(û - u_m)             (Eq. 7b)
     f(e) = w₁e + b₁ + Σⱼ w₃ⱼ tanh(w₂ⱼe + b₂ⱼ) + b₃      (Eq. 8, and the second layer's own bias)
 
-    Args:
-        settings: structure.
-        yaw_rate_max: centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
+    Parameters
+    ----------
+    settings : Any
+        Structure.
+    yaw_rate_max : float, default 1.0
+        Centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
 
     Shapes:
         measurements: (..., N, 4), channels yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
@@ -78,7 +83,9 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         parameters["gamma"][..., 0].clamp_(min=1e-3, max=1.0)
 
     def activations(self, yaw_rate: Tensor) -> Tensor:
-        """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the last one alone."""
+        """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the
+        last one alone.
+        """
         position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(
             max=self.settings.n_local - 1
         )

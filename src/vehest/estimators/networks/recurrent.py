@@ -47,7 +47,8 @@ class HiddenStateEstimator(Network):
 class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     """One recurrent layer, one bias a gate, and a linear read-out of the last hidden state.
 
-    From standardised windows, (..., N, C), to the lateral velocity [m/s] one step after each, (...).
+    From standardised windows, (..., N, C), to the lateral velocity [m/s] one step after each,
+    (...).
     """
 
     n_gates: ClassVar[int]  # of the cell
@@ -89,11 +90,12 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     def recursion(self) -> Recursion:
         """The compiled recursion."""
         gates = self.n_gates
-        own = self.settings
+        settings = self.settings
         mean = float(self.output_mean)
         scale = float(self.output_scale)
         return Recursion(
-            loop, lambda number: (gates, own.n_states, own.window, number(mean), number(scale))
+            loop,
+            lambda number: (gates, settings.n_states, settings.window, number(mean), number(scale)),
         )
 
 

@@ -1,4 +1,6 @@
-"""What networks share that map the measurements of one instant to a sideslip angle: inputs, the network, its samples, its weights."""
+"""What networks share that map the measurements of one instant to a sideslip angle: inputs, the
+network, its samples, its weights.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ INPUTS: dict[str, tuple[str, ...]] = {
     "full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)),
     "imu": IMU,
 }
-"""Sets of inputs: with tyre forces (Bertipaglia et al. 2024, Section III-A, 17 of them), and without."""
+"""Sets of inputs: with tyre forces (Bertipaglia et al. 2024, Section III-A, 17 of them), and
+without.
+"""
 
 Normalisation = Literal["range", "standard"]
 NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
@@ -62,7 +66,9 @@ class SampleNetworkEstimator(Network):
     def prepare_network(
         self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
     ) -> tuple[SampleNetwork, Samples, Samples]:
-        """A new network with initial weights, a seed a member, and samples of training and validation as it takes them."""
+        """A new network with initial weights, a seed a member, and samples of training and
+        validation as it takes them.
+        """
         raw, judged = (
             learnt_samples(part, self.network_inputs, self.name, minimum_speed)
             for part in (data.train, data.validation)
@@ -82,7 +88,9 @@ class SampleNetworkEstimator(Network):
         seeds: Sequence[int],
         minimum_speed: float = -np.inf,
     ) -> FitRecord:
-        """Train members, each of a seed, on samples in random order; squared errors are in rad², other losses in the network's units."""
+        """Train members, each of a seed, on samples in random order; squared errors are in rad²,
+        other losses in the network's units.
+        """
         network, train, validation = self.prepare_network(data, training, seeds, minimum_speed)
         unit = network.unit**2 if criterion is squared_error else 1.0
         phase = sample_phase(
@@ -101,11 +109,13 @@ class SampleNetworkEstimator(Network):
 
 
 class SampleNetwork(nn.Module):
-    """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1 convolutions over time.
+    """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1
+    convolutions over time.
 
-    Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0 and a deviation of 1; a constant one
-    becomes 0. Targets are divided by their root mean square in training. Both are kept with the weights and are not parameters. A network
-    says O numbers of a sample.
+    Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0
+    and a deviation of 1; a constant one becomes 0. Targets are divided by their root mean square in
+    training. Both are kept with the weights and are not parameters. A network says O numbers of a
+    sample.
 
     Source: Bertipaglia et al. 2024, Section III-A.
     """
@@ -143,9 +153,11 @@ class SampleNetwork(nn.Module):
     def scale(
         self, inputs: FloatArray, sideslip: FloatArray, normalisation: Normalisation = "range"
     ) -> None:
-        """Take scales of inputs, (N, C), and the unit of targets, (N,) [rad], from training samples.
+        """Take scales of inputs, (N, C), and the unit of targets, (N,) [rad], from training
+        samples.
 
-        ``range`` maps inputs to [0, 1] by their extremes, ``standard`` to a mean of 0 and a standard deviation of 1.
+        ``range`` maps inputs to [0, 1] by their extremes, ``standard`` to a mean of 0 and a
+        standard deviation of 1.
         """
         low = inputs.min(axis=0)
         span = np.ptp(inputs, axis=0)
@@ -157,18 +169,22 @@ class SampleNetwork(nn.Module):
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
 
     def scaled(self, inputs: Tensor) -> Tensor:
-        """Inputs as the network takes them, (..., C), of measured ones in SI units; those of training lie in 0 … 1."""
+        """Inputs as the network takes them, (..., C), of measured ones in SI units; those of
+        training lie in 0 … 1.
+        """
         return (inputs - self.input_low) / self.input_span
 
     def samples(self, inputs: FloatArray, sideslip: FloatArray) -> Samples:
         """Measured inputs (N, C) and sideslip angles (N,) [rad] as the network takes them."""
-        seen, wanted = (
+        measured_inputs, angles = (
             torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip)
         )
-        return Samples(self.scaled(seen).contiguous(), wanted / self.unit)
+        return Samples(self.scaled(measured_inputs).contiguous(), angles / self.unit)
 
     def forward(self, inputs: Tensor, seeds: Tensor | None = None, dropout: float = 0.0) -> Tensor:
-        """Outputs (M, B, O) of scaled inputs, (M, B, C) or (1, B, C) for all members; see `outputs_of`."""
+        """Outputs (M, B, O) of scaled inputs, (M, B, C) or (1, B, C) for all members; see
+        `outputs_of`.
+        """
         return outputs_of(inputs, list(self.parameters()), seeds, dropout)
 
     def losses(self, samples: Samples, draw: Draw, dropout: float, criterion: Criterion) -> Tensor:
@@ -201,7 +217,9 @@ class SampleNetwork(nn.Module):
                 inputs, targets = (part[first : first + CHUNK] for part in samples)
                 outputs = self(inputs.unsqueeze(0)).numpy()
                 unused = np.empty_like(outputs[0])
-                total += [len(targets) * criterion(own, targets.numpy(), unused) for own in outputs]
+                total += [
+                    len(targets) * criterion(output, targets.numpy(), unused) for output in outputs
+                ]
         return torch.from_numpy(total / len(samples.targets))
 
 
@@ -211,11 +229,15 @@ def learnt_samples(
     estimator: str,
     minimum_speed: float = -np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,) [rad], recordings one after another.
+    """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,)
+    [rad], recordings one after another.
 
     Samples slower than ``minimum_speed`` [m/s] are left out.
 
-    Raises `DataError`: a channel is missing or has gaps, or all samples are too slow.
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, or all samples are too slow.
     """
     hint = "; set estimator.inputs=imu for cars without measured tyre forces"
     hints = {name: hint for name in channels if name.startswith("f")}

@@ -14,9 +14,10 @@ from vehest.data.recording import Recording
 class StandardisedNetwork(nn.Module):
     """Base of networks that see standardised measurements and predict standardised velocities.
 
-    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters. `prepared`
-    standardises what ``forward`` sees; what it predicts goes back to SI units by ``output * self.output_scale + self.output_mean``. The
-    shape of what is predicted of one instant is ``outputs``.
+    Means and standard deviations are those of the training recordings; they are kept with the
+    weights and are not parameters. `prepared` standardises what ``forward`` sees; what it predicts
+    goes back to SI units by ``output * self.output_scale + self.output_mean``. The shape of what is
+    predicted of one instant is ``outputs``.
     """
 
     input_mean: Tensor

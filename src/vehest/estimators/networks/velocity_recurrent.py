@@ -1,4 +1,6 @@
-"""What recurrent networks share that estimate a car's velocities from all samples so far: training, estimating, running online."""
+"""What recurrent networks share that estimate a car's velocities from all samples so far: training,
+estimating, running online.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ State = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class SequenceSettings(Group):
-    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024, Section IV)."""
+    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024,
+    Section IV).
+    """
 
     group = "training"
     version: ClassVar[str] = "1"
@@ -107,15 +111,19 @@ class SequenceSettings(Group):
 class VelocityNetwork(StandardisedNetwork):
     """Base of recurrent networks from standardised measurements to standardised velocities.
 
-    Args:
-        settings: channels and sizes.
+    Parameters
+    ----------
+    settings : Any
+        Channels and sizes.
     """
 
     def __init__(self, settings: Any) -> None:
         super().__init__(len(settings.inputs), (len(settings.outputs),))
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden state for gates; biases alike."""
+        """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden
+        state for gates; biases alike.
+        """
         with torch.no_grad():
             for module in self.modules():
                 n = (
@@ -132,10 +140,11 @@ class VelocityNetwork(StandardisedNetwork):
     def forward(
         self, measured: Tensor, state: State, mask: Tensor | None = None
     ) -> tuple[Tensor, State]:
-        """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the last, of measurements (B, T, C) [SI].
+        """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the
+        last, of measurements (B, T, C) [SI].
 
-        The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B, T, H), is what the hidden state is
-        multiplied by on its way out, none outside training.
+        The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B,
+        T, H), is what the hidden state is multiplied by on its way out, none outside training.
         """
         outputs, state = self.advance(self.prepared(measured), state, mask)
         return outputs * self.output_scale + self.output_mean, state
@@ -144,8 +153,10 @@ class VelocityNetwork(StandardisedNetwork):
     def start(self, velocities: Tensor) -> State:
         """The state before the first sample.
 
-        Args:
-            velocities: (B, O) at that time [m/s, rad/s], given or measured.
+        Parameters
+        ----------
+        velocities : Tensor
+            (B, O) at that time [m/s, rad/s], given or measured.
         """
 
     @abstractmethod
@@ -156,9 +167,10 @@ class VelocityNetwork(StandardisedNetwork):
 class RecurrentVelocityEstimator(HiddenStateEstimator):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
-    The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
-    if it is among ``inputs``. The loss is that of Węgrzynowski et al. 2024: squared errors, each output with its weight, over sequences
-    without their first samples.
+    The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity
+    to start from; the network sees it only if it is among ``inputs``. The loss is that of
+    Węgrzynowski et al. 2024: squared errors, each output with its weight, over sequences without
+    their first samples.
     """
 
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
@@ -187,7 +199,13 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:
-        """Raises `ConfigurationError`: inputs or outputs that repeat or are unknown, or a reference among the inputs."""
+        """Check inputs and outputs.
+
+        Raises
+        ------
+        ConfigurationError
+            Inputs or outputs that repeat or are unknown, or a reference among the inputs.
+        """
         for name in ("inputs", "outputs"):
             if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
                 raise ConfigurationError(
@@ -232,7 +250,9 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         )
 
     def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
-        """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read, and 0 for the lateral velocity."""
+        """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read,
+        and 0 for the lateral velocity.
+        """
         n = len(channels["vx"])
         columns = [
             channels[name] if name in self.channels and name != "vy" else np.zeros(n)
@@ -240,7 +260,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         ]
         return np.stack(columns, axis=1)
 
-    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> State:
+    def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> State:
         """State of the network that starts from given velocities, else measured ones."""
         measured = self._measured_velocities(
             {
@@ -248,7 +268,10 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
                 for name, value in zip(self.channels, sample.tolist(), strict=True)
             }
         )
-        values = [given.get(name, own) for name, own in zip(self.outputs, measured[0], strict=True)]
+        values = [
+            initial_state.get(name, measured_value)
+            for name, measured_value in zip(self.outputs, measured[0], strict=True)
+        ]
         with torch.no_grad():
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
@@ -306,7 +329,9 @@ class _Batch(NamedTuple):
 
 
 class _Drives:
-    """Recordings one after another as tensors, (N, …), from which sequences are cut by their first samples."""
+    """Recordings one after another as tensors, (N, …), from which sequences are cut by their first
+    samples.
+    """
 
     def __init__(
         self,
@@ -338,18 +363,22 @@ class _Drives:
         return _Batch(self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted)
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
-        """All drives, cut whole at random places into pieces of ``steps`` samples and less: first row and length of each, (N, 2)."""
-        found = []
+        """All drives, cut whole at random places into pieces of ``steps`` samples and less: first
+        row and length of each, (N, 2).
+        """
+        spans = []
         offset = 0
         for length in self.lengths:
             shift = int(torch.randint(steps, (), generator=generator))
             edges = sorted({0, *range(shift, length, steps), length})
-            found += [(offset + first, end - first) for first, end in itertools.pairwise(edges)]
+            spans += [(offset + first, end - first) for first, end in itertools.pairwise(edges)]
             offset += length
-        return torch.tensor(found)
+        return torch.tensor(spans)
 
     def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
-        """Pieces of different lengths side by side, as long as the longest; what is beyond a piece's end does not count."""
+        """Pieces of different lengths side by side, as long as the longest; what is beyond a
+        piece's end does not count.
+        """
         firsts, lengths = pieces.unbind(1)
         places = torch.arange(int(lengths.max()))
         ends = lengths.unsqueeze(1)
@@ -357,7 +386,9 @@ class _Drives:
         return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
 
     def for_validation(self, training: SequenceSettings) -> list[_Batch]:
-        """Sequences without overlap from the start of each recording; of one that is too short, all of it."""
+        """Sequences without overlap from the start of each recording; of one that is too short, all
+        of it.
+        """
         batches = []
         offset = 0
         for name, length in zip(self.names, self.lengths, strict=True):
@@ -413,17 +444,17 @@ def _phase(
     def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:
         if not settings.dropout:
             return None
-        kept = (
+        is_active = (
             torch.rand(sequences, length, settings.n_states, generator=generator)
             >= settings.dropout
         )
-        return kept.to(dtype) / (1.0 - settings.dropout)
+        return is_active.to(dtype) / (1.0 - settings.dropout)
 
     def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
         if not training.mirrored:
             return batch
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
-        inputs, outputs = (torch.where(turned, own, 1.0) for own in signs)
+        inputs, outputs = (torch.where(turned, sign, 1.0) for sign in signs)
         return batch._replace(
             inputs=batch.inputs * inputs.unsqueeze(1),
             targets=batch.targets * outputs.unsqueeze(1),

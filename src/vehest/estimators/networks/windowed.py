@@ -33,10 +33,11 @@ TARGET = "vy_ref"
 
 
 class WindowedEstimator(Network):
-    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et al. 2023, Fig. 1).
+    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et
+    al. 2023, Fig. 1).
 
-    The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it may have besides, a compiled recursion
-    for example, is in `vehest.training.members`.
+    The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it
+    may have besides, a compiled recursion for example, is in `vehest.training.members`.
     """
 
     channels = ("yaw_rate", "vx", "ay", "ax")
@@ -47,7 +48,9 @@ class WindowedEstimator(Network):
     window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
-        """A network that knows the ranges of the training recordings: means and deviations if it is a `StandardisedNetwork`."""
+        """A network that knows the ranges of the training recordings: means and deviations if it is
+        a `StandardisedNetwork`.
+        """
         from vehest.estimators.networks.standardised import StandardisedNetwork
 
         network = self.new_network()
@@ -66,8 +69,14 @@ class WindowedEstimator(Network):
     ) -> list[FitRecord]:
         """Train members together (`train_members`).
 
-        Raises `DataError`: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged. Raises
-        `ConfigurationError`: the network cannot be trained so, or a model to start from is of another family or has other settings.
+        Raises
+        ------
+        DataError
+            Recordings are too short or have gaps, the loss is no longer finite, or a model to start
+            from is damaged.
+        ConfigurationError
+            The network cannot be trained so, or a model to start from is of another family or has
+            other settings.
         """
         import torch
 
@@ -111,14 +120,16 @@ class WindowedEstimator(Network):
         return network
 
     def _weights_of(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-        """Weights and ranges of another model of the same family and settings, to start a training from (fine-tuning)."""
-        other = load_model(folder)
-        if (other.name, other.settings) != (self.name, self.settings):
+        """Weights and ranges of another model of the same family and settings, to start a training
+        from (fine-tuning).
+        """
+        start_model = load_model(folder)
+        if (start_model.name, start_model.settings) != (self.name, self.settings):
             raise ConfigurationError(
-                f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
+                f"training.start_from: '{folder.name}' is {start_model.full_title} with {asdict(start_model.settings)}; "
                 f"training starts from a model of the same family and settings, here {self.full_title} with {asdict(self.settings)}"
             )
-        return other.weights()
+        return start_model.weights()
 
     def _estimate_one(
         self, recording: Recording, initial_state: Mapping[str, float] | None
@@ -134,7 +145,9 @@ class WindowedEstimator(Network):
         return self._wrapped(recording, vy)
 
     def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
-        """Lateral velocity [m/s] one step after the windows of measurements (T, C) that begin at ``starts``, (B,)."""
+        """Lateral velocity [m/s] one step after the windows of measurements (T, C) that begin at
+        ``starts``, (B,).
+        """
         import torch
 
         from vehest.training.members import predict_members, prepare

@@ -1,7 +1,7 @@
 """The car as its driver knows it: size, limits, and steering over lateral acceleration.
 
-Sizes and limits are the vehicle's parameters. The steering is measured: the car goes into an ever tighter turn at constant speed until
-it follows no more, as in the constant-speed test of ISO 4138.
+Sizes and limits are the vehicle's parameters. The steering is measured: the car goes into an ever
+tighter turn at constant speed until it follows no more, as in the constant-speed test of ISO 4138.
 """
 
 from __future__ import annotations
@@ -20,13 +20,22 @@ from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 
 TEST_SPEED = 25.0  # of the measurement [m/s], or half of the top speed if that is less; assumed
-USEFUL_SHARE = 0.985  # share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed
-UNSTEADY = 0.5  # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed
+# share of the largest lateral acceleration that counts as the grip: the last bit takes far more
+# steering; assumed
+USEFUL_SHARE = 0.985
+# difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins;
+# assumed
+UNSTEADY = 0.5
 MARGIN = 0.85
-"""Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver counts as all of the grip; assumed."""
-TRACTION_SHARE = 0.8  # share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed
+"""Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver
+counts as all of the grip; assumed.
+"""
+# share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed
+TRACTION_SHARE = 0.8
 DRAG_AREA = 0.25
-"""Drag coefficient times frontal area, per square of the width; assumed: 0.7 m² for a car 1.7 m wide. ``driver: drag_area`` replaces it."""
+"""Drag coefficient times frontal area, per square of the width; assumed: 0.7 m² for a car 1.7 m
+wide. ``driver: drag_area`` replaces it.
+"""
 AIR_DENSITY = 1.2  # [kg/m³]
 POWER_SHARE = 0.9  # share of the engine's power that a driver uses; assumed
 
@@ -59,8 +68,8 @@ class Car:
     ) -> float:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
-        Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
-        Curvature [1/m] and lateral acceleration [m/s²] are positive to the left.
+        Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly
+        depends on it. Curvature [1/m] and lateral acceleration [m/s²] are positive to the left.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -82,43 +91,53 @@ class Car:
 
     def _at(self, values: tuple[float, ...], lateral_acceleration: float, friction: float) -> float:
         grid = self.lateral_acceleration
-        wanted = min(abs(lateral_acceleration) / friction, grid[-1])
-        after = min(max(bisect_right(grid, wanted), 1), len(grid) - 1)
-        share = (wanted - grid[after - 1]) / (grid[after] - grid[after - 1])
+        lateral = min(abs(lateral_acceleration) / friction, grid[-1])
+        after = min(max(bisect_right(grid, lateral), 1), len(grid) - 1)
+        share = (lateral - grid[after - 1]) / (grid[after] - grid[after - 1])
         return values[after - 1] + share * (values[after] - values[after - 1])
 
 
 def car_of(plant: MultiBodyPlant) -> Car:
-    """The car as its driver knows it; measured once a process for each vehicle and step; raises `ConfigurationError`."""
-    own = dict(plant.vehicle.driver)
+    """The car as its driver knows it; measured once a process for each vehicle and step; raises
+    `ConfigurationError`.
+    """
+    driver_values = dict(plant.vehicle.driver)
     key = json.dumps(
-        [plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step],
+        [
+            plant.vehicle.name,
+            plant.vehicle.parameter_set,
+            plant.vehicle.overrides,
+            driver_values,
+            plant.step,
+        ],
         sort_keys=True,
     )
-    if key not in _KNOWN:
-        _KNOWN[key] = _as_known(plant, own)
-    return _KNOWN[key]
+    if key not in _CARS:
+        _CARS[key] = _driver_view(plant, driver_values)
+    return _CARS[key]
 
 
-_KNOWN: dict[str, Car] = {}
-_OWN_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
+_CARS: dict[str, Car] = {}
+_DRIVER_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
 
 
-def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
+def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car:
     vehicle = plant.vehicle
     parameters = plant.parameters
-    unknown = sorted(set(own) - set(_OWN_VALUES))
+    unknown = sorted(set(driver_values) - set(_DRIVER_VALUES))
     if unknown:
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_OWN_VALUES)}"
+            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_DRIVER_VALUES)}"
         )
     front_share = parameters.b / (parameters.a + parameters.b)
     driven_axle = min(
         _ratio(front_share, parameters.T_se), _ratio(1.0 - front_share, 1.0 - parameters.T_se)
     )
-    top_speed = _own(own, "top_speed", parameters.longitudinal.v_max, vehicle.name)
+    top_speed = _driver_value(
+        driver_values, "top_speed", parameters.longitudinal.v_max, vehicle.name
+    )
     accelerations, steers, slips = _measure(plant, min(TEST_SPEED, 0.5 * top_speed))
-    grip = _own(own, "grip", accelerations[-1], vehicle.name)
+    grip = _driver_value(driver_values, "grip", accelerations[-1], vehicle.name)
     return Car(
         name=vehicle.name,
         wheelbase=plant.wheelbase,
@@ -126,8 +145,8 @@ def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
         front_share=front_share,
         grip=grip,
         driving_share=min(TRACTION_SHARE * driven_axle, TRACTION_SHARE),
-        power_per_mass=_own(
-            own,
+        power_per_mass=_driver_value(
+            driver_values,
             "power_per_mass",
             POWER_SHARE * parameters.longitudinal.a_max * parameters.longitudinal.v_switch,
             vehicle.name,
@@ -136,7 +155,7 @@ def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
         drag=0.5
         * AIR_DENSITY
         / parameters.m
-        * _own(own, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
+        * _driver_value(driver_values, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
         steering_rate=parameters.steering.v_max,
         largest_steer=parameters.steering.max,
         lateral_acceleration=accelerations,
@@ -149,8 +168,10 @@ def _ratio(load: float, torque: float) -> float:
     return load / torque if torque > 0.0 else math.inf
 
 
-def _own(own: Mapping[str, Any], name: str, default: float, vehicle_name: str) -> float:
-    value = float(own.get(name, default))
+def _driver_value(
+    driver_values: Mapping[str, Any], name: str, default: float, vehicle_name: str
+) -> float:
+    value = float(driver_values.get(name, default))
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(
             f"vehicle '{vehicle_name}': the driver's {name} must be positive, not {value}"
@@ -161,7 +182,9 @@ def _own(own: Mapping[str, Any], name: str, default: float, vehicle_name: str) -
 def _measure(
     plant: MultiBodyPlant, speed: float
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one; excess steer and rear slip [rad] there."""
+    """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one; excess
+    steer and rear slip [rad] there.
+    """
     ramp = ramp_steer(plant, speed)
     steady = ramp.vx * ramp.yaw_rate
     astray = np.flatnonzero(

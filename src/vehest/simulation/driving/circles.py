@@ -31,7 +31,9 @@ CIRCLE_LIMITS = {"radius": (15.0, 500.0), "severity": (0.1, 1.3)}
 
 @dataclass(frozen=True)
 class SteadyCircle(Manoeuvre):
-    """Steady-state circle: constant radius, slowly increasing speed (ISO 4138, constant-radius test)."""
+    """Steady-state circle: constant radius, slowly increasing speed (ISO 4138, constant-radius
+    test).
+    """
 
     name: ClassVar[str] = "skidpad"
     radius: Range = (35.0, 60.0)  # [m]; the standard wants at least 30 m
@@ -156,19 +158,21 @@ class TurnBraker(LineDriver):
         super().__init__(plan, car, driver, drawn)
         self._brakes_at = drawn["brakes_at"]
         self._deceleration = drawn["deceleration"]
-        self._held = manoeuvre.steering == "held"
+        self._holds_steering = manoeuvre.steering == "held"
         self._until_speed = manoeuvre.until_speed
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """Around the circle, then braking, with the steering held or not."""
-        decision = super().command(time, seen)
+        decision = super().command(time, observation)
         if time < self._brakes_at:
             return decision
         braking = -self._deceleration * min((time - self._brakes_at) / BRAKE_BUILD_UP, 1.0)
-        decision = decision._replace(acceleration=braking, finished=seen.speed < self._until_speed)
+        decision = decision._replace(
+            acceleration=braking, finished=observation.speed < self._until_speed
+        )
         return (
             decision._replace(steering_velocity=0.0, lateral_error=math.nan)
-            if self._held
+            if self._holds_steering
             else decision
         )
 

@@ -33,7 +33,8 @@ CONE_LIMITS = {"severity": (0.05, 1.3), "speed": (3.0, 70.0)}
 class DoubleLaneChange(Manoeuvre):
     """To the neighbouring lane and back between cones, at a constant speed.
 
-    Lengths and widths of the gates are those of ISO 3888-1 and ISO 3888-2; the offset of part 1 is taken between the lanes' middles.
+    Lengths and widths of the gates are those of ISO 3888-1 and ISO 3888-2; the offset of part 1 is
+    taken between the lanes' middles.
     """
 
     name: ClassVar[str] = "double_lane_change"
@@ -56,7 +57,9 @@ class DoubleLaneChange(Manoeuvre):
         return 60.0
 
     def gates(self, width: float) -> tuple[Gate, ...]:
-        """Gates for a car of a width [m], along the x axis from the first gate on, with the other lane on the left."""
+        """Gates for a car of a width [m], along the x axis from the first gate on, with the other
+        lane on the left.
+        """
         first = 1.1 * width + 0.25
         last = 1.3 * width + 0.25
         if self.layout == "iso_3888_1":
@@ -129,14 +132,16 @@ def _between_cones(
     draw = Draws(seed)
     severity = draw(manoeuvre.severity)
     side = draw.side(manoeuvre.side)
-    own_speed = draw(manoeuvre.speed) if manoeuvre.speed is not None else None
-    usual = draw_driver(seed)  # who looks less far ahead and steers faster between cones
+    fixed_speed = draw(manoeuvre.speed) if manoeuvre.speed is not None else None
+    average_driver = draw_driver(seed)  # who looks less far ahead and steers faster between cones
     driver = replace(
-        usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag
+        average_driver,
+        preview_time=0.57 * average_driver.preview_time,
+        steering_lag=0.5 * average_driver.steering_lag,
     )
     shape = line_through(gates, car.width, 40.0, 60.0)
     grip = car.grip * OpenArea(surface, seed).mean
-    speed = own_speed or min(
+    speed = fixed_speed or min(
         math.sqrt(severity * grip / float(np.abs(shape.curvature).max())),
         FASTEST_SHARE * car.top_speed,
     )
@@ -146,7 +151,7 @@ def _between_cones(
         line = Line(line.distance, line.x, -line.y, -line.heading, -line.curvature)
     plan = plan_along(line, speed, surface, seed)
     drawn = {
-        "severity": severity if own_speed is None else None,
+        "severity": severity if fixed_speed is None else None,
         "speed": speed,
         "side": SIDES[side],
         "driver": asdict(driver),

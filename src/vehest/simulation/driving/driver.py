@@ -1,8 +1,10 @@
-"""The driver: a racing line, a speed profile at a fraction of the grip, and path following with preview.
+"""The driver: a racing line, a speed profile at a fraction of the grip, and path following with
+preview.
 
-Steering follows the optimal-preview idea of Sharp, Casanova and Symonds 2000 in its simplest form: the steering of the steady turn ahead,
-the lateral error expected at one preview point, damping of the yaw rate, and countersteering once the rear slides. The speed profile is
-the usual quasi-steady pass forwards and backwards through the friction circle (e.g. Heilmeier et al. 2020).
+Steering follows the optimal-preview idea of Sharp, Casanova and Symonds 2000 in its simplest form:
+the steering of the steady turn ahead, the lateral error expected at one preview point, damping of
+the yaw rate, and countersteering once the rear slides. The speed profile is the usual quasi-steady
+pass forwards and backwards through the friction circle (e.g. Heilmeier et al. 2020).
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ WAVELENGTHS = (
 
 @dataclass(frozen=True)
 class Driver:
-    """How a person drives; all values are assumed, chosen so that the shipped cars follow the shipped courses."""
+    """How a person drives; all values are assumed, chosen so that the shipped cars follow the
+    shipped courses.
+    """
 
     preview_time: float = 0.7  # how far ahead the driver looks for lateral errors [s]
     steering_lag: float = 0.1  # time constant from the wanted to the actual steering angle [s]
@@ -56,7 +60,10 @@ class DrivingStyle:
 
     Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
 
-    Raises `ConfigurationError`: the grip used is not between 0 and 1 all along.
+    Raises
+    ------
+    ConfigurationError
+        The grip used is not between 0 and 1 all along.
     """
 
     grip_fraction: float  # mean share of the grip that the speed profile uses, 0 … 1
@@ -77,7 +84,9 @@ class DrivingStyle:
 
 @dataclass(frozen=True, eq=False)
 class Plan(Line):
-    """Planned line and speed over the distance along the way, uniform from 0; all arrays have shape (N,)."""
+    """Planned line and speed over the distance along the way, uniform from 0; all arrays have shape
+    (N,).
+    """
 
     speed: FloatArray  # [m/s]
     friction: FloatArray  # scale of the tyres' friction
@@ -96,7 +105,9 @@ class Plan(Line):
 
 
 class Observation(NamedTuple):
-    """The car as the driver perceives it: place [m], heading [rad], velocity [m/s], yaw rate [rad/s], steering angle [rad]."""
+    """The car as the driver perceives it: place [m], heading [rad], velocity [m/s], yaw rate
+    [rad/s], steering angle [rad].
+    """
 
     x: float
     y: float
@@ -136,7 +147,9 @@ class Command(NamedTuple):
 def draw_style(
     seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float
 ) -> DrivingStyle:
-    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the circle."""
+    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the
+    circle.
+    """
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
@@ -157,8 +170,8 @@ def plan_laps(
 ) -> Plan:
     """Line and speed profile over one whole lap or more, within the car's limits.
 
-    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one value or one for each of the n_laps·(N - 1)
-    + 1 samples.
+    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one
+    value or one for each of the n_laps·(N - 1) + 1 samples.
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
@@ -172,7 +185,7 @@ def plan_laps(
     stretch = 1.0 - bend * offset  # length of the line per length of the centre line
     curvature = bend / stretch + offset_bend
     ripple, _, _ = _sines(distance, style.wavelengths, style.grip_phases, style.grip_ripple)
-    used = car.grip * scale * (style.grip_fraction + ripple)
+    used_grip = car.grip * scale * (style.grip_fraction + ripple)
     return Plan(
         distance=distance,
         x=_repeat(course.x, n_laps) - offset * np.sin(heading),
@@ -180,7 +193,7 @@ def plan_laps(
         heading=heading + np.arctan2(offset_slope, stretch),
         curvature=curvature,
         speed=speed_profile(
-            curvature, used, float(distance[1]), car, driver, highest_speed, bank, grade
+            curvature, used_grip, float(distance[1]), car, driver, highest_speed, bank, grade
         ),
         friction=scale,
         bank=bank,
@@ -190,7 +203,7 @@ def plan_laps(
 
 def speed_profile(
     curvature: FloatArray,
-    used: FloatArray,
+    used_grip: FloatArray,
     spacing: float,
     car: Car,
     driver: Driver,
@@ -198,20 +211,27 @@ def speed_profile(
     bank: FloatArray | float = 0.0,
     grade: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Highest speeds [m/s] within friction circle, engine power, the car's top speed and the driver's ``highest_speed`` [m/s]; (N,).
+    """Highest speeds [m/s] within friction circle, engine power, the car's top speed and the
+    driver's ``highest_speed`` [m/s]; (N,).
 
-    Args:
-        curvature: (N,) [1/m], at samples ``spacing`` [m] apart.
-        used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
-        bank, grade: of the road, positive with its left side higher, and downhill [rad]; gravity helps or hinders.
+    Parameters
+    ----------
+    curvature : FloatArray
+        (N,) [1/m], at samples ``spacing`` [m] apart.
+    used
+        (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving
+        ``car.driving_share``.
+    bank, grade : FloatArray | float, default 0.0
+        Of the road, positive with its left side higher, and downhill [rad]; gravity helps or
+        hinders.
     """
-    lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
+    lateral = np.maximum(used_grip - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used_grip)
     cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))
     speed = np.minimum(cornering, np.minimum(highest_speed, car.top_speed)).tolist()
     bend = np.abs(curvature).tolist()
     limit = lateral.tolist()
-    most = used.tolist()
-    downhill = (GRAVITY * np.sin(grade) + np.zeros_like(used)).tolist()
+    max_grip = used_grip.tolist()
+    downhill = (GRAVITY * np.sin(grade) + np.zeros_like(used_grip)).tolist()
 
     def spare(i: int) -> float:
         """Longitudinal share of the friction circle at sample i."""
@@ -219,14 +239,14 @@ def speed_profile(
 
     for i in range(len(speed) - 2, -1, -1):
         braking = (
-            driver.braking_share * most[i + 1] * spare(i + 1)
+            driver.braking_share * max_grip[i + 1] * spare(i + 1)
             - downhill[i + 1]
             + car.drag * speed[i + 1] ** 2
         )
         speed[i] = min(speed[i], math.sqrt(speed[i + 1] ** 2 + 2.0 * max(braking, 0.0) * spacing))
     for i in range(len(speed) - 1):
         driving = (
-            min(car.power_per_mass / speed[i], car.driving_share * most[i] * spare(i))
+            min(car.power_per_mass / speed[i], car.driving_share * max_grip[i] * spare(i))
             + downhill[i]
             - car.drag * speed[i] ** 2
         )
@@ -237,11 +257,16 @@ def speed_profile(
 
 
 class Hands:
-    """Steering corrections between 0.5 and 2 Hz beside following a line, as drivers make them at the limit.
+    """Steering corrections between 0.5 and 2 Hz beside following a line, as drivers make them at
+    the limit.
 
-    Args:
-        size: root mean square of the lateral acceleration that is asked for, in a corner at the limit [m/s²]; a third of it on a straight.
-        generator: draws 24 frequencies, evenly spread over the logarithm, and their phases.
+    Parameters
+    ----------
+    size : float
+        Root mean square of the lateral acceleration that is asked for, in a corner at the limit
+        [m/s²]; a third of it on a straight.
+    generator : np.random.Generator
+        Draws 24 frequencies, evenly spread over the logarithm, and their phases.
     """
 
     def __init__(self, size: float, generator: np.random.Generator) -> None:
@@ -258,7 +283,9 @@ class Hands:
         )
 
     def at(self, time: float, load: float) -> float:
-        """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip [m/s²]."""
+        """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip
+        [m/s²].
+        """
         unit = math.sqrt(2.0 / len(self._waves)) * sum(
             math.sin(rate * time + phase) for rate, phase in self._waves
         )
@@ -268,10 +295,14 @@ class Hands:
 class Follower:
     """Drives a car along a plan.
 
-    Args:
-        progress: where on the plan the car starts [m].
-        speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
-        hands: corrections beside the line; by default none.
+    Parameters
+    ----------
+    progress : float, default 0.0
+        Where on the plan the car starts [m].
+    speed_at : Callable[[float], tuple[float, float]] | None, default None
+        Wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
+    hands : Hands | None, default None
+        Corrections beside the line; by default none.
     """
 
     def __init__(
@@ -308,64 +339,71 @@ class Follower:
         )
         return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """The command at a time [s] for an observation of the car."""
         car = self.car
         driver = self.driver
-        speed = seen.speed
-        sideslip = seen.sideslip
-        lateral_error, heading_error, here, share = self._locate(seen, sideslip)
+        speed = observation.speed
+        sideslip = observation.sideslip
+        lateral_error, heading_error, cell, share = self._locate(observation, sideslip)
         ahead, share_ahead = self._cell(
             self.progress + speed * (driver.steering_lag + driver.response * speed)
         )
         friction = max(_between(self._friction, ahead, share_ahead), 0.05)
-        bank = _between(self._bank, here, share)
-        grade = _between(self._grade, here, share)
+        bank = _between(self._bank, cell, share)
+        grade = _between(self._grade, cell, share)
         grip = car.grip * friction
 
         preview = max(speed * driver.preview_time, 3.0)
         error_ahead = lateral_error + preview * math.sin(heading_error)
-        meant = _between(self._curvature, ahead, share_ahead)
-        most = driver.saturation * grip / max(speed, 1.0) ** 2
-        curvature = max(-most, min(most, meant - 2.0 * error_ahead / preview**2))
+        planned_curvature = _between(self._curvature, ahead, share_ahead)
+        max_curvature = driver.saturation * grip / max(speed, 1.0) ** 2
+        curvature = max(
+            -max_curvature, min(max_curvature, planned_curvature - 2.0 * error_ahead / preview**2)
+        )
         lateral = curvature * speed**2 + GRAVITY * math.sin(bank)
-        # Back to the line with no more steering than at half of the grip: at the limit a car hardly answers, and more makes it weave.
-        held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
-        steer = held + self._per_curvature(speed, friction) * (curvature - meant)
-        steer -= driver.yaw_damping * (seen.yaw_rate - speed * curvature)
+        # Back to the line with no more steering than at half of the grip: at the limit a car hardly
+        # answers, and more makes it weave.
+        steady_steer = car.steer_for(
+            planned_curvature, planned_curvature * speed**2 + GRAVITY * math.sin(bank), friction
+        )
+        steer = steady_steer + self._per_curvature(speed, friction) * (
+            curvature - planned_curvature
+        )
+        steer -= driver.yaw_damping * (observation.yaw_rate - speed * curvature)
         sliding = sideslip - car.sideslip_for(curvature, lateral, friction)
-        beyond = max(abs(sliding) - driver.slide, 0.0)
-        steer += driver.countersteer * math.copysign(beyond, sliding)
+        excess_slide = max(abs(sliding) - driver.slide, 0.0)
+        steer += driver.countersteer * math.copysign(excess_slide, sliding)
         if self._hands is not None:
-            asked = self._hands.at(time, abs(lateral) / grip)
-            steer += self._per_curvature(speed, friction) * asked / max(speed, 5.0) ** 2
+            correction = self._hands.at(time, abs(lateral) / grip)
+            steer += self._per_curvature(speed, friction) * correction / max(speed, 5.0) ** 2
 
         target, feedforward = (
             self._speed_at(time)
             if self._speed_at
             else (
-                _between(self._speed, here, share),
+                _between(self._speed, cell, share),
                 _between(self._acceleration, ahead, share_ahead),
             )
         )
         resistance = car.resistance(
-            speed, seen.yaw_rate, seen.steer, sideslip
+            speed, observation.yaw_rate, observation.steer, sideslip
         ) - GRAVITY * math.sin(grade)
         acceleration = feedforward + driver.speed_gain * (target - speed) + resistance
-        spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
+        spare = math.sqrt(max(1.0 - (observation.yaw_rate * speed / grip) ** 2, 0.0))
         highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0)) * max(
-            1.0 - beyond / 0.1, 0.0
+            1.0 - excess_slide / 0.1, 0.0
         )
         lowest = -max(driver.braking_share * grip * spare, 0.1 * grip)
         return Command(
-            steering_velocity=steering_velocity(car, driver, steer, seen.steer),
+            steering_velocity=steering_velocity(car, driver, steer, observation.steer),
             acceleration=max(lowest, min(highest, acceleration)),
             progress=self.progress,
             lateral_error=lateral_error,
-            friction=_between(self._friction, here, share),
+            friction=_between(self._friction, cell, share),
             bank=bank,
             grade=grade,
-            heading=_between(self._heading, here, share),
+            heading=_between(self._heading, cell, share),
         )
 
     def _per_curvature(self, speed: float, friction: float) -> float:
@@ -374,31 +412,42 @@ class Follower:
         moderate = 0.5 * self.car.grip * friction
         return car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
 
-    def _locate(self, seen: Observation, sideslip: float) -> tuple[float, float, int, float]:
-        """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the last progress."""
+    def _locate(self, observation: Observation, sideslip: float) -> tuple[float, float, int, float]:
+        """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the
+        last progress.
+        """
         for _ in range(2):
             cell, share = self._cell(self.progress)
             heading = _between(self._heading, cell, share)
-            dx = seen.x - _between(self._x, cell, share)
-            dy = seen.y - _between(self._y, cell, share)
+            dx = observation.x - _between(self._x, cell, share)
+            dy = observation.y - _between(self._y, cell, share)
             along = math.cos(heading)
             across = math.sin(heading)
             self.progress = max(self.progress + dx * along + dy * across, 0.0)
         error = dy * along - dx * across
         cell, share = self._cell(self.progress)
-        return error, math.remainder(seen.yaw + sideslip - heading, 2.0 * math.pi), cell, share
+        return (
+            error,
+            math.remainder(observation.yaw + sideslip - heading, 2.0 * math.pi),
+            cell,
+            share,
+        )
 
     def _cell(self, distance: float) -> tuple[int, float]:
-        """Sample before a distance and the share of the way to the next one, held at the plan's ends."""
+        """Sample before a distance and the share of the way to the next one, held at the plan's
+        ends.
+        """
         position = distance * self._per_metre
         before = min(max(int(position), 0), self._last_cell)
         return before, min(max(position - before, 0.0), 1.0)
 
 
-def steering_velocity(car: Car, driver: Driver, wanted: float, steer: float) -> float:
+def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: float) -> float:
     """Steering velocity of the road wheels towards a wanted angle, within the car's limits [rad/s]."""
-    wanted = max(-car.largest_steer, min(car.largest_steer, wanted))
-    return max(-car.steering_rate, min(car.steering_rate, (wanted - steer) / driver.steering_lag))
+    target_steer = max(-car.largest_steer, min(car.largest_steer, target_steer))
+    return max(
+        -car.steering_rate, min(car.steering_rate, (target_steer - steer) / driver.steering_lag)
+    )
 
 
 def _between(values: list[float], before: int, share: float) -> float:

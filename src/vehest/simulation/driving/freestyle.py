@@ -1,4 +1,6 @@
-"""Freestyle driving of a small car: drifts, doughnuts, wheel spin and hard braking, in random order."""
+"""Freestyle driving of a small car: drifts, doughnuts, wheel spin and hard braking, in random
+order.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle in a slide that is ca
 class Freestyle(Manoeuvre):
     """A remotely controlled car on an open area, thrown from turn to turn; all habits are assumed.
 
-    The driver holds the steering at a stop, half way or straight for a while, then goes on to the next; gives gas in bursts as long as the
-    car is slower than wanted, coasts, brakes where it is much faster, and countersteers where it slides more than allowed.
+    The driver holds the steering at a stop, half way or straight for a while, then goes on to the
+    next; gives gas in bursts as long as the car is slower than wanted, coasts, brakes where it is
+    much faster, and countersteers where it slides more than allowed.
     """
 
     name: ClassVar[str] = "freestyle"
@@ -79,21 +82,21 @@ class FreestyleDriver:
         self.duration = draw(style.duration)
         self.drawn = {"duration": self.duration}
         self._progress = self._speed_until = self._steer_until = self._gas_until = 0.0
-        self._wanted = self._steer = self._gas = 0.0
+        self._target_speed = self._steer = self._gas = 0.0
         self._side = 1.0
-        self._held_sideslip = draw(style.sideslip)
+        self._max_sideslip = draw(style.sideslip)
         self._saves = False
 
-    def inputs(self, time: float, seen: Observation) -> Inputs:
+    def inputs(self, time: float, observation: Observation) -> Inputs:
         """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
-        self._progress += seen.speed / COMMAND_RATE_HZ
-        sideslip = math.atan2(seen.vy, seen.vx) if seen.speed > SLOW else 0.0
-        if not self._saves and abs(sideslip) > self._held_sideslip:
-            self._saves, self._held_sideslip = True, self._draw(self._style.sideslip)
+        self._progress += observation.speed / COMMAND_RATE_HZ
+        sideslip = math.atan2(observation.vy, observation.vx) if observation.speed > SLOW else 0.0
+        if not self._saves and abs(sideslip) > self._max_sideslip:
+            self._saves, self._max_sideslip = True, self._draw(self._style.sideslip)
         elif self._saves and abs(sideslip) < CALM:
             self._saves = False
         steer = self._next_steer(time)
-        gas = self._next_gas(time, seen)
+        gas = self._next_gas(time, observation)
         if self._saves:
             steer = COUNTERSTEER * sideslip
             gas = 0.0
@@ -117,26 +120,28 @@ class FreestyleDriver:
                 self._steer_until += float(generator.gamma(1.5, 1.0))
         return self._steer
 
-    def _next_gas(self, time: float, seen: Observation) -> float:
-        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast, and at random."""
+    def _next_gas(self, time: float, observation: Observation) -> float:
+        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast, and
+        at random.
+        """
         generator = self._generator
         style = self._style
         largest = self._car.largest_current
         if time >= self._speed_until:
-            self._wanted = float(generator.uniform(*as_range(style.speed)))
+            self._target_speed = float(generator.uniform(*as_range(style.speed)))
             self._speed_until = time + float(generator.uniform(1.0, 4.0))
-        if seen.vx < SLOW and self._gas <= 0.0:
+        if observation.vx < SLOW and self._gas <= 0.0:
             self._gas_until = time
         if time >= self._gas_until:
             kind = generator.uniform()
             current = float(generator.uniform(*style.current))
             self._gas_until = time + float(generator.uniform(0.15, 0.6))
-            if seen.vx < SLOW:
+            if observation.vx < SLOW:
                 self._gas = max(current, 0.4 * largest)
-            elif kind < style.brakes or seen.vx > self._wanted + FAST:
+            elif kind < style.brakes or observation.vx > self._target_speed + FAST:
                 self._gas = -float(generator.uniform(0.3, 0.7)) * largest
             elif kind > 1.0 - style.kicks:
                 self._gas = float(generator.uniform(0.8, 1.0)) * largest
             else:
-                self._gas = current if seen.vx < self._wanted else 0.0
+                self._gas = current if observation.vx < self._target_speed else 0.0
         return self._gas

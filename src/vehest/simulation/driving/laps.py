@@ -34,7 +34,9 @@ from vehest.simulation.driving.manoeuvre import (
 from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
 
-_TRAFFIC_STREAM = 5  # of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the fleet's
+# of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the
+# fleet's
+_TRAFFIC_STREAM = 5
 TRAFFIC_LENGTH = (50.0, 400.0)  # of a stretch behind a slower car [m]; assumed
 
 
@@ -97,7 +99,9 @@ class Laps(Manoeuvre):
         hands = Hands(draw(self.corrections), draw.generator) if self.corrections != 0.0 else None
 
         def plan(n_laps: int) -> Plan:
-            speeds = self._held_up(course, n_laps, highest, seed) if self.traffic else highest
+            speeds = (
+                self._traffic_speeds(course, n_laps, highest, seed) if self.traffic else highest
+            )
             return plan_laps(
                 course, car, driver, style, n_laps, friction=friction, highest_speed=speeds
             )
@@ -116,8 +120,10 @@ class Laps(Manoeuvre):
             plan(laps + 2), car, driver, drawn, course.length, end, end_time=end_time, hands=hands
         )
 
-    def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
-        """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are drawn lap by lap."""
+    def _traffic_speeds(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
+        """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are
+        drawn lap by lap.
+        """
         cells = len(course.arc_length) - 1
         spacing = float(course.arc_length[1])
         speeds = np.full(n_laps * cells + 1, highest)
@@ -128,14 +134,16 @@ class Laps(Manoeuvre):
             for _ in range(int(generator.poisson(self.traffic))):
                 begin = lap * cells + int(generator.uniform(0.0, cells))
                 length = int(generator.uniform(*TRAFFIC_LENGTH) / spacing)
-                held = speeds[begin : begin + length]
-                held[:] = np.minimum(held, generator.uniform(*self.traffic_speed))
+                stretch = speeds[begin : begin + length]
+                stretch[:] = np.minimum(stretch, generator.uniform(*self.traffic_speed))
         return speeds
 
 
 @dataclass(frozen=True)
 class SpeedLaps(Manoeuvre):
-    """A lap at each of several speeds, then a stop, as the truck of Di Biase et al. 2020 drove them."""
+    """A lap at each of several speeds, then a stop, as the truck of Di Biase et al. 2020 drove
+    them.
+    """
 
     name: ClassVar[str] = "speed_laps"
     course: str = "vairano_like"  # name of the course
@@ -181,7 +189,7 @@ class SpeedLaps(Manoeuvre):
         n_laps = len(self.speeds) + 2
         cells = len(course.arc_length) - 1
         lap_of = np.clip(np.arange(n_laps * cells + 1) // cells - 1, 0, len(self.speeds) - 1)
-        wanted = np.array(self.speeds)[lap_of]
+        lap_speeds = np.array(self.speeds)[lap_of]
         plan = plan_laps(
             course,
             car,
@@ -189,7 +197,7 @@ class SpeedLaps(Manoeuvre):
             style,
             n_laps,
             friction=friction,
-            highest_speed=_eased(wanted, course, self.change_rate),
+            highest_speed=_eased(lap_speeds, course, self.change_rate),
         )
         end = (1 + len(self.speeds)) * course.length
         drawn = {"severity": severity, "style": asdict(style), "driver": asdict(driver)}
@@ -223,7 +231,9 @@ class FastLap(Manoeuvre):
         return 2.0 * course_by_name(self.course).length / self.mean_speed
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver who uses as much of the grip as the mean speed takes; raises `ConfigurationError` where the car is too slow for it."""
+        """A driver who uses as much of the grip as the mean speed takes; raises
+        `ConfigurationError` where the car is too slow for it.
+        """
         course = _course(self.course, self.flat)
         driver = draw_driver(seed)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
@@ -261,10 +271,12 @@ FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
 
 
 class LapDriver(LineDriver):
-    """Follows a plan of laps of length ``lap`` [m] from just before the second one; the first sample is taken on the start line.
+    """Follows a plan of laps of length ``lap`` [m] from just before the second one; the first
+    sample is taken on the start line.
 
-    At the distance ``end`` [m] the drive is over or, with a ``stop_time`` [s], the car begins to stop, to stand after it; it is over at
-    ``end_time`` [s] wherever the car is. The plan has one lap more than is recorded.
+    At the distance ``end`` [m] the drive is over or, with a ``stop_time`` [s], the car begins to
+    stop, to stand after it; it is over at ``end_time`` [s] wherever the car is. The plan has one
+    lap more than is recorded.
     """
 
     def __init__(
@@ -283,18 +295,18 @@ class LapDriver(LineDriver):
         self._stop_time = stop_time
         self._stop: tuple[float, float] | None = None  # when it began, and at which speed
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """As planned, and braking evenly once the end is reached."""
-        decision = super().command(time, seen)
+        decision = super().command(time, observation)
         if self._stop_time is None or decision.progress < self._end:
             return decision
         if self._stop is None:
-            self._stop = (time, seen.speed)
+            self._stop = (time, observation.speed)
         begin, speed = self._stop
         rate = speed / self._stop_time
         return decision._replace(
             finished=False,
-            acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0),
+            acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - observation.speed, 0.0),
         )
 
 
@@ -311,7 +323,9 @@ def _lap_time(plan: Plan, length: float) -> float:
 
 
 def _eased(speed: FloatArray, course: Course, rate: float) -> FloatArray:
-    """Speeds [m/s] along the way without steps: they change by a constant acceleration around each step."""
+    """Speeds [m/s] along the way without steps: they change by a constant acceleration around each
+    step.
+    """
     spacing = float(course.arc_length[1])
     eased = speed.copy()
     for at in np.flatnonzero(np.diff(speed)).tolist():

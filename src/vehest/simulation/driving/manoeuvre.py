@@ -39,7 +39,7 @@ class Controller(Protocol):
         """Values that the seed drew, as JSON can hold them."""
         ...
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """The driver's command at a time [s]; called DRIVER_RATE_HZ times a second."""
         ...
 
@@ -59,11 +59,15 @@ class Manoeuvre(ABC):
     @property
     @abstractmethod
     def longest(self) -> float:
-        """Time after which the recording ends in any case, unless the car is coming to its stand [s]."""
+        """Time after which the recording ends in any case, unless the car is coming to its stand
+        [s].
+        """
 
     @abstractmethod
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """The controller of this car on this surface, as the seed draws it; raises `ConfigurationError` where the car cannot do this."""
+        """The controller of this car on this surface, as the seed draws it; raises
+        `ConfigurationError` where the car cannot do this.
+        """
 
     def description(self) -> dict[str, Any]:
         """Name and parameters."""
@@ -74,7 +78,9 @@ FASTEST_SHARE = 0.9  # share of the top speed that a manoeuvre on an open area i
 
 
 class LineDriver(Follower):
-    """Follows a line to the distance ``end`` [m], by default the plan's end, or until ``end_time`` [s]; ``following``: see `Follower`."""
+    """Follows a line to the distance ``end`` [m], by default the plan's end, or until ``end_time``
+    [s]; ``following``: see `Follower`.
+    """
 
     def __init__(
         self,
@@ -92,9 +98,9 @@ class LineDriver(Follower):
         self._end = plan.length - 1.0 if end is None else end
         self._end_time = end_time
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """As planned, until the end."""
-        decision = super().command(time, seen)
+        decision = super().command(time, observation)
         return decision._replace(finished=decision.progress >= self._end or time >= self._end_time)
 
 
@@ -114,7 +120,9 @@ SIDES = {1.0: "left", -1.0: "right"}  # names of the values of Draws.side
 
 
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
-    """Refuse parameters outside their limits, both ends of a range included, by a `ConfigurationError`; None is within."""
+    """Refuse parameters outside their limits, both ends of a range included, by a
+    `ConfigurationError`; None is within.
+    """
     for key, (lowest, highest) in limits.items():
         value = getattr(manoeuvre, key, None)
         low, high = as_range(lowest if value is None else value)
@@ -139,7 +147,9 @@ class Draws:
         )
 
     def __call__(self, value: Range) -> float:
-        """A value of the range, uniformly; also a plain number takes one draw, so that later ones stay as they are."""
+        """A value of the range, uniformly; also a plain number takes one draw, so that later ones
+        stay as they are.
+        """
         return float(self.generator.uniform(*as_range(value)))
 
     def side(self, side: Side) -> float:

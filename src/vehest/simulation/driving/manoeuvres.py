@@ -1,10 +1,12 @@
 """Manoeuvres by name, and made from a configuration.
 
-A manoeuvre is a frozen dataclass of its parameters; its controller drives a car on a surface as a seed draws it. A parameter of type Range
-is a number, or a pair from which every drive draws one, uniformly. ``severity`` is the share of the grip that the driver uses on
-the surface of the drive. Values without a source are assumed.
+A manoeuvre is a frozen dataclass of its parameters; its controller drives a car on a surface as a
+seed draws it. A parameter of type Range is a number, or a pair from which every drive draws one,
+uniformly. ``severity`` is the share of the grip that the driver uses on the surface of the drive.
+Values without a source are assumed.
 
-Time is zero at the first sample of the recording; SETTLING_TIME before it the car starts, rolling straight ahead.
+Time is zero at the first sample of the recording; SETTLING_TIME before it the car starts, rolling
+straight ahead.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.open_loop import RandomSteer, Spiral, StepSteer
 
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
-    made.name: made
-    for made in (
+    manoeuvre.name: manoeuvre
+    for manoeuvre in (
         Laps,
         SpeedLaps,
         FastLap,
@@ -41,7 +43,9 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 def manoeuvre_from_config(
     configuration: Mapping[str, Any], among: Mapping[str, type[Any]] = MANOEUVRES
 ) -> Any:
-    """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has; else `ConfigurationError`."""
+    """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has;
+    else `ConfigurationError`.
+    """
     values = dict(configuration)
     name = values.pop("name", None)
     if not isinstance(name, str) or name not in among:

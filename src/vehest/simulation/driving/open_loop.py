@@ -29,7 +29,9 @@ from vehest.simulation.road.surface import Surface
 
 @dataclass(frozen=True)
 class StepSteer(Manoeuvre):
-    """J-turn: straight ahead, then the steering wheel is turned quickly and held (ISO 7401, step input)."""
+    """J-turn: straight ahead, then the steering wheel is turned quickly and held (ISO 7401, step
+    input).
+    """
 
     name: ClassVar[str] = "j_turn"
     speed: Range = (15.0, 28.0)  # [m/s]; the driver holds it as far as grip and power allow
@@ -84,7 +86,9 @@ class StepSteer(Manoeuvre):
 
 @dataclass(frozen=True)
 class Spiral(Manoeuvre):
-    """Spiral: at constant speed the steering angle grows slowly, then, in a second turn, to the other side."""
+    """Spiral: at constant speed the steering angle grows slowly, then, in a second turn, to the
+    other side.
+    """
 
     name: ClassVar[str] = "spiral"
     speed: Range = (14.0, 25.0)  # [m/s]; the driver holds it as far as grip and power allow
@@ -144,7 +148,9 @@ class Spiral(Manoeuvre):
 
 @dataclass(frozen=True)
 class RandomSteer(Manoeuvre):
-    """Random steering within a band of frequencies at roughly constant speed (in the manner of ISO 7401, random input)."""
+    """Random steering within a band of frequencies at roughly constant speed (in the manner of ISO
+    7401, random input).
+    """
 
     name: ClassVar[str] = "random_steer"
     speed: Range = (14.0, 30.0)  # [m/s]; the driver holds it as far as grip and power allow
@@ -199,7 +205,9 @@ N_SINES = 24  # of which random steering is made, evenly spread over the band
 
 
 class OpenLoop:
-    """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the speed [m/s], until ``end_time`` [s]."""
+    """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the
+    speed [m/s], until ``end_time`` [s].
+    """
 
     def __init__(
         self,
@@ -220,23 +228,23 @@ class OpenLoop:
         self._progress = 0.0
         self._before = -SETTLING_TIME
 
-    def command(self, time: float, seen: Observation) -> Command:
+    def command(self, time: float, observation: Observation) -> Command:
         """Steering by the clock; throttle or brakes as the speed wants them and the grip allows."""
         car = self._car
-        speed = seen.speed
+        speed = observation.speed
         self._progress += speed * (time - self._before)
         self._before = time
         friction = self._area.friction_at(self._progress)
-        rate = (self._steer_at(time + 1.0 / DRIVER_RATE_HZ) - seen.steer) * DRIVER_RATE_HZ
+        rate = (self._steer_at(time + 1.0 / DRIVER_RATE_HZ) - observation.steer) * DRIVER_RATE_HZ
         grip = car.grip * friction
-        spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
-        wanted = 1.5 * (self._speed - speed) + car.resistance(
-            speed, seen.yaw_rate, seen.steer, seen.sideslip
+        spare = math.sqrt(max(1.0 - (observation.yaw_rate * speed / grip) ** 2, 0.0))
+        target_acceleration = 1.5 * (self._speed - speed) + car.resistance(
+            speed, observation.yaw_rate, observation.steer, observation.sideslip
         )
         highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0))
         return Command(
             steering_velocity=max(-car.steering_rate, min(car.steering_rate, rate)),
-            acceleration=max(-0.2 * grip, min(highest, wanted)),
+            acceleration=max(-0.2 * grip, min(highest, target_acceleration)),
             progress=self._progress,
             friction=friction,
             finished=time >= self._end_time,

@@ -1,7 +1,8 @@
-"""The multi-body equations in their three regimes, and a Runge-Kutta method of fixed step, compiled.
+"""The multi-body equations in their three regimes, and a Runge-Kutta method of fixed step,
+compiled.
 
-Flow: parameter vector -> MultiBodyValues -> multi_body (equations.py) and regimes (regimes.py) -> Runge-Kutta steps (advance) or
-derivatives and forces at given states (evaluate).
+Flow: parameter vector -> MultiBodyValues -> multi_body (equations.py) and regimes (regimes.py) ->
+Runge-Kutta steps (advance) or derivatives and forces at given states (evaluate).
 """
 
 from __future__ import annotations
@@ -68,17 +69,22 @@ N_STATES = 29
 N_INPUTS = 5
 N_FORCES = 12
 
-ROLLED_OVER = (
-    0.6  # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
-)
+# roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
+ROLLED_OVER = 0.6
 STABLE_RATE = 2.785  # the Runge-Kutta method is stable for eigenvalues down to -STABLE_RATE/step
 AT_REST = 1e-9  # lateral velocity [m/s] and yaw rate [rad/s] of a standing car that count as none
-OVERSPEED = 1.1  # speed of the driven wheels over the car's top speed at which the engine gives no more torque; assumed
+# speed of the driven wheels over the car's top speed at which the engine gives no more torque;
+# assumed
+OVERSPEED = 1.1
 LARGEST_LOAD_FACTOR = 1.5
-"""Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
+"""Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer
+is that of braking.
+"""
 
-# As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for Python, which unpack tuples of a hundred
-# numbers, and references of arrays, counted in every function, would take almost half of the time to compile.
+# As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for
+# Python, which unpack tuples of a hundred
+# numbers, and references of arrays, counted in every function, would take almost half of the time
+# to compile.
 _kernel = numba.njit(
     error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
 )
@@ -101,7 +107,9 @@ _LENGTHS = tuple(
     error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
 )  # it makes an array
 def _unpack(vector, friction):  # type: ignore[no-untyped-def]
-    """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost as much as ten evaluations."""
+    """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost
+    as much as ten evaluations.
+    """
     values = vector.copy()
     for place in _FRICTIONS:
         values[place] *= friction
@@ -120,7 +128,9 @@ def _sliding_friction(tyre):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def]
-    """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order and the wheels' axes."""
+    """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order
+    and the wheels' axes.
+    """
     regime = contact[0]
     inputs = contact[1]
     forces = multi_body(x, inputs[0], _engine_limit(x, inputs[1], p), contact, p, derivatives)
@@ -161,7 +171,9 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
 
 @_kernel
 def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
-    """Wanted acceleration, within power at the speed of the driven wheels; the library's limit takes the car's speed."""
+    """Wanted acceleration, within power at the speed of the driven wheels; the library's limit
+    takes the car's speed.
+    """
     front = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1]
     rear = x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
     velocity = 0.5 * p.R_w * (p.T_se * front + (1.0 - p.T_se) * rear)
@@ -180,12 +192,12 @@ def _brake_arm(p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _yaw_moment(wanted, forces, p):  # type: ignore[no-untyped-def]
+def _yaw_moment(moment, forces, p):  # type: ignore[no-untyped-def]
     """The wanted moment, within the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
     right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
     # A positive moment, to the left of ISO 8855, brakes the wheels that the library calls right.
-    return min(max(wanted, -left * _brake_arm(p)), right * _brake_arm(p))
+    return min(max(moment, -left * _brake_arm(p)), right * _brake_arm(p))
 
 
 @_kernel
@@ -202,28 +214,30 @@ def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
-    """Lateral forces over load after a part of a step: while rolling they follow the slip over a length of the way.
+def _relax(lateral_ratio, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
+    """Lateral forces over load after a part of a step: while rolling they follow the slip over a
+    length of the way.
 
-    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7) of the force over the load, exact for the slip at the
-    part's beginning. Tyres of a slow or sliding car, which other equations hold, have no lag.
+    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7) of the force
+    over the load, exact for the slip at the part's beginning. Tyres of a slow or sliding car, which
+    other equations hold, have no lag.
     """
     for i in range(4):
         if regime == ROLLING:
             length = vector[len(vector) - (2 if i < 2 else 1)]
-            held[i] += (held[4 + i] - held[i]) * (
+            lateral_ratio[i] += (lateral_ratio[4 + i] - lateral_ratio[i]) * (
                 1.0 - math.exp(-abs(x[VX]) * part / length) if length > 0.0 else 1.0
             )
         else:
-            held[i] = forces[4 + i] / forces[8 + i]
+            lateral_ratio[i] = forces[4 + i] / forces[8 + i]
 
 
-def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before):  # type: ignore[no-untyped-def]
+def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_ratio_before):  # type: ignore[no-untyped-def]
     p = _unpack(vector, friction)
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
-    held = np.empty(8)
+    lateral_ratio = np.empty(8)
     for i in range(4):
-        held[i] = held[4 + i] = held_before[i]
+        lateral_ratio[i] = lateral_ratio[4 + i] = lateral_ratio_before[i]
     friction_front = _sliding_friction(p.tire)
     friction_rear = _sliding_friction(p.tire_rear)
     x = state.copy()
@@ -236,14 +250,15 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before
     for _ in range(n_steps):
         regime = next_regime(regime, x, p)
         slid = slid or regime == SLIDING
-        contact = (regime, inputs, friction_front, friction_rear, lags, held)
+        contact = (regime, inputs, friction_front, friction_rear, lags, lateral_ratio)
         n_parts = _n_substeps(regime, x, p, step)
         part = step / n_parts
         for _ in range(n_parts):
-            # The library sets a negative wheel speed to zero in the state it is given; that must reach x itself.
+            # The library sets a negative wheel speed to zero in the state it is given; that must
+            # reach x itself.
             forces = _right_hand_side(x, contact, p, k1)
             if lags:
-                _relax(held, regime, forces, x, vector, 0.5 * part)
+                _relax(lateral_ratio, regime, forces, x, vector, 0.5 * part)
             for i in range(N_STATES):
                 stage[i] = x[i] + 0.5 * part * k1[i]
             _right_hand_side(stage, contact, p, k2)
@@ -254,7 +269,7 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before
                 stage[i] = x[i] + part * k3[i]
             forces = _right_hand_side(stage, contact, p, k4)
             if lags:
-                _relax(held, regime, forces, stage, vector, 0.5 * part)
+                _relax(lateral_ratio, regime, forces, stage, vector, 0.5 * part)
             for i in range(N_STATES):
                 x[i] += part / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
             for i in range(FIRST_WHEEL, FIRST_WHEEL + 4):
@@ -267,26 +282,26 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before
         if not abs(x[ROLL]) < ROLLED_OVER:
             break
     regime = next_regime(regime, x, p)
-    return x, regime, slid or regime == SLIDING, held[:4].copy()
+    return x, regime, slid or regime == SLIDING, lateral_ratio[:4].copy()
 
 
-def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignore[no-untyped-def]
+def _evaluate(states, regimes, inputs, vector, frictions, lateral_ratios):  # type: ignore[no-untyped-def]
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
-    held = np.empty(8)
+    lateral_ratio = np.empty(8)
     n_samples = len(states)
     derivatives = np.empty((n_samples, N_STATES))
     forces = np.empty((n_samples, N_FORCES))
     for k in range(n_samples):
         p = _unpack(vector, frictions[k])
         for i in range(4):
-            held[i] = helds[k, i]
+            lateral_ratio[i] = lateral_ratios[k, i]
         contact = (
             regimes[k],
             inputs[k],
             _sliding_friction(p.tire),
             _sliding_friction(p.tire_rear),
             lags,
-            held,
+            lateral_ratio,
         )
         wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
         sine = math.sin(states[k, STEER])
@@ -304,14 +319,17 @@ def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignor
     return derivatives, forces
 
 
-class _Kept:
-    """A function of this module whose machine code is kept on disk, where a writable place is found.
+class _CachedFunction:
+    """A function of this module whose machine code is kept on disk, where a writable place is
+    found.
 
-    The first of several processes compiles, which takes some ten seconds; the others wait for it and load the code.
+    The first of several processes compiles, which takes some ten seconds; the others wait for it
+    and load the code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        # numba looks code up by the name, file and date of the outermost function; the digest stands for the rest.
+        # numba looks code up by the name, file and date of the outermost function; the digest
+        # stands for the rest.
         function.__qualname__ = f"{function.__name__}_{_digest()}"
         self.dispatcher: Any = function
         self.lock: Path | None = None
@@ -327,15 +345,17 @@ class _Kept:
     def __call__(self, *arguments: Any) -> Any:
         if self._is_ready:
             return self.dispatcher(*arguments)
-        with _held(self.lock):
+        with _locked(self.lock):
             results = self.dispatcher(*arguments)
         self._is_ready = True
         return results
 
 
 @contextmanager
-def _held(lock: Path | None) -> Iterator[None]:
-    """Waits for other processes that hold the lock. Where there are no locks, as on Windows, every process compiles."""
+def _locked(lock: Path | None) -> Iterator[None]:
+    """Waits for other processes that hold the lock. Where there are no locks, as on Windows, every
+    process compiles.
+    """
     with ExitStack() as stack:
         if lock is not None and fcntl is not None:
             with suppress(OSError):
@@ -354,14 +374,21 @@ def _digest() -> str:
     return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
 
 
-advance = _Kept(_advance)
-"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, held (4,)) -> state (29,), regime, whether it slid, held (4,).
+advance = _CachedFunction(_advance)
+"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, lateral_ratio (4,)) -> state
+(29,), regime, whether it slid, lateral_ratio (4,).
 
-``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``held`` are lateral forces over load, where these lag.
+``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``lateral_ratio`` are lateral forces
+over load, where these lag.
 
-Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a rollover or NaN."""
+Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a
+rollover or NaN.
+"""
 
-evaluate = _Kept(_evaluate)
-"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,), held (T, 4)) -> derivatives (T, 29), forces (T, 12).
+evaluate = _CachedFunction(_evaluate)
+"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,), lateral_ratio (T, 4)) ->
+derivatives (T, 29), forces (T, 12).
 
-Forces: along and across in the level body's axes, then vertical, each for the library's four wheels [N]."""
+Forces: along and across in the level body's axes, then vertical, each for the library's four wheels
+[N].
+"""

@@ -1,10 +1,12 @@
 """Multi-body equations of a car with suspension, load transfer and combined-slip tyres; compiled.
 
-Sources: Althoff, Koschi and Manzinger, "CommonRoad: Composable benchmarks for motion planning on roads", IEEE IV 2017, and Althoff and
-Würsching, "CommonRoad: Vehicle Models", 2020; both after Allen et al., "Vehicle dynamic stability and rollover", DOT HS 807 956, 1992.
-Parameters keep the names of the second one. Tyres: Pacejka's magic formula, without turn slip.
+Sources: Althoff, Koschi and Manzinger, "CommonRoad: Composable benchmarks for motion planning on
+roads", IEEE IV 2017, and Althoff and Würsching, "CommonRoad: Vehicle Models", 2020; both after
+Allen et al., "Vehicle dynamic stability and rollover", DOT HS 807 956, 1992. Parameters keep the
+names of the second one. Tyres: Pacejka's magic formula, without turn slip.
 
-Flow: suspension of each axle -> loads and slips of its wheels -> tyre formulas -> forces_of_contact (regimes.py) -> sums -> derivatives.
+Flow: suspension of each axle -> loads and slips of its wheels -> tyre formulas -> forces_of_contact
+(regimes.py) -> sums -> derivatives.
 
 Differences from the published model:
 
@@ -14,7 +16,8 @@ Differences from the published model:
 - rear tyres have parameters of their own, ``p.tire_rear``;
 - the forces of the tyre formulas pass through forces_of_contact, and are returned.
 
-Elsewhere the derivatives are those of the package commonroad-vehicle-models bit by bit: sums keep its order of terms.
+Elsewhere the derivatives are those of the package commonroad-vehicle-models bit by bit: sums keep
+its order of terms.
 """
 
 from __future__ import annotations
@@ -44,7 +47,9 @@ from vehest.simulation.plant.regimes import (
 )
 
 SMALLEST_WHEEL_VELOCITY = 0.5
-"""Smallest divisor of slips [m/s]; below it a rolling wheel still has no slip, and slip stiffness stays finite."""
+"""Smallest divisor of slips [m/s]; below it a rolling wheel still has no slip, and slip stiffness
+stays finite.
+"""
 
 SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
 
@@ -52,13 +57,15 @@ HEAVE_RATE = 12
 JOINT_FRONT = 27
 JOINT_REAR = 28
 
-# Places of an axle's lateral velocity and of the lateral play of its joint among the states, and its parameters. Roll, roll rate, lateral
+# Places of an axle's lateral velocity and of the lateral play of its joint among the states, and
+# its parameters. Roll, roll rate, lateral
 # velocity, heave and heave rate of an axle follow one another.
 _Axle = namedtuple(
     "_Axle",
     "vy joint lever track mass inertia static spring damper torsion joint_height camber camber_squared",
 )
-# Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the wheels.
+# Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the
+# wheels.
 _Suspension = namedtuple("_Suspension", "left right joint joint_rate camber_left camber_right")
 _Wheels = namedtuple(
     "_Wheels", "along_left along_right across_left across_right load_left load_right"
@@ -84,20 +91,26 @@ def acceleration_limit(velocity, acceleration, limits):  # type: ignore[no-untyp
         velocity >= limits.v_max and acceleration >= 0.0
     ):
         return 0.0
-    most = limits.a_max * limits.v_switch / velocity if velocity > limits.v_switch else limits.a_max
-    return min(max(acceleration, -limits.a_max), most)
+    max_acceleration = (
+        limits.a_max * limits.v_switch / velocity if velocity > limits.v_switch else limits.a_max
+    )
+    return min(max(acceleration, -limits.a_max), max_acceleration)
 
 
 @_kernel
 def _bent(stiffness, curvature, slip):  # type: ignore[no-untyped-def]
-    """atan(B s - E (B s - atan(B s))), whose sine or cosine the magic formula takes, times the shape factor."""
+    """atan(B s - E (B s - atan(B s))), whose sine or cosine the magic formula takes, times the
+    shape factor.
+    """
     product = stiffness * slip
     return math.atan(product - curvature * (product - math.atan(product)))
 
 
 @_kernel
 def longitudinal_force(slip, camber, load, tyre):  # type: ignore[no-untyped-def]
-    """Longitudinal force of pure slip [N]. The published model has the vertical shift inside of the sine."""
+    """Longitudinal force of pure slip [N]. The published model has the vertical shift inside of the
+    sine.
+    """
     peak = tyre.p_dx1 * (1.0 - tyre.p_dx3 * camber**2) * load
     stiffness = load * tyre.p_kx1 / (tyre.p_cx1 * peak)
     return peak * math.sin(
@@ -145,7 +158,7 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
 
 @_kernel
 def _axles(p):  # type: ignore[no-untyped-def]
-    both = 2.0 * (p.a + p.b)
+    twice_wheelbase = 2.0 * (p.a + p.b)
     return (
         _Axle(
             VY_FRONT,
@@ -154,7 +167,7 @@ def _axles(p):  # type: ignore[no-untyped-def]
             p.T_f,
             p.m_uf,
             p.I_uf,
-            p.m_s * GRAVITY * p.b / both,
+            p.m_s * GRAVITY * p.b / twice_wheelbase,
             p.K_sf,
             p.K_sdf,
             p.K_tsf,
@@ -169,7 +182,7 @@ def _axles(p):  # type: ignore[no-untyped-def]
             p.T_r,
             p.m_ur,
             p.I_ur,
-            p.m_s * GRAVITY * p.a / both,
+            p.m_s * GRAVITY * p.a / twice_wheelbase,
             p.K_sr,
             p.K_sdr,
             p.K_tsr,
@@ -182,7 +195,9 @@ def _axles(p):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: ignore[no-untyped-def]
-    """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump stops are left out."""
+    """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump
+    stops are left out.
+    """
     roll = x[axle.vy - 2]
     roll_rate = x[axle.vy - 1]
     heave = x[axle.vy + 1]
@@ -222,7 +237,9 @@ def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: i
 
 @_kernel
 def _slip(velocity, turning):  # type: ignore[no-untyped-def]
-    """Longitudinal slip of a wheel from its velocity and that of its rim [m/s]; a wheel that moves backwards counts as standing."""
+    """Longitudinal slip of a wheel from its velocity and that of its rim [m/s]; a wheel that moves
+    backwards counts as standing.
+    """
     forward = 0.0 if velocity < 0.0 else velocity
     if forward > SMALLEST_WHEEL_VELOCITY:
         return 1.0 - turning / forward
@@ -260,7 +277,8 @@ def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical,
 def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, derivatives):  # type: ignore[no-untyped-def]
     """Fill the derivatives of an axle's five states and its joint's play.
 
-    ``across`` is the lateral force of both wheels in the body's axes; left and right are lateral force and load of each in its own.
+    ``across`` is the lateral force of both wheels in the body's axes; left and right are lateral
+    force and load of each in its own.
     """
     roll = x[axle.vy - 2]
     height = radius * math.sin(roll)
@@ -268,7 +286,7 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
     reach = half * math.cos(roll)
     sine = math.sin(x[ROLL])
     cosine = math.cos(x[ROLL])
-    both = suspension.left + suspension.right
+    spring_force = suspension.left + suspension.right
     moment = (
         half * suspension.right
         - half * suspension.left
@@ -280,21 +298,24 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
     derivatives[axle.vy - 2] = x[axle.vy - 1]
     derivatives[axle.vy - 1] = 1.0 / axle.inertia * moment
     derivatives[axle.vy] = (
-        1.0 / axle.mass * (across - suspension.joint * cosine - both * sine) - x[YAW_RATE] * x[VX]
+        1.0 / axle.mass * (across - suspension.joint * cosine - spring_force * sine)
+        - x[YAW_RATE] * x[VX]
     )
     derivatives[axle.vy + 1] = x[axle.vy + 2]
     derivatives[axle.vy + 2] = GRAVITY - 1.0 / axle.mass * (
-        left[1] + right[1] + suspension.joint * sine - both * cosine
+        left[1] + right[1] + suspension.joint * sine - spring_force * cosine
     )
     derivatives[axle.joint] = suspension.joint_rate
 
 
 @_kernel
 def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # type: ignore[no-untyped-def]
-    """Fill the derivatives (29,) of the state x (29,); returns twelve tyre forces in the wheels' axes: four along, four across, four loads.
+    """Fill the derivatives (29,) of the state x (29,); returns twelve tyre forces in the wheels'
+    axes: four along, four across, four loads.
 
-    A negative wheel speed becomes zero in x itself. Axes and places are those of regimes.py; steering velocity [rad/s] and acceleration
-    [m/s²] are the wanted ones, ``contact`` is as forces_of_contact takes it, p are MultiBodyValues.
+    A negative wheel speed becomes zero in x itself. Axes and places are those of regimes.py;
+    steering velocity [rad/s] and acceleration [m/s²] are the wanted ones, ``contact`` is as
+    forces_of_contact takes it, p are MultiBodyValues.
     """
     u = (
         steering_limit(x[STEER], steering_velocity, p.steering),

@@ -17,10 +17,12 @@ LONGEST = 60.0  # s
 def ramp_steer(
     plant: MultiBodyPlant, speed: float, *, friction: float = 1.0, direction: float = 1.0
 ) -> Motion:
-    """Constant speed [m/s], slowly growing steering angle, until the lateral acceleration falls by 3 % again; 50 Hz.
+    """Constant speed [m/s], slowly growing steering angle, until the lateral acceleration falls by
+    3 % again; 50 Hz.
 
-    Towards the limit, where the lateral acceleration hardly grows any more, the steering angle grows up to ten times faster. ``friction``
-    scales that of the tyres; the direction is 1 to the left, -1 to the right.
+    Towards the limit, where the lateral acceleration hardly grows any more, the steering angle
+    grows up to ten times faster. ``friction`` scales that of the tyres; the direction is 1 to the
+    left, -1 to the right.
     """
     steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
     state = plant.initial_state(0.0, 0.0, 0.0, speed)

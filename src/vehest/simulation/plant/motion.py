@@ -18,10 +18,11 @@ WHEELS = (
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """True motion of the centre of gravity of the car body, uniformly sampled; arrays have shape (T,) or (T, 4).
+    """True motion of the centre of gravity of the car body, uniformly sampled; arrays have shape
+    (T,) or (T, 4).
 
-    Axes are those of ISO 8855: x forward, y left, z up; a left turn has positive steer, yaw_rate and ay. They yaw with
-    the car and stay level with the road; columns of (T, 4) arrays are WHEELS.
+    Axes are those of ISO 8855: x forward, y left, z up; a left turn has positive steer, yaw_rate
+    and ay. They yaw with the car and stay level with the road; columns of (T, 4) arrays are WHEELS.
     """
 
     rate_hz: float  # sampling rate [Hz]

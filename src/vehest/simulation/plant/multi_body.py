@@ -1,17 +1,21 @@
-"""The plant: CommonRoad's multi-body car, integrated with a fixed step, from standstill to 70 m/s and through a spin.
+"""The plant: CommonRoad's multi-body car, integrated with a fixed step, from standstill to 70 m/s
+and through a spin.
 
-Source of the equations: Althoff and Würsching, "CommonRoad: Vehicle Models", 2020, the multi-body model of 29 states
-with suspension, load transfer and combined-slip tyres. The library's vertical axis points down, so that a positive yaw
-rate speeds up the wheels it calls left. Read as a mirror image, the equations are those of a car in ISO 8855 axes:
-steering, yaw and lateral quantities keep their sign, left and right wheels change places, roll and pitch change sign.
+Source of the equations: Althoff and Würsching, "CommonRoad: Vehicle Models", 2020, the multi-body
+model of 29 states with suspension, load transfer and combined-slip tyres. The library's vertical
+axis points down, so that a positive yaw rate speeds up the wheels it calls left. Read as a mirror
+image, the equations are those of a car in ISO 8855 axes: steering, yaw and lateral quantities keep
+their sign, left and right wheels change places, roll and pitch change sign.
 
-The equations, and so the plant, leave out: aerodynamic drag and lift, rolling resistance, bump stops, a
-differential, anti-lock brakes. Longitudinal forces pitch the body as if all of the mass were the body's. Drag, and gravity
-along and across a road that is not level, come in as external accelerations (drive.py); wheel loads stay those of a level road.
+The equations, and so the plant, leave out: aerodynamic drag and lift, rolling resistance, bump
+stops, a differential, anti-lock brakes. Longitudinal forces pitch the body as if all of the mass
+were the body's. Drag, and gravity along and across a road that is not level, come in as external
+accelerations (drive.py); wheel loads stay those of a level road.
 
-The published tyre has shifts that change sign with camber, so that its force jumps there by about 4 % of the wheel load.
-With them the integration converges to first order where that happens, and on a straight the lateral acceleration has
-small steps; the vehicles of conf/vehicle go without those shifts where their files state it.
+The published tyre has shifts that change sign with camber, so that its force jumps there by about 4
+% of the wheel load. With them the integration converges to first order where that happens, and on a
+straight the lateral acceleration has small steps; the vehicles of conf/vehicle go without those
+shifts where their files state it.
 """
 
 from __future__ import annotations
@@ -50,9 +54,12 @@ from vehest.simulation.plant.regimes import (
 )
 
 STEADY_SHARE = 0.93
-"""Lateral acceleration over friction in a steady turn at the limit: 0.91 to 0.98 for the shipped vehicles at 15 to 40 m/s.
+"""Lateral acceleration over friction in a steady turn at the limit: 0.91 to 0.98 for the shipped
+vehicles at 15 to 40 m/s.
 
-The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
+The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving
+against it takes.
+"""
 
 HEAVE_FRONT = 16
 HEAVE_REAR = 21
@@ -61,7 +68,9 @@ MIRRORED = (
     0,
     3,
     2,
-)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
+    # the library's left front, right front, left rear and right rear wheel in the order of
+    # motion.WHEELS
+)
 
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
@@ -78,7 +87,7 @@ class PlantState:
     regime: Regime  # which equations hold
     spun: bool = False  # whether the car has been in a spin since its start
     # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag
-    held: FloatArray = field(default_factory=lambda: np.zeros(4))
+    lateral_ratio: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     x = _state(X, "Position on the ground [m].")
     y = _state(Y, "Position on the ground [m].")
@@ -89,7 +98,7 @@ class PlantState:
     steer = _state(STEER, "Road-wheel angle of the front axle, positive to the left [rad].")
 
     @property
-    def stands(self) -> bool:
+    def is_standing(self) -> bool:
         """Whether the car is at rest, but for the last of its suspension's swing."""
         return bool(self.regime == Regime.SLOW and self.vx == 0.0)
 
@@ -98,12 +107,13 @@ class PlantState:
 class MultiBodyPlant:
     """A vehicle and the step it is integrated with.
 
-    Inputs are an array of shape (5,): steering velocity of the front wheels [rad/s], wanted longitudinal acceleration
-    [m/s²], both within the vehicle's limits, yaw moment by braking one side (positive turns left) [N m], and external
-    acceleration along and across the level body, as gravity gives on a slope (road_gravity) [m/s²].
+    Inputs are an array of shape (5,): steering velocity of the front wheels [rad/s], wanted
+    longitudinal acceleration [m/s²], both within the vehicle's limits, yaw moment by braking one
+    side (positive turns left) [N m], and external acceleration along and across the level body, as
+    gravity gives on a slope (road_gravity) [m/s²].
 
-    The yaw moment brings its braking force |M|/(track/2) along. It does not use up the braked tyres' grip, and does
-    nothing below about 1 m/s and in a spin.
+    The yaw moment brings its braking force |M|/(track/2) along. It does not use up the braked
+    tyres' grip, and does nothing below about 1 m/s and in a spin.
     """
 
     vehicle: Vehicle  # the car
@@ -125,7 +135,9 @@ class MultiBodyPlant:
 
     @property
     def grip(self) -> float:
-        """About the largest steady lateral acceleration [m/s²], from the lateral friction of the weaker axle."""
+        """About the largest steady lateral acceleration [m/s²], from the lateral friction of the
+        weaker axle.
+        """
         return float(
             STEADY_SHARE
             * GRAVITY
@@ -148,7 +160,9 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or standing."""
+        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or
+        standing.
+        """
         values = self._at_rest.copy()
         values[[X, Y, YAW, VX]] = x, y, yaw, vx
         values[FIRST_WHEEL : FIRST_WHEEL + 4] = vx / self.parameters.R_w
@@ -157,9 +171,11 @@ class MultiBodyPlant:
     def advance(
         self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0
     ) -> PlantState:
-        """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the car rolls over or diverges."""
+        """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the
+        car rolls over or diverges.
+        """
         inputs = _writable(inputs)
-        values, regime, slid, held = compiled.advance(
+        values, regime, slid, lateral_ratio = compiled.advance(
             state.values,
             int(state.regime),
             inputs,
@@ -167,29 +183,30 @@ class MultiBodyPlant:
             float(friction),
             self.step,
             int(n_steps),
-            state.held,
+            state.lateral_ratio,
         )
         if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
             raise SimulationError(
                 f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at {_describe(values)}; lower "
                 f"the grip that is asked of it or the centre of gravity (h_s), or stiffen roll (K_tsf, K_tsr)"
             )
-        return PlantState(values, Regime(regime), state.spun or slid, held)
+        return PlantState(values, Regime(regime), state.spun or slid, lateral_ratio)
 
     def evaluate(
         self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
+        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for
+        motion.WHEELS [N].
 
         ``inputs`` are (T, 5); ``friction`` scales friction, (T,) or one for all.
         """
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
         inputs = _writable(inputs).reshape(-1, N_INPUTS)
-        held = np.array([state.held for state in states]).reshape(-1, 4)
+        lateral_ratio = np.array([state.lateral_ratio for state in states]).reshape(-1, 4)
         frictions = _writable(np.broadcast_to(friction, len(states)))
         derivatives, forces = compiled.evaluate(
-            values, regimes, inputs, self._vector, frictions, held
+            values, regimes, inputs, self._vector, frictions, lateral_ratio
         )
         return derivatives, forces.reshape(-1, 3, 4)[:, :, MIRRORED]
 
@@ -203,11 +220,16 @@ class MultiBodyPlant:
         bank: ArrayLike = 0.0,
         grade: ArrayLike = 0.0,
     ) -> Motion:
-        """States sampled at ``rate_hz`` [Hz], each with the inputs (T, 5) that hold from then on, as motion in ISO 8855 axes.
+        """States sampled at ``rate_hz`` [Hz], each with the inputs (T, 5) that hold from then on,
+        as motion in ISO 8855 axes.
 
-        Args:
-            friction: scale of friction, (T,) or one for all.
-            bank, grade: of the road, (T,) or one for all [rad]; kept with the motion, their gravity is in the inputs.
+        Parameters
+        ----------
+        friction : ArrayLike, default 1.0
+            Scale of friction, (T,) or one for all.
+        bank, grade : ArrayLike, default 0.0
+            Of the road, (T,) or one for all [rad]; kept with the motion, their gravity is in the
+            inputs.
         """
         derivatives, forces = self.evaluate(states, inputs, friction)
         values = np.array([state.values for state in states])
@@ -243,7 +265,9 @@ def _writable(values: ArrayLike) -> FloatArray:
 
 
 def road_gravity(bank: float, grade: float) -> tuple[float, float]:
-    """Acceleration along and across the body that gravity gives on a road [m/s²]; signs of Motion.bank and Motion.grade."""
+    """Acceleration along and across the body that gravity gives on a road [m/s²]; signs of
+    Motion.bank and Motion.grade.
+    """
     return GRAVITY * math.sin(grade), -GRAVITY * math.sin(bank)
 
 

@@ -1,7 +1,7 @@
 """Parameters of the multi-body plant: a set published by CommonRoad, with named values replaced.
 
-The library has one tyre for all wheels. Here the rear axle may have its own: ``tire_rear`` replaces values of ``tire``,
-which is then the front axle's.
+The library has one tyre for all wheels. Here the rear axle may have its own: ``tire_rear`` replaces
+values of ``tire``, which is then the front axle's.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ def _field_names(library_class: type) -> list[str]:
 
 REAR_TYRE = "tire_rear"
 
-# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre. Groups stand last.
+# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a
+# rear tyre. Groups stand last.
 SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
 LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
 TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
@@ -90,8 +91,9 @@ POSITIVE = (
 class Vehicle:
     """A car that the multi-body plant can drive; ``relaxation`` [m] is of its tyres.
 
-    ``overrides`` replace the published values, by the library's names; a mapping inside it replaces values of a group (``tire``,
-    ``tire_rear``, ``steering``, ``longitudinal``). `ConfigurationError` for an unknown set or parameter, or what is no finite number.
+    ``overrides`` replace the published values, by the library's names; a mapping inside it replaces
+    values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
+    `ConfigurationError` for an unknown set or parameter, or what is no finite number.
     """
 
     name: str  # in recordings
@@ -121,26 +123,32 @@ class Vehicle:
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver``
+    and ``relaxation`` (front, rear).
 
-    Raises `ConfigurationError` where a key is missing or unknown, or a value of the wrong type, and as `Vehicle` does.
+    Raises
+    ------
+    ConfigurationError
+        Where a key is missing or unknown, or a value of the wrong type, and as `Vehicle` does.
     """
-    given = {key: value for key, value in configuration.items() if value is not None}
-    where = f"vehicle '{configuration.get('name')}'"
-    lengths = given.pop("relaxation", {})
+    values = {key: value for key, value in configuration.items() if value is not None}
+    label = f"vehicle '{configuration.get('name')}'"
+    lengths = values.pop("relaxation", {})
     if not isinstance(lengths, Mapping) or set(lengths) - {"front", "rear"}:
         raise ConfigurationError(
-            f"{where}: relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}"
+            f"{label}: relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}"
         )
-    given["relaxation"] = [lengths.get("front", 0.0), lengths.get("rear", 0.0)]
-    return validated(Vehicle, given, where, error=ConfigurationError)
+    values["relaxation"] = [lengths.get("front", 0.0), lengths.get("rear", 0.0)]
+    return validated(Vehicle, values, label, error=ConfigurationError)
 
 
 def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
-    """The vehicle with a payload [kg], a point mass that its springs carry ``forward`` and ``up`` of the centre of gravity [m].
+    """The vehicle with a payload [kg], a point mass that its springs carry ``forward`` and ``up``
+    of the centre of gravity [m].
 
-    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan. Without a mass it is the
-    same vehicle. Raises `ConfigurationError`: it is negative, or an axle would carry nothing.
+    Unsprung masses are shared anew between the axles, so that body and car keep one centre of
+    gravity in plan. Without a mass it is the same vehicle. Raises `ConfigurationError`: it is
+    negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle
@@ -170,17 +178,19 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
 
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
-    """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh one at every call."""
+    """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh
+    one at every call.
+    """
     if vehicle.parameter_set not in PUBLISHED_SETS:
-        known = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
+        published_sets = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
+            f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {published_sets}"
         )
     parameters = deepcopy(_published(vehicle.parameter_set))
-    known_to_library = {
+    library_overrides = {
         name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE
     }
-    _override(parameters, known_to_library, vehicle.name, prefix="")
+    _override(parameters, library_overrides, vehicle.name, prefix="")
     return parameters
 
 
@@ -215,21 +225,21 @@ def _override(
     parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str
 ) -> None:
     for name, value in overrides.items():
-        where = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
+        label = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
         if name not in _field_names(type(parameters)):
-            known = ", ".join(_field_names(type(parameters)))
+            names = ", ".join(_field_names(type(parameters)))
             raise ConfigurationError(
-                f"{where} names no parameter of the plant; known ones: {known}"
+                f"{label} names no parameter of the plant; known ones: {names}"
             )
         is_group = is_dataclass(getattr(parameters, name))
         if is_group != isinstance(value, Mapping):
             raise ConfigurationError(
-                f"{where} must be {'a mapping' if is_group else 'a number'}, not {value!r}"
+                f"{label} must be {'a mapping' if is_group else 'a number'}, not {value!r}"
             )
         if is_group:
             _override(getattr(parameters, name), value, vehicle_name, prefix=f"{prefix}{name}.")
             continue
-        _require_number(where, value)
+        _require_number(label, value)
         setattr(parameters, name, float(value))
 
 
@@ -238,13 +248,13 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _require_number(where: str, value: Any) -> None:
+def _require_number(label: str, value: Any) -> None:
     if not is_number(value):
-        raise ConfigurationError(f"{where} must be a finite number, not {value!r}")
+        raise ConfigurationError(f"{label} must be a finite number, not {value!r}")
 
 
-def _as_values(values_class: Any, parameters: Any, **others: Any) -> Any:
-    values = dict(others)
+def _as_values(values_class: Any, parameters: Any, **preset: Any) -> Any:
+    values = dict(preset)
     for name in values_class._fields:
         if name in values:
             continue

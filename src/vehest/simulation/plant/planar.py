@@ -1,16 +1,19 @@
 """The planar plant: a small four-wheel-drive car on a level floor, from standstill through spins.
 
-A double track with four wheels that turn by themselves, combined slip and relaxation at each tyre, load transfer in both directions, and
-one electric motor that drives all wheels through three differentials. The multi-body plant of ``plant`` has no equations for a car that
-slides sideways and drives on; this one has no regimes.
+A double track with four wheels that turn by themselves, combined slip and relaxation at each tyre,
+load transfer in both directions, and one electric motor that drives all wheels through three
+differentials. The multi-body plant of ``plant`` has no equations for a car that slides sideways and
+drives on; this one has no regimes.
 
-Tyres: magic formula without curvature of the combined slip, F = μ F_z sin(C atan(B s)) along the slip (Pacejka, Tire and Vehicle
-Dynamics, 2012, Sections 4.2 and 4.3, with the same slip stiffness in both directions). Slips are divided by
-V = max(|V_x|, |ω|R, SLOWEST): at a spinning, locked or standing wheel they stay finite. They follow their steady values over a relaxation
-length σ, ds/dt = V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding tyre's carcass bends no further;
-a share of the difference acts at once, as a carcass's damping does.
+Tyres: magic formula without curvature of the combined slip, F = μ F_z sin(C atan(B s)) along the
+slip (Pacejka, Tire and Vehicle Dynamics, 2012, Sections 4.2 and 4.3, with the same slip stiffness
+in both directions). Slips are divided by V = max(|V_x|, |ω|R, SLOWEST): at a spinning, locked or
+standing wheel they stay finite. They follow their steady values over a relaxation length σ, ds/dt =
+V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding tyre's
+carcass bends no further; a share of the difference acts at once, as a carcass's damping does.
 
-Motor: J dω/dt = K I - b0 sign(ω) - b1 ω - R ΣF_x on the mean speed of the wheels, the powertrain of Eq. 2 of Węgrzynowski et al. 2024.
+Motor: J dω/dt = K I - b0 sign(ω) - b1 ω - R ΣF_x on the mean speed of the wheels, the powertrain of
+Eq. 2 of Węgrzynowski et al. 2024.
 """
 
 from __future__ import annotations
@@ -28,12 +31,15 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
 
-SLOWEST = 0.3  # speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper, not a spring
-STICTION_SPEED = (
-    1.0  # speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
-)
+# speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper,
+# not a spring
+SLOWEST = 0.3
+# speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
+STICTION_SPEED = 1.0
 
-SHORTEST = 0.2  # share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step
+# share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones
+# need a smaller step
+SHORTEST = 0.2
 
 X, Y, YAW, VX, VY, YAW_RATE = range(6)
 FIRST_WHEEL = 6
@@ -59,8 +65,10 @@ def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type: ignore[no-untyped-def]
-    """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its load."""
+def _derivative(state, target_steer, target_current, scale, p, forces):  # type: ignore[no-untyped-def]
+    """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its
+    load.
+    """
     rate = np.empty(N_STATES)
     vx = state[VX]
     vy = state[VY]
@@ -152,27 +160,29 @@ def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type:
     rate[VY] = ay - vx * yaw_rate
     rate[LOAD_AX] = (ax - state[LOAD_AX]) / p.load_time
     rate[LOAD_AY] = (ay - state[LOAD_AY]) / p.load_time
-    turning = (min(max(wanted_steer, -p.largest_steer), p.largest_steer) - steer) / p.steering_time
+    turning = (min(max(target_steer, -p.largest_steer), p.largest_steer) - steer) / p.steering_time
     rate[STEER] = min(max(turning, -p.steering_rate), p.steering_rate)
     rate[CURRENT] = (
-        min(max(wanted_current, -p.largest_current), p.largest_current) - current
+        min(max(target_current, -p.largest_current), p.largest_current) - current
     ) / p.current_time
     return rate
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # type: ignore[no-untyped-def]
-    """The state (22,) after n_steps steps of a Runge-Kutta method of fourth order with constant inputs."""
+def _advance(state, target_steer, target_current, scale, p, step, n_steps):  # type: ignore[no-untyped-def]
+    """The state (22,) after n_steps steps of a Runge-Kutta method of fourth order with constant
+    inputs.
+    """
     forces = np.empty((4, 3))
     for _ in range(n_steps):
-        first = _derivative(state, wanted_steer, wanted_current, scale, p, forces)
+        first = _derivative(state, target_steer, target_current, scale, p, forces)
         second = _derivative(
-            state + 0.5 * step * first, wanted_steer, wanted_current, scale, p, forces
+            state + 0.5 * step * first, target_steer, target_current, scale, p, forces
         )
         third = _derivative(
-            state + 0.5 * step * second, wanted_steer, wanted_current, scale, p, forces
+            state + 0.5 * step * second, target_steer, target_current, scale, p, forces
         )
-        fourth = _derivative(state + step * third, wanted_steer, wanted_current, scale, p, forces)
+        fourth = _derivative(state + step * third, target_steer, target_current, scale, p, forces)
         state = state + step / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
     return state
 
@@ -202,12 +212,16 @@ class PlanarPlant:
         return state
 
     def derivative(self, state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-        """Rate of change of the state, (22,), and each tyre's force along and across the body and its load [N], (4, 3)."""
+        """Rate of change of the state, (22,), and each tyre's force along and across the body and
+        its load [N], (4, 3).
+        """
         forces = np.empty((4, 3))
         return _derivative(state, *map(float, inputs), self._values, forces), forces
 
     def advance(self, state: FloatArray, inputs: Inputs, n_steps: int) -> FloatArray:
-        """The state after some steps with constant inputs, (22,); raises `SimulationError` where a state is not finite."""
+        """The state after some steps with constant inputs, (22,); raises `SimulationError` where a
+        state is not finite.
+        """
         after: FloatArray = _advance(state, *map(float, inputs), self._values, self.step, n_steps)
         if not np.isfinite(after).all():
             raise SimulationError(
@@ -222,11 +236,11 @@ class PlanarPlant:
         """Motion from the states (22,) and the inputs at each sample."""
         values = np.array(states)
         car = self.car
-        found = [
+        derivatives = [
             self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)
         ]
-        rates = np.array([rate for rate, _ in found])
-        forces = np.array([force for _, force in found])
+        rates = np.array([rate for rate, _ in derivatives])
+        forces = np.array([force for _, force in derivatives])
         level = np.zeros(len(values))
         wheel_speed = values[:, FIRST_WHEEL : FIRST_WHEEL + len(WHEELS)]
         return Motion(

@@ -16,7 +16,9 @@ ZeroOrPositive = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 PLANAR = "planar"
-"""Value of ``plant`` in a vehicle's configuration that selects this plant; without it the vehicle is the multi-body plant's."""
+"""Value of ``plant`` in a vehicle's configuration that selects this plant; without it the vehicle
+is the multi-body plant's.
+"""
 
 
 @dataclass(frozen=True)
@@ -90,15 +92,19 @@ class PlanarVehicle:
 
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:
-    """A car from the keys ``name``, ``plant`` and ``parameters``; raises `ConfigurationError` where one is missing, unknown or wrong."""
-    whole = validated(
+    """A car from the keys ``name``, ``plant`` and ``parameters``; raises `ConfigurationError` where
+    one is missing, unknown or wrong.
+    """
+    vehicle = validated(
         PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError
     )
-    return _checked(whole.name, whole.parameters)
+    return _checked(vehicle.name, vehicle.parameters)
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
-    """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no parameter or a value makes no sense."""
+    """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no
+    parameter or a value makes no sense.
+    """
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
         raise ConfigurationError(

@@ -1,7 +1,7 @@
 """Regimes of the plant beside the multi-body equations: near standstill, and in a spin.
 
-Three regimes share one state vector and one set of suspension equations; they differ in the forces of the tyres and
-in how the planar motion follows.
+Three regimes share one state vector and one set of suspension equations; they differ in the forces
+of the tyres and in how the planar motion follows.
 
 - ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with 1/vx.
 - SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels (kinematic single track).
@@ -33,14 +33,23 @@ class Regime(IntEnum):
 
 ROLLING, SLOW, SLIDING = (int(regime) for regime in Regime)
 
-SLOW_BELOW = 1.0  # forward speed below which the car no longer slips [m/s]; assumed. The lateral dynamics are faster than 5 ms there
-ROLLING_ABOVE = 1.2  # forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime does not flutter
-SLOW_TOLERANCE = 0.5  # how far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to follow; assumed
+# forward speed below which the car no longer slips [m/s]; assumed. The lateral dynamics are faster
+# than 5 ms there
+SLOW_BELOW = 1.0
+# forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime
+# does not flutter
+ROLLING_ABOVE = 1.2
+# how far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to
+# follow; assumed
+SLOW_TOLERANCE = 0.5
 SPUN_SIDESLIP = math.radians(60.0)
-"""Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to far smaller angles."""
-STANDING = 0.02  # speed [m/s] and yaw rate [rad/s] below which a slide has ended; assumed
+"""Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to
+far smaller angles.
+"""
+STANDSTILL_LIMIT = 0.02  # speed [m/s] and yaw rate [rad/s] below which a slide has ended; assumed
 SLIDING_SMOOTHING = 0.05  # speed over which Coulomb friction changes sign [m/s]; assumed
-RELAXATION = 0.05  # time constant with which SLOW takes over the lateral motion that ROLLING left [s]; assumed
+# time constant with which SLOW takes over the lateral motion that ROLLING left [s]; assumed
+RELAXATION = 0.05
 WHEEL_RELAXATION = 0.02  # time constant of wheels that start to roll freely, or lock [s]; assumed
 SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes use of; assumed
 
@@ -48,7 +57,9 @@ SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
 VY_FRONT = 15
 VY_REAR = 20
-FIRST_WHEEL = 23  # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names
+# places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear,
+# right rear by its names
+FIRST_WHEEL = 23
 
 _kernel = numba.njit(
     error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
@@ -71,19 +82,21 @@ def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
     elif regime == SLOW:
         if vx > ROLLING_ABOVE:
             return ROLLING
-    elif math.sqrt(vx**2 + vy**2) < STANDING and abs(yaw_rate) < STANDING:
+    elif math.sqrt(vx**2 + vy**2) < STANDSTILL_LIMIT and abs(yaw_rate) < STANDSTILL_LIMIT:
         return SLOW
     return regime
 
 
 @_kernel
 def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[no-untyped-def]
-    """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes or a slope hold it."""
+    """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes
+    or a slope hold it.
+    """
     wheelbase = p.a + p.b
-    least = _adhesion(p, p.T_sb)
-    most = _adhesion(p, p.T_se)
-    wanted = min(max(acceleration, -least), most) + inputs[3]
-    change = wanted * p.m / (p.m + 4.0 * p.I_y_w / p.R_w**2)
+    max_braking = _adhesion(p, p.T_sb)
+    max_driving = _adhesion(p, p.T_se)
+    demanded = min(max(acceleration, -max_braking), max_driving) + inputs[3]
+    change = demanded * p.m / (p.m + 4.0 * p.I_y_w / p.R_w**2)
     if x[VX] <= 0.0 and change <= 0.0:
         change = 0.0
     tangent = math.tan(x[STEER])
@@ -118,24 +131,31 @@ def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
 def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[no-untyped-def]
     """Longitudinal and lateral forces of the four tyres in the wheels' axes.
 
-    Args:
-        contact: regime, inputs of the plant, friction of sliding front and rear tyres, whether lateral forces lag, and eight lateral forces
-            over load: the four that the tyres hold now, which are taken, and room for those they tend to.
-        x: state.
-        u: steering velocity and acceleration within the vehicle's limits.
-        p: parameters.
-        along, across, loads: longitudinal and lateral forces of the tyre formulas and wheel loads, four each.
+    Parameters
+    ----------
+    contact
+        Regime, inputs of the plant, friction of sliding front and rear tyres, whether lateral
+        forces lag, and eight lateral forces over load: the four that the tyres hold now, which are
+        taken, and room for those they tend to.
+    x
+        State.
+    u
+        Steering velocity and acceleration within the vehicle's limits.
+    p
+        Parameters.
+    along, across, loads
+        Longitudinal and lateral forces of the tyre formulas and wheel loads, four each.
     """
-    regime, inputs, friction_front, friction_rear, lags, held = contact
+    regime, inputs, friction_front, friction_rear, lags, lateral_ratio = contact
     if regime == ROLLING and lags:
         for i in range(4):
-            held[4 + i] = across[i] / loads[i]
+            lateral_ratio[4 + i] = across[i] / loads[i]
         return (
             *along,
-            held[0] * loads[0],
-            held[1] * loads[1],
-            held[2] * loads[2],
-            held[3] * loads[3],
+            lateral_ratio[0] * loads[0],
+            lateral_ratio[1] * loads[1],
+            lateral_ratio[2] * loads[2],
+            lateral_ratio[3] * loads[3],
         )
     if regime == ROLLING:
         return *along, *across
@@ -172,7 +192,9 @@ def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[n
 
 @_kernel
 def _adhesion(p, front_share):  # type: ignore[no-untyped-def]
-    """Largest acceleration [m/s²] whose torque, split in this way, neither axle's static load fails to carry."""
+    """Largest acceleration [m/s²] whose torque, split in this way, neither axle's static load fails
+    to carry.
+    """
     wheelbase = p.a + p.b
     front = p.tire.p_dx1 * p.b / wheelbase / max(front_share, 1e-9)
     rear = p.tire_rear.p_dx1 * p.a / wheelbase / max(1.0 - front_share, 1e-9)

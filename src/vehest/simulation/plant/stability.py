@@ -1,8 +1,10 @@
-"""Stability control: a yaw moment by braking one side, when the car does not yaw as its driver asks.
+"""Stability control: a yaw moment by braking one side, when the car does not yaw as its driver
+asks.
 
-The reference is the steady yaw rate of a linear single track at this steering angle, limited by friction
-at this speed and delayed as a car answers (e.g. Rajamani, "Vehicle Dynamics and Control", chapter on electronic
-stability control). The control acts between two thresholds of the yaw rate's error, with hysteresis.
+The reference is the steady yaw rate of a linear single track at this steering angle, limited by
+friction at this speed and delayed as a car answers (e.g. Rajamani, "Vehicle Dynamics and Control",
+chapter on electronic stability control). The control acts between two thresholds of the yaw rate's
+error, with hysteresis.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ class StabilityControl:
     grip: float  # lateral acceleration that friction allows on a dry road [m/s²]
     largest_moment: float  # that braking one side may give on a dry road [N m]
     # moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms, and cars get all of the moment at about
-    # 7 degrees a second. With half of it, a car whose rear slides is lost before the brakes are fully on.
+    # 7 degrees a second. With half of it, a car whose rear slides is lost before the brakes are
+    # fully on.
     gain: float = 20.0
     on_above: float = 0.07  # error of the yaw rate at which it intervenes [rad/s]; assumed
     off_below: float = 0.03  # error at which it lets go again [rad/s]; assumed
@@ -52,13 +55,17 @@ class StabilityControl:
         yaw_rate: float,
         friction: float = 1.0,
     ) -> StabilityState:
-        """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as far as the control knows it."""
+        """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as
+        far as the control knows it.
+        """
         if vx < self.slowest:
             return StabilityState(reference=yaw_rate)
-        wanted = vx * steer / (self.wheelbase + self.understeer_gradient * vx**2)
+        target_yaw_rate = vx * steer / (self.wheelbase + self.understeer_gradient * vx**2)
         allowed = friction * self.grip / vx
-        wanted = max(-allowed, min(allowed, wanted))
-        reference = wanted + (before.reference - wanted) * math.exp(-interval / self.lag)
+        target_yaw_rate = max(-allowed, min(allowed, target_yaw_rate))
+        reference = target_yaw_rate + (before.reference - target_yaw_rate) * math.exp(
+            -interval / self.lag
+        )
         error = reference - yaw_rate
         active = abs(error) > (self.off_below if before.active else self.on_above)
         limit = friction * self.largest_moment
@@ -69,8 +76,8 @@ class StabilityControl:
 def stability_control(plant: MultiBodyPlant) -> StabilityControl:
     """A control for this car, from its parameters.
 
-    Its largest moment is that of one side's friction under its static load. A side that is braked against a spin carries more;
-    the rest is left for cornering.
+    Its largest moment is that of one side's friction under its static load. A side that is braked
+    against a spin carries more; the rest is left for cornering.
     """
     parameters = plant.parameters
     cornering_front = abs(parameters.tire.p_ky1)

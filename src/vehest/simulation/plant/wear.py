@@ -13,7 +13,8 @@ Share = Annotated[float, Field(ge=0.0, le=0.5)]
 
 @dataclass(frozen=True)
 class Stint:
-    """Friction of the tyres over the time of a drive, over that of warm, new tyres; all values are assumed.
+    """Friction of the tyres over the time of a drive, over that of warm, new tyres; all values are
+    assumed.
 
     factor(t) = (1 - cold exp(-t/warm_time)) (1 - wear min(t/wear_time, 1))
     """

@@ -20,7 +20,9 @@ SPACING = 1.0  # of the samples of a course at most [m]
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A closed centre line, sampled from arc length 0 to the full length; first and last sample are the same place."""
+    """A closed centre line, sampled from arc length 0 to the full length; first and last sample are
+    the same place.
+    """
 
     name: str  # in recordings
     arc_length: FloatArray  # (N,) [m], uniform
@@ -46,11 +48,14 @@ class Course:
 def build_course(name: str, layout: Layout) -> Course:
     """A closed course from its segments, starting at the origin along the x axis.
 
-    The corners are kept as they are and must turn by a full circle in total; the course is closed by the smallest
-    change, in the sum of squares, of the lengths of its straights.
+    The corners are kept as they are and must turn by a full circle in total; the course is closed
+    by the smallest change, in the sum of squares, of the lengths of its straights.
 
-    Raises `ConfigurationError`: the corners do not add up to a circle, a corner is too short for its clothoids, or a straight would have to
-    become negative.
+    Raises
+    ------
+    ConfigurationError
+        The corners do not add up to a circle, a corner is too short for its clothoids, or a
+        straight would have to become negative.
     """
     for segment in layout.segments:
         if isinstance(segment, Corner | Compound) and segment.arc < 0:
@@ -65,7 +70,9 @@ def build_course(name: str, layout: Layout) -> Course:
 
 @cache
 def course_by_name(name: str) -> Course:
-    """One of the courses of the proving ground; raises `ConfigurationError` where there is no such course."""
+    """One of the courses of the proving ground; raises `ConfigurationError` where there is no such
+    course.
+    """
     if name not in LAYOUTS:
         raise ConfigurationError(
             f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}"
@@ -149,7 +156,9 @@ def _friction(patches: Sequence[tuple[float, float, float]], arc_length: FloatAr
 
 
 class _HeadingProfile:
-    """Heading [rad] as a function of arc length: the exact integral of a piecewise linear curvature."""
+    """Heading [rad] as a function of arc length: the exact integral of a piecewise linear
+    curvature.
+    """
 
     def __init__(self, nodes: FloatArray, curvatures: FloatArray) -> None:
         self._nodes = nodes

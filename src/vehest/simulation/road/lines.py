@@ -15,7 +15,9 @@ from vehest.constants import FloatArray
 SPACING = 0.5  # of the samples of a line [m]
 CLEARANCE = 0.15  # room between the car and a cone [m]; assumed
 _KNOTS = 1.5  # spacing of the points that are sought for the smoothest line [m]
-_SMOOTH = 6.0  # length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s
+# length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth
+# of a second at 30 m/s
+_SMOOTH = 6.0
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,13 @@ class Line:
 
 @lru_cache(maxsize=64)
 def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: float) -> Line:
-    """The smoothest line along the x axis that takes a car of a width [m] through gates, in the order of the axis.
+    """The smoothest line along the x axis that takes a car of a width [m] through gates, in the
+    order of the axis.
 
-    It makes the sum of the squares of the curvature, and of its change, as small as the gates allow; in and out it runs straight along the
-    axis, over ``run_in`` before the first gate and the last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends
-    swing out a little where the line turns, is covered by the clearance.
+    It makes the sum of the squares of the curvature, and of its change, as small as the gates
+    allow; in and out it runs straight along the axis, over ``run_in`` before the first gate and the
+    last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends swing out a
+    little where the line turns, is covered by the clearance.
     """
     begin = gates[0].begin - run_in
     end = gates[-1].end + run_out
@@ -58,7 +62,8 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     lower = np.full(len(places), -np.inf)
     upper = np.full(len(places), np.inf)
     for gate in gates:
-        # A gate holds at its ends too, which lie between two points: the nearest points outside them count as inside.
+        # A gate holds at its ends too, which lie between two points: the nearest points outside
+        # them count as inside.
         inside = (places > gate.begin - 0.75 * _KNOTS) & (places < gate.end + 0.75 * _KNOTS)
         lower[inside] = np.maximum(lower[inside], gate.right + room)
         upper[inside] = np.minimum(upper[inside], gate.left - room)
@@ -78,11 +83,15 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
 
 
 def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """The vector y (N,) within bounds (N,) for which yᵀ·stiffness·y is least, by the alternating direction method of multipliers.
+    """The vector y (N,) within bounds (N,) for which yᵀ·stiffness·y is least, by the alternating
+    direction method of multipliers.
 
-    Args:
-        stiffness: (N, N), positive definite with at most three diagonals beside the main one.
-        lower, upper: (N,), infinite where y is free. They may be exceeded by ``_TOLERANCE``.
+    Parameters
+    ----------
+    stiffness : FloatArray
+        (N, N), positive definite with at most three diagonals beside the main one.
+    lower, upper : FloatArray
+        (N,), infinite where y is free. They may be exceeded by ``_TOLERANCE``.
     """
     bounded = (np.isfinite(lower) | np.isfinite(upper)).astype(np.float64)
     system = stiffness + _PENALTY * np.diag(bounded)
@@ -128,16 +137,19 @@ def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) 
 
 
 def circle(radius: float, side: float, run_in: float, length: float, transition: float) -> Line:
-    """A straight of ``run_in``, a clothoid of ``transition``, and a circle for the rest of ``length`` [m]; ``side`` 1: left, -1: right."""
+    """A straight of ``run_in``, a clothoid of ``transition``, and a circle for the rest of
+    ``length`` [m]; ``side`` 1: left, -1: right.
+    """
     distance = np.arange(0.0, run_in + transition + length, SPACING)
     curvature = side / radius * np.clip((distance - run_in) / transition, 0.0, 1.0)
-    beyond = np.clip(distance - run_in, 0.0, transition)
+    into_transition = np.clip(distance - run_in, 0.0, transition)
     heading = (
         side
         / radius
-        * (0.5 * beyond**2 / transition + np.maximum(distance - run_in - transition, 0.0))
+        * (0.5 * into_transition**2 / transition + np.maximum(distance - run_in - transition, 0.0))
     )
-    # Simpson's rule over each sample; the heading between two samples is taken as linear, as good as exact at this spacing.
+    # Simpson's rule over each sample; the heading between two samples is taken as linear, as good
+    # as exact at this spacing.
     half = 0.5 * (heading[1:] + heading[:-1])
     x, y = (
         np.concatenate(

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 Piece = tuple[
     float, float, float
-]  # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are linear
+    # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are
+    # linear
+]
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class Corner:
 
     @property
     def arc(self) -> float:
-        """Length of the circular part [m]; each clothoid turns by half its length times the arc's curvature."""
+        """Length of the circular part [m]; each clothoid turns by half its length times the arc's
+        curvature.
+        """
         return abs(self.angle) * self.radius - self.transition
 
     def pieces(self) -> list[Piece]:
@@ -64,7 +68,10 @@ class Compound:
 
     Each part turns by its own angle, half of the clothoids on either side included.
 
-    Raises `ValueError`: the parts do not agree.
+    Raises
+    ------
+    ValueError
+        The parts do not agree.
     """
 
     parts: tuple[Corner, ...]  # corners to the same side, with the same transition

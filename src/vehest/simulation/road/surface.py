@@ -21,10 +21,14 @@ _STREAM = 2  # of a drive's seed; 0 is the driver's, 1 the sensors'
 class Surface:
     """Friction of a road.
 
-    Either one scale all along or, with ``patches``, patches of which each has a scale drawn between ``patches`` and ``friction``,
-    uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
+    Either one scale all along or, with ``patches``, patches of which each has a scale drawn between
+    ``patches`` and ``friction``, uniformly, and a length drawn from ``patch_length``, uniformly.
+    Friction changes over two metres between them.
 
-    Raises `ConfigurationError`: a scale is outside 0.05 … 1.5 or a length makes no sense.
+    Raises
+    ------
+    ConfigurationError
+        A scale is outside 0.05 … 1.5 or a length makes no sense.
     """
 
     name: str = "dry"  # in recordings
@@ -53,8 +57,8 @@ class Surface:
     ) -> FloatArray:
         """Scale at each distance along the way, (N,) [m], zero or positive, uniform.
 
-        The drive's seed draws the patches if the surface has none of its own; after a lap's ``length`` [m] the same come again, by default
-        never.
+        The drive's seed draws the patches if the surface has none of its own; after a lap's
+        ``length`` [m] the same come again, by default never.
         """
         if self.patches is None:
             return np.full(distance.shape, self.friction)
@@ -84,11 +88,15 @@ SURFACES: dict[str, Surface] = {
     "wet": Surface("wet", 0.7),
     "patchy": Surface("patchy", 1.0, patches=0.5),
 }
-"""Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's friction, puddles or gravel half."""
+"""Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's
+friction, puddles or gravel half.
+"""
 
 
 def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surface:
-    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road; raises `ConfigurationError` otherwise."""
+    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road;
+    raises `ConfigurationError` otherwise.
+    """
     if configuration is None:
         return SURFACES["dry"]
     if isinstance(configuration, str):

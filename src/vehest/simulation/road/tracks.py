@@ -72,8 +72,9 @@ VAIRANO_LIKE = Layout(
 )
 """A handling course of 2.5 km in the manner of Vairano, Italy.
 
-From Di Biase et al. 2020 are the length, the section with corners both ways at the beginning of the lap, the long straight and the
-hairpin before the main straight. Radii, angles and the crossfall (for drainage) are assumed.
+From Di Biase et al. 2020 are the length, the section with corners both ways at the beginning of the
+lap, the long straight and the hairpin before the main straight. Radii, angles and the crossfall
+(for drainage) are assumed.
 """
 
 PALM_BEACH_LIKE = Layout(
@@ -96,12 +97,14 @@ PALM_BEACH_LIKE = Layout(
     ),
     heights=((0.0, 0.0), (0.3, 0.8), (0.55, -0.6), (0.8, 0.4)),
 )
-"""A race circuit of 3.28 km and 11 turns in the manner of Palm Beach International Raceway, Florida.
+"""A race circuit of 3.28 km and 11 turns in the manner of Palm Beach International Raceway,
+Florida.
 
-Order, angles and radii of the corners were read off the path of a recording made there (Revs Vehicle Dynamics Database, 20140222_01_01_03,
-a Ferrari 250 LM), then widened by a few metres for the road's centre line to close at the published length of 3.288 km. The straight of
-six tenths of a mile and the one corner with 6° of bank are as drivers describe the circuit; which corner it is, the other banks and the
-heights of an almost level country are assumed.
+Order, angles and radii of the corners were read off the path of a recording made there (Revs
+Vehicle Dynamics Database, 20140222_01_01_03, a Ferrari 250 LM), then widened by a few metres for
+the road's centre line to close at the published length of 3.288 km. The straight of six tenths of a
+mile and the one corner with 6° of bank are as drivers describe the circuit; which corner it is, the
+other banks and the heights of an almost level country are assumed.
 """
 
 FAST_CIRCUIT = Layout(
@@ -149,7 +152,9 @@ HILL_CIRCUIT = Layout(
     ),
     heights=((0.0, 0.0), (0.2, 12.0), (0.5, -8.0), (0.75, 5.0)),
 )
-"""An anticlockwise race circuit of 3.7 km up and down a hill, like no particular one; all values are assumed."""
+"""An anticlockwise race circuit of 3.7 km up and down a hill, like no particular one; all values
+are assumed.
+"""
 
 LAYOUTS: dict[str, Layout] = {
     "handling": HANDLING,

@@ -1,4 +1,6 @@
-"""Errors of a sensor: delay, scale, offset, drift, noise and quantisation, each from a random stream of its own."""
+"""Errors of a sensor: delay, scale, offset, drift, noise and quantisation, each from a random
+stream of its own.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,12 @@ from vehest.simulation.sensors.levels import SensorLevel
 STREAM = 1  # first spawn key of all sensor errors; 0 is the driver's
 
 
-def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str) -> FloatArray:
-    """Signal of a sensor for a true one, (T,), uniformly sampled; the sensor's name and the kind of error choose the random stream."""
+def sensor_signal(
+    true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str
+) -> FloatArray:
+    """Signal of a sensor for a true one, (T,), uniformly sampled; the sensor's name and the kind of
+    error choose the random stream.
+    """
     value = delayed(true, level.delay * rate_hz)
     if level.gain:
         value = value * (1.0 + level.gain)
@@ -48,15 +54,15 @@ def stream(seed: int, name: str) -> np.random.Generator:
 def delayed(samples: FloatArray, delay: float) -> FloatArray:
     """Samples (T,) as they were ``delay`` samples ago, held before the first one.
 
-    Between samples by the cubic through the four nearest (Lagrange): half way between two, a sine of a tenth of the sampling rate
-    loses 0.4 % of its amplitude and nothing of its phase.
+    Between samples by the cubic through the four nearest (Lagrange): half way between two, a sine
+    of a tenth of the sampling rate loses 0.4 % of its amplitude and nothing of its phase.
     """
     if delay == 0.0:
         return samples
     n_samples = len(samples)
-    whole = min(math.floor(delay), n_samples)
+    delay_samples = min(math.floor(delay), n_samples)
     u = 1.0 - (delay - math.floor(delay))  # of the way from the older to the younger neighbour
-    padded = np.concatenate([np.full(whole + 2, samples[0]), samples, samples[-1:]])
+    padded = np.concatenate([np.full(delay_samples + 2, samples[0]), samples, samples[-1:]])
     oldest, older, younger, youngest = (padded[first : first + n_samples] for first in range(4))
     if u == 1.0:
         return younger.copy()
@@ -69,7 +75,9 @@ def delayed(samples: FloatArray, delay: float) -> FloatArray:
 
 
 def _gauss_markov(generator: np.random.Generator, n_samples: int, correlation: float) -> FloatArray:
-    """Unit-variance first-order Gauss-Markov process of a correlation time in samples, (n_samples,)."""
+    """Unit-variance first-order Gauss-Markov process of a correlation time in samples,
+    (n_samples,).
+    """
     keep = math.exp(-1.0 / correlation)
     step = math.sqrt(-math.expm1(-2.0 / correlation))
     driven = step * generator.standard_normal(n_samples)

@@ -11,7 +11,9 @@ from vehest.data.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Errors:
-    """Sizes of errors, which are finite and, but for the ``signed`` ones, not negative; raises `ConfigurationError` otherwise."""
+    """Sizes of errors, which are finite and, but for the ``signed`` ones, not negative; raises
+    `ConfigurationError` otherwise.
+    """
 
     signed: ClassVar[tuple[str, ...]] = ()
 
@@ -29,12 +31,17 @@ class SensorLevel(Errors):
 
     shown = quantise((1 + gain) (1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
 
-    Gain and bias belong to the car, the same in each of its drives; scale, offset, drift and noise are drawn.
+    Gain and bias belong to the car, the same in each of its drives; scale, offset, drift and noise
+    are drawn.
 
-    Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
-    samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
+    Noise is a density, so that a level means the same at every sampling rate: a sensor that is
+    low-passed at half the sampling rate has samples of standard deviation noise·√(rate/2), which at
+    100 Hz is 7.07 times the density.
 
-    Raises `ConfigurationError`: as `Errors` does, or the correlation time is zero.
+    Raises
+    ------
+    ConfigurationError
+        As `Errors` does, or the correlation time is zero.
     """
 
     signed: ClassVar[tuple[str, ...]] = ("gain", "bias")
@@ -70,7 +77,9 @@ class Mounting(Errors):
 
 @dataclass(frozen=True)
 class Tilt(Errors):
-    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others are zero."""
+    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others
+    are zero.
+    """
 
     signed: ClassVar[tuple[str, ...]] = ("roll_share",)
     roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
@@ -83,7 +92,9 @@ class Tilt(Errors):
 
 @dataclass(frozen=True)
 class Vibration(Errors):
-    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean speed."""
+    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean
+    speed.
+    """
 
     yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
     ax: float = 0.0  # the same [m/s² per rad/s]
@@ -92,12 +103,17 @@ class Vibration(Errors):
 
 @dataclass(frozen=True)
 class Reference(Errors):
-    """The sensor that gives vx_ref, vy_ref, yaw_rate_ref and, as atan2(vy_ref, vx_ref), sideslip_ref.
+    """The sensor that gives vx_ref, vy_ref, yaw_rate_ref and, as atan2(vy_ref, vx_ref),
+    sideslip_ref.
 
-    It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to the centre of gravity with its
-    own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
+    It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to
+    the centre of gravity with its own yaw rate and a lever that is known but for ``lever_error``.
+    Roll and pitch rate are left out of that, as is usual.
 
-    Raises `ConfigurationError`: as `Errors` does, or heading has errors without a meaning.
+    Raises
+    ------
+    ConfigurationError
+        As `Errors` does, or heading has errors without a meaning.
     """
 
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
@@ -124,13 +140,16 @@ class Reference(Errors):
 
 GNSS = Reference(
     kind="gnss",
-    # Noise: read off the Ferrari recording, whose reference is of this kind. Drift: the 0.1 km/h of Racelogic's VBOX 3i Dual Antenna
+    # Noise: read off the Ferrari recording, whose reference is of this kind. Drift: the 0.1 km/h of
+    # Racelogic's VBOX 3i Dual Antenna
     # (technical specifications); its correlation time is assumed.
     vx=SensorLevel(noise=0.0017, drift=0.028, drift_time=10.0),
     vy=SensorLevel(noise=0.0020, drift=0.028, drift_time=10.0),
-    # Noise: 0.01 °/s/√Hz, drift: bias stability of 0.0028 °/s, both of Racelogic's VBOX 3iS (technical specifications); time assumed.
+    # Noise: 0.01 °/s/√Hz, drift: bias stability of 0.0028 °/s, both of Racelogic's VBOX 3iS
+    # (technical specifications); time assumed.
     yaw_rate=SensorLevel(noise=1.75e-4, drift=4.9e-5),
-    # 0.1° with antennas 1 m apart (VBOX 3i Dual Antenna) or 2 m apart (OxTS RT user manual: 0.2° per metre); time and share of the
+    # 0.1° with antennas 1 m apart (VBOX 3i Dual Antenna) or 2 m apart (OxTS RT user manual: 0.2°
+    # per metre); time and share of the
     # constant part, which is how well the antennas are aligned with the car, are assumed.
     heading=SensorLevel(offset=0.0010, drift=0.0014, drift_time=30.0),
     lever_error=0.02,  # assumed
@@ -139,7 +158,8 @@ GNSS = Reference(
 
 OPTICAL = Reference(
     kind="optical",
-    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet was available.
+    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet was
+    # available.
     vx=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     vy=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     yaw_rate=SensorLevel(noise=1.75e-4, offset=0.001, delay=0.008),
@@ -148,11 +168,14 @@ OPTICAL = Reference(
     lever_z=-0.2,
     lever_error=0.02,  # assumed
 )
-"""Optical sensor over the road, in the front bumper: more noise, a delay, and errors of the place where it sits."""
+"""Optical sensor over the road, in the front bumper: more noise, a delay, and errors of the place
+where it sits.
+"""
 
 MOTION_CAPTURE = Reference(
     kind="motion_capture",
-    # Second differences of the references of iros_hoons_1 give 0.007 m/s, 0.012 m/s and 0.012 rad/s at 100 Hz, jolts of the car included.
+    # Second differences of the references of iros_hoons_1 give 0.007 m/s, 0.012 m/s and 0.012 rad/s
+    # at 100 Hz, jolts of the car included.
     vx=SensorLevel(noise=0.001),
     vy=SensorLevel(noise=0.001),
     yaw_rate=SensorLevel(noise=0.002),
@@ -177,34 +200,56 @@ _WHEEL_FORCE = SensorLevel(
 
 @dataclass(frozen=True)
 class SensorLevels:
-    """Errors of all sensors of a car; the defaults are those of production sensors, the preset ``default``.
+    """Errors of all sensors of a car; the defaults are those of production sensors, the preset
+    ``default``.
 
-    Each sensor and each kind of error has a random stream of its own: one level changes no other error.
+    Each sensor and each kind of error has a random stream of its own: one level changes no other
+    error.
 
-    Args:
-        vx: of the forward speed, which is the true speed with the errors of an odometer, not computed from the wheels: 0.05 m/s at
-            100 Hz, a step of 0.01 km/h, and the tyre's radius as scale. All assumed.
-        yaw_rate: noise 0.1 °/s at 100 Hz, step 0.01 °/s and scale 3 % at three standard deviations of Bosch's SMI700 (product
-            information). Offset assumed, far inside its ±3 °/s, since control units learn it at standstill. Drift: 2 K of the
-            0.015 °/s/K of Bosch's BMG160 (CISS manual). Delay: of its low-pass at 21 Hz.
-        roll_rate, pitch_rate: as yaw_rate; assumed.
-        ax, ay: noise 6 mg at 100 Hz, step g/5000 and scale 3 % at three standard deviations of Bosch's SMI700. Offset assumed, as that of
-            yaw_rate, far inside its ±50 mg; drift assumed, 1 mg. Delay: of its low-pass at 21 Hz.
-        steer: of the road-wheel angle, from a steering-wheel sensor. Step: the 0.1° of Bosch's LWS 5 over an assumed ratio of
-            16; delay: one message at 100 Hz (LWS 7); noise and offset, which stand for play and compliance, assumed.
-        wheel_speed: of each wheel; scale stands for the tyre's radius, which who uses the speed takes to be known. All assumed.
-        fx, fy, fz: of each wheel. Step: 24 kN over 4000 of A&D's wheel force sensor; the rest assumed, about 0.5 % of that range each.
-            For trucks take more.
-        imu: where yaw_rate, roll_rate, pitch_rate, ax and ay are measured. At the centre of gravity, as control units correct for the
-            place; misalignment 0.2°, assumed.
-        tilt: which angles let gravity in.
-        reference: of the reference channels.
-        motor_speed: of an electric motor, referred to the wheels: all assumed; only cars that have such
-            a motor show it.
-        motor_current: the same; assumed.
-        vibration: of the inertial unit with the wheels' speed; none.
-        speed_of_wheels: the forward speed is what the front wheels' mean speed gives with a radius that fits on the straight, instead of
-            the body's: it errs with steering angle and slip.
+    Parameters
+    ----------
+    vx : SensorLevel
+        Of the forward speed, which is the true speed with the errors of an odometer, not computed
+        from the wheels: 0.05 m/s at 100 Hz, a step of 0.01 km/h, and the tyre's radius as scale.
+        All assumed.
+    yaw_rate : SensorLevel
+        Noise 0.1 °/s at 100 Hz, step 0.01 °/s and scale 3 % at three standard deviations of Bosch's
+        SMI700 (product information). Offset assumed, far inside its ±3 °/s, since control units
+        learn it at standstill. Drift: 2 K of the 0.015 °/s/K of Bosch's BMG160 (CISS manual).
+        Delay: of its low-pass at 21 Hz.
+    roll_rate, pitch_rate : SensorLevel
+        As yaw_rate; assumed.
+    ax, ay : SensorLevel
+        Noise 6 mg at 100 Hz, step g/5000 and scale 3 % at three standard deviations of Bosch's
+        SMI700. Offset assumed, as that of yaw_rate, far inside its ±50 mg; drift assumed, 1 mg.
+        Delay: of its low-pass at 21 Hz.
+    steer : SensorLevel
+        Of the road-wheel angle, from a steering-wheel sensor. Step: the 0.1° of Bosch's LWS 5 over
+        an assumed ratio of 16; delay: one message at 100 Hz (LWS 7); noise and offset, which stand
+        for play and compliance, assumed.
+    wheel_speed : SensorLevel
+        Of each wheel; scale stands for the tyre's radius, which who uses the speed takes to be
+        known. All assumed.
+    fx, fy, fz : SensorLevel
+        Of each wheel. Step: 24 kN over 4000 of A&D's wheel force sensor; the rest assumed, about
+        0.5 % of that range each. For trucks take more.
+    imu : Mounting
+        Where yaw_rate, roll_rate, pitch_rate, ax and ay are measured. At the centre of gravity, as
+        control units correct for the place; misalignment 0.2°, assumed.
+    tilt : Tilt
+        Which angles let gravity in.
+    reference : Reference
+        Of the reference channels.
+    motor_speed : SensorLevel
+        Of an electric motor, referred to the wheels: all assumed; only cars that have such a motor
+        show it.
+    motor_current : SensorLevel
+        The same; assumed.
+    vibration : Vibration
+        Of the inertial unit with the wheels' speed; none.
+    speed_of_wheels : bool
+        The forward speed is what the front wheels' mean speed gives with a radius that fits on the
+        straight, instead of the body's: it errs with steering angle and slip.
     """
 
     vx: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.0028, delay=0.02, scale=0.005)
@@ -253,16 +298,21 @@ def _gyros(level: SensorLevel) -> dict[str, Any]:
     return {"yaw_rate": level, "roll_rate": level, "pitch_rate": level}
 
 
-# The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014, 20140222_01_01_03; its sensors cannot
-# be separated from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
+# The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014,
+# 20140222_01_01_03; its sensors cannot
+# be separated from the car and the road they shake with. What a recording without truth cannot show
+# is assumed, or taken from ``default``.
 RACE = SensorLevels(
     vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
     **_gyros(
         SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)
     ),  # noise and delay read off; offset and scale assumed
-    # Read off but for the scale (assumed). Offset: the mean of what the accelerations lack against the reference's velocities; drift:
-    # what is left of that below 0.5 Hz when delays, white noise and the gravity of roll and pitch are taken out, a banked road included;
-    # its time is known to a factor of two. Delays are known to some 3 ms, by what other bands than 0.2 to 2 Hz give.
+    # Read off but for the scale (assumed). Offset: the mean of what the accelerations lack against
+    # the reference's velocities; drift:
+    # what is left of that below 0.5 Hz when delays, white noise and the gravity of roll and pitch
+    # are taken out, a banked road included;
+    # its time is known to a factor of two. Delays are known to some 3 ms, by what other bands than
+    # 0.2 to 2 Hz give.
     ax=SensorLevel(
         noise=0.088, offset=0.025, drift=0.0153, drift_time=1.8, delay=0.0151, scale=0.003
     ),
@@ -277,11 +327,14 @@ RACE = SensorLevels(
 """A race car of the sixties with good instruments."""
 
 
-# Read off the F1TENTH recordings that the learned-dynamics UKF trains on, iros_hoons_1, where the comment says so: vibration and noise of
-# ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by the motor's speed
+# Read off the F1TENTH recordings that the learned-dynamics UKF trains on, iros_hoons_1, where the
+# comment says so: vibration and noise of
+# ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by
+# the motor's speed
 # (tools/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
-    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which are not measured there.
+    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces,
+    # which are not measured there.
     **_gyros(
         SensorLevel(noise=0.006, offset=0.0065, delay=0.005)
     ),  # noise, offset read off; delay assumed

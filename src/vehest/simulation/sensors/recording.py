@@ -1,6 +1,8 @@
-"""Channels that the simulated sensors show of a true motion, and how provenance describes the sensors.
+"""Channels that the simulated sensors show of a true motion, and how provenance describes the
+sensors.
 
-true motion -> tilt, mounting and vibration of the inertial unit -> errors of each sensor (errors.py), as large as levels.py has them
+true motion -> tilt, mounting and vibration of the inertial unit -> errors of each sensor
+(errors.py), as large as levels.py has them
 """
 
 from __future__ import annotations
@@ -12,17 +14,21 @@ import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.simulation.plant.motion import WHEELS, Motion
-from vehest.simulation.sensors.errors import shown, stream
+from vehest.simulation.sensors.errors import sensor_signal, stream
 from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
 
 OF_MOTOR = ("motor_speed", "motor_current")
 
 
 def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
-    """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
+    """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same
+    arguments give the same samples.
 
-    Args:
-        seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
+    Parameters
+    ----------
+    seed : int
+        Of the errors; each error of each sensor draws from a stream of its own, so that changing
+        one level leaves the rest alone.
     """
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
@@ -32,31 +38,35 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
         "fy": motion.tyre_fy,
         "fz": motion.tyre_fz,
     }
-    felt = [(name, name, values) for name, values in true.items()]
-    felt += [
-        (f"{sensor}_{wheel}", sensor, own)
+    true_signals = [(name, name, values) for name, values in true.items()]
+    true_signals += [
+        (f"{sensor}_{wheel}", sensor, wheel_values)
         for sensor, values in wheels.items()
-        for wheel, own in zip(WHEELS, values.T, strict=True)
+        for wheel, wheel_values in zip(WHEELS, values.T, strict=True)
     ]
-    felt += [
+    true_signals += [
         (name, name, values) for name in OF_MOTOR if (values := getattr(motion, name)) is not None
     ]
     channels = {
-        name: shown(values, getattr(levels, sensor), motion.rate_hz, seed, name)
-        for name, sensor, values in felt
+        name: sensor_signal(values, getattr(levels, sensor), motion.rate_hz, seed, name)
+        for name, sensor, values in true_signals
     }
     return channels | _reference(motion, levels.reference, seed)
 
 
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
-    """Sensors that measured a motion, for provenance; without those of a motor, and a vibration, that are not there."""
-    absent = {name for name in OF_MOTOR if getattr(motion, name) is None}
+    """Sensors that measured a motion, for provenance; without those of a motor, and a vibration,
+    that are not there.
+    """
+    idle_names = {name for name in OF_MOTOR if getattr(motion, name) is None}
     if levels.vibration == Vibration():
-        absent.add("vibration")
+        idle_names.add("vibration")
     if not levels.speed_of_wheels:
-        absent.add("speed_of_wheels")
+        idle_names.add("speed_of_wheels")
     return {
-        name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent
+        name: _without_idle(value)
+        for name, value in asdict(levels).items()
+        if name not in idle_names
     }
 
 
@@ -74,7 +84,9 @@ def _without_idle(value: Any) -> Any:
 
 
 def _speed_of_wheels(motion: Motion) -> FloatArray:
-    """Mean speed of the front wheels times the radius that fits where the car goes straight [m/s], (T,)."""
+    """Mean speed of the front wheels times the radius that fits where the car goes straight [m/s],
+    (T,).
+    """
     turning = motion.wheel_speed[:, :2].mean(axis=1)
     straight = np.abs(motion.steer) <= np.quantile(np.abs(motion.steer), 0.3)
     rolling = float(np.dot(turning[straight], turning[straight]))
@@ -85,10 +97,11 @@ def _speed_of_wheels(motion: Motion) -> FloatArray:
 
 
 def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
-    """Specific force at the centre of gravity in the axes of the tilted body, forward, left and up [m/s²], (3, T).
+    """Specific force at the centre of gravity in the axes of the tilted body, forward, left and up
+    [m/s²], (3, T).
 
-    The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
-    along its vertical axis are left out.
+    The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch,
+    then roll. Accelerations of the body along its vertical axis are left out.
     """
     grade = motion.grade * tilt.grade
     bank = motion.bank * tilt.bank
@@ -105,7 +118,8 @@ def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
 def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
     """Angular velocity about the body's forward, left and upward axes [rad/s], (3, T).
 
-    ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
+    ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns
+    about its own lateral axis.
     """
     roll = motion.roll * tilt.roll
     pitch = motion.pitch * tilt.pitch
@@ -145,7 +159,7 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
         )
     roll_rate, pitch_rate, yaw_rate = _turned(rates, *angles)
     ax, ay, _ = _turned(force, *angles)
-    felt = {
+    true_signals = {
         "yaw_rate": yaw_rate,
         "roll_rate": roll_rate,
         "pitch_rate": pitch_rate,
@@ -156,8 +170,10 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
         by_speed = getattr(levels.vibration, name)
         if by_speed:
             shaking = stream(seed, f"vibration.{name}").standard_normal(len(motion))
-            felt[name] = felt[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
-    return felt
+            true_signals[name] = (
+                true_signals[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
+            )
+    return true_signals
 
 
 def _turned(
@@ -166,7 +182,9 @@ def _turned(
     pitch: FloatArray | float,
     yaw: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """A vector (3, T) along axes that are turned by yaw, then pitch, then roll; the angles are numbers or (T,)."""
+    """A vector (3, T) along axes that are turned by yaw, then pitch, then roll; the angles are
+    numbers or (T,).
+    """
     x, y, z = vector
     x, y = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
     x, z = x * np.cos(pitch) - z * np.sin(pitch), z * np.cos(pitch) + x * np.sin(pitch)
@@ -175,18 +193,24 @@ def _turned(
 
 
 def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, FloatArray]:
-    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity."""
+    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of
+    gravity.
+    """
     rate_hz = motion.rate_hz
     forward = (
         motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
     )
     left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
-    heading = shown(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
+    heading = sensor_signal(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
     cosine = np.cos(heading)
     sine = np.sin(heading)
-    yaw_rate = shown(motion.yaw_rate, reference.yaw_rate, rate_hz, seed, "yaw_rate_ref")
-    seen_forward = shown(forward * cosine + left * sine, reference.vx, rate_hz, seed, "vx_ref")
-    seen_left = shown(left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref")
+    yaw_rate = sensor_signal(motion.yaw_rate, reference.yaw_rate, rate_hz, seed, "yaw_rate_ref")
+    forward_signal = sensor_signal(
+        forward * cosine + left * sine, reference.vx, rate_hz, seed, "vx_ref"
+    )
+    left_signal = sensor_signal(
+        left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref"
+    )
     lever_x = reference.lever_x
     lever_y = reference.lever_y
     if reference.lever_error:
@@ -195,8 +219,8 @@ def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, Flo
         ).standard_normal(2)
         lever_x = lever_x + error_x
         lever_y = lever_y + error_y
-    vx = seen_forward + yaw_rate * lever_y
-    vy = seen_left - yaw_rate * lever_x
+    vx = forward_signal + yaw_rate * lever_y
+    vy = left_signal - yaw_rate * lever_x
     return {
         "vx_ref": vx,
         "vy_ref": vy,

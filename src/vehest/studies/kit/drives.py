@@ -15,7 +15,13 @@ from vehest.evaluation.floors import (
     reference_floor,
     reference_spread,
 )
-from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, REGIMES, STRAIGHT_YAW_RATE, TRANSIENT
+from vehest.evaluation.regimes import (
+    AY_BANDS,
+    MIN_REGIME_SECONDS,
+    REGIMES,
+    STRAIGHT_YAW_RATE,
+    TRANSIENT,
+)
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import MISSING, Line, fixed
@@ -122,7 +128,7 @@ def regime_table(
         name,
         f"RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets the share of samples. Straight: yaw rate "
         f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
-        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {LEAST_SECONDS:g} s are left out.",
+        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {MIN_REGIME_SECONDS:g} s are left out.",
         pd.DataFrame(rows),
         {
             "title": Column("estimator"),

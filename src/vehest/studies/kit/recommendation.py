@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vehest.evaluation.blocks import LEAST_BLOCKS
+from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking
 from vehest.report.document import as_text
 from vehest.report.style import listed
@@ -105,8 +105,8 @@ def plain_text(markdown: str) -> str:
 
 
 def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str]:
-    few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {LEAST_BLOCKS} are needed"
-    return [*([few] if ranking.n_blocks < LEAST_BLOCKS else []), *cannot_rank(part, test_set)]
+    few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {MIN_BLOCKS} are needed"
+    return [*([few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
 
 
 def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> EvaluatedModel:

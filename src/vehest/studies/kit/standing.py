@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from vehest.evaluation.blocks import LEAST_BLOCKS
+from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.style import MISSING, decimals_for, fixed, listed
 from vehest.studies.artefacts import PartArtefacts
@@ -30,7 +30,7 @@ def ranking_of(
         for name, own in segments.items()
         if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)
     }
-    return rank(finite, artefacts.protocol.rate_hz, asked=asked)
+    return rank(finite, artefacts.protocol.rate_hz, claimed_pairs=asked)
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
@@ -83,9 +83,9 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
     """The estimator with the lowest RMSE(β) and those that are not significantly worse, in Markdown."""
     best = ranking.order[0]
     words = f"**Best: {titles[best]}, {figure_of(ranking, best)}.**"
-    if ranking.n_blocks < LEAST_BLOCKS:
+    if ranking.n_blocks < MIN_BLOCKS:
         return f"{words} The test is too short to compare estimators."
-    equal = [titles[name] for name in ranking.not_told_apart]
+    equal = [titles[name] for name in ranking.tied_with_best]
     if not equal:
         return (
             f"{words} Every other estimator is significantly worse." if ranking.order[1:] else words
@@ -100,7 +100,7 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) 
     """The best estimator, those that are not significantly worse, and whether it beats the baselines."""
     if not ranking.order:
         return f"No estimator has a finite sideslip error on {where}."
-    if ranking.n_blocks < LEAST_BLOCKS:
+    if ranking.n_blocks < MIN_BLOCKS:
         return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, where)}"
     return f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} {basis_sentence(ranking, where)}"
 
@@ -125,7 +125,7 @@ def _baselines_sentence(ranking: Ranking) -> str:
 def basis_sentence(ranking: Ranking, where: str) -> str:
     """What the figures are and how they were compared."""
     figures = f"RMSE(β) over all seeds with its 95 % interval, on {where}"
-    if ranking.n_blocks < LEAST_BLOCKS:
+    if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."
     return (
         f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, "

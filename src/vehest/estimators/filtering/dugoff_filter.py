@@ -1,0 +1,332 @@
+"""Filters recordings and single samples by the unscented filter of a single track on Dugoff's
+tyres.
+
+    recordings --split_samples--> measurements (T, 4), inputs (T, 3) --`TrackFilter`--> states --> estimates
+    one sample --filter_step--> `FilterStep` --`UnscentedStepper`--> state
+
+Measured are a_y, r and, where tyre forces are measured, those of both axles; forward speed,
+steering angle and longitudinal acceleration are inputs. The forces' noise is smaller where the car
+behaves non-linearly, by a hysteresis on |a_y|. A network behind the sensors may add a sideslip
+angle (`PseudoMeasurement`).
+
+Source: Bertipaglia et al. 2024, Sections III-B and IV-C.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.filtering.track_filter import (
+    ROLLING,
+    Over,
+    TrackFilter,
+    error_over,
+    groups_of,
+    in_nonlinear_range,
+    padded,
+)
+from vehest.estimators.networks.sample_network import reference_sideslip
+from vehest.filters.gating import Gate
+from vehest.filters.gaussian import Filtered
+from vehest.filters.unscented_scan import UnscentedStepper
+from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
+
+Inputs = Literal["full", "imu"]
+Curve = Literal["plain", "smooth"]
+
+WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
+"""Lateral force of an axle -> channels of its wheels."""
+INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")
+CHANNELS: dict[str, tuple[str, ...]] = {
+    "full": (*INERTIAL, *(wheel for pair in WHEELS.values() for wheel in pair)),
+    "imu": INERTIAL,
+}
+MAX_SAMPLES_TOGETHER = 200_000  # samples that are filtered at a time
+
+
+class PseudoMeasurement(NamedTuple):
+    """Sideslip angles that a network adds to T samples."""
+
+    sideslip: FloatArray  # β_DD, (T,) [rad]
+    variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
+    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's
+    process: FloatArray | None = None
+
+
+class DugoffFilter(SigmaPointEstimator):
+    """An estimator by an unscented filter over `DugoffTrack`; a subclass has the settings and the
+    fit.
+
+    Attributes
+    ----------
+    axle_tyres : array, shape (6,)
+        Cornering stiffness [N/rad], friction [1] and reduction [s/m] of the front, then of the rear axle.
+    levels : dict
+        Standard deviations by name: ``process_vy`` [m/s] and ``process_yaw_rate`` [rad/s] of a step, those
+        of the sensors, and ``force_factor``.
+    """
+
+    channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
+    states: ClassVar[tuple[str, ...]] = TRACK_STATES
+    covariance_of = TRACK_STATES
+    axle_tyres: FloatArray
+    levels: dict[str, float]
+    # settings
+    inputs: Inputs
+    curve: Curve
+    minimum_speed: float
+    nonlinear_from: float
+    linear_below: float
+    correlated_samples: float
+    car: LoadedCar
+
+    def require_fitted(self) -> None:
+        """Check that tyres and levels are given or found.
+
+        Raises
+        ------
+        ConfigurationError
+            Tyres or levels are neither given nor found.
+        """
+        self.track()
+        self.noise_covariances(self.levels)
+
+    def track(self) -> DugoffTrack:
+        """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
+        if np.isnan(self.axle_tyres).any():
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres"
+            )
+        s = self.settings
+        front, rear = (
+            DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6))
+        )
+        return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
+
+    def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+        """Covariance of a step, (2, 2), and those of measurements where the car is linear and where
+        it is not, (2, 4, 4).
+
+        Raises
+        ------
+        ConfigurationError
+            A level is neither given nor found.
+        """
+        if any(math.isnan(level) for level in levels.values()):
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise"
+            )
+        process = (
+            torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64)
+            .square()
+            .diag()
+        )
+        factor = levels.get("force_factor", 1.0)
+        rows = [
+            [
+                levels["ay"],
+                levels["yaw_rate"],
+                *(force_factor * levels.get(name, 1.0) for name in WHEELS),
+            ]
+            for force_factor in (factor, 1.0)
+        ]
+        variances = torch.tensor(rows, dtype=torch.float64).square() * self.correlated_samples
+        return process, torch.diag_embed(variances)
+
+    def split_samples(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Measurements (T, 4), NaN where forces are not measured, and inputs (T, 3) of samples (T,
+        n) of ``channels``.
+        """
+        yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
+        wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
+        forces = (
+            [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]]
+            if wheels.shape[1]
+            else [np.full(len(samples), np.nan)] * 2
+        )
+        return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
+
+    def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
+        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see
+        `in_nonlinear_range`.
+        """
+        return in_nonlinear_range(ay, self.nonlinear_from, self.linear_below, before)
+
+    def mean_squared_error(
+        self,
+        recordings: Sequence[Recording],
+        skip_seconds: float = 0.0,
+        levels: Mapping[str, float] | None = None,
+        over: Over = "samples",
+        pseudo: Sequence[PseudoMeasurement] | None = None,
+    ) -> float:
+        """Mean squared error of sideslip [rad²] over samples fast enough for the model; see
+        `error_over`.
+        """
+        skip = round(skip_seconds * self.rate_hz)
+        sums: list[tuple[float, int]] = []
+        for rows, steps in self.filtered(recordings, levels=levels, pseudo=pseudo):
+            for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
+                vx = recordings[row]["vx"]
+                reference = reference_sideslip(recordings[row])
+                error = np.arctan2(states[: len(vx), 0], vx) - reference
+                is_counted = (vx >= self.minimum_speed) & np.isfinite(reference)
+                is_counted[:skip] = False
+                sums.append((float(np.square(error[is_counted]).sum()), int(is_counted.sum())))
+        return error_over(sums, over)
+
+    def _estimate_all(
+        self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
+    ) -> list[Estimate]:
+        """Recordings of similar length are filtered together."""
+        estimates: dict[int, Estimate] = {}
+        for rows, steps in self.filtered(
+            recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)
+        ):
+            mean, covariance = (part.numpy() for part in steps.filtered)
+            nis = (
+                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
+                .result.mul(steps.innovation)
+                .sum(-1)
+                .numpy()
+            )
+            dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
+            for place, row in enumerate(rows):
+                n = len(recordings[row])
+                quantities = {
+                    "yaw_rate": mean[place, :n, 1].copy(),
+                    "nis": nis[place, :n].copy(),
+                    "nis_dof": dof[place, :n].copy(),
+                }
+                estimates[row] = self._wrapped(
+                    recordings[row],
+                    mean[place, :n, 0].copy(),
+                    covariance[place, :n].copy(),
+                    TRACK_STATES,
+                    **quantities,
+                )
+        return [estimates[row] for row in range(len(recordings))]
+
+    def pseudo_measurements(
+        self, recordings: Sequence[Recording]
+    ) -> list[PseudoMeasurement] | None:
+        """Sideslip angles that a network adds to each recording; none: there is no network."""
+        return None
+
+    def filtered(
+        self,
+        recordings: Sequence[Recording],
+        states: Sequence[Mapping[str, float] | None] | None = None,
+        levels: Mapping[str, float] | None = None,
+        gate: Gate | None = None,
+        pseudo: Sequence[PseudoMeasurement] | None = None,
+    ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
+        """Filter recordings in groups of similar length, padded to the longest of each.
+
+        Yields the rows of each group and its filtered states. Levels are searched, and networks
+        trained, without a gate: noise that is too small would close it.
+        """
+        model = TrackFilter(self.track())
+        process, sensors = self.noise_covariances(self.levels if levels is None else levels)
+        for rows in groups_of([len(recording) for recording in recordings], MAX_SAMPLES_TOGETHER):
+            parts = [self.split_samples(recordings[row].stack(self.channels)) for row in rows]
+            measured = [part[0] for part in parts]
+            steps_noise = process
+            if pseudo is not None:
+                added = [pseudo[row] for row in rows]
+                measured = [
+                    np.column_stack([sensors_only, angle.sideslip])
+                    for sensors_only, angle in zip(measured, added, strict=True)
+                ]
+                if added[0].process is not None:
+                    steps_noise = torch.diag_embed(
+                        torch.as_tensor(padded([angle.process for angle in added], None))  # type: ignore[misc]
+                    )
+            measurements = torch.as_tensor(padded(measured, np.nan))
+            inputs = torch.as_tensor(padded([part[1] for part in parts], None))
+            noise = sensors[
+                torch.as_tensor(
+                    np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()])
+                ).long()
+            ]
+            if pseudo is not None:
+                noise = with_variance(
+                    noise,
+                    torch.as_tensor(
+                        padded([angle.variance[:, None] for angle in added], None)[..., 0]
+                    ),
+                )
+            initial_states = None if states is None else [states[row] for row in rows]
+            with torch.no_grad():
+                initial = model.start(inputs[:, 0], initial_states)
+                yield (
+                    rows,
+                    model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps,
+                )
+
+    def new_filter(self, first: FilterStep) -> UnscentedStepper:
+        """The filter before its first sample: straight ahead with wide deviations, or rolling."""
+        track_filter = TrackFilter(self.track())
+        mean, covariance = (
+            part[0].numpy() for part in track_filter.start(torch.as_tensor(first.inputs)[None])
+        )
+        return UnscentedStepper(
+            track_filter.model,
+            mean,
+            covariance,
+            len(first.measurement),
+            track_filter.rule,
+            gate=self.gate_in_use(),
+        )
+
+    def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
+        """Measurements, none below the minimum speed, and the noise of the car's present range."""
+        if not memory:
+            process, sensors = (noise.numpy() for noise in self.noise_covariances(self.levels))
+            memory |= {"process": process, "noise": process, "sensors": sensors, "trusts": False}
+        measurements, inputs = (part[0] for part in self.split_samples(sample[None]))
+        memory["trusts"] = bool(self.trusts_forces(measurements[:1], memory["trusts"])[0])
+        noise = memory["sensors"][int(memory["trusts"])]
+        process = memory["noise"]
+        memory["noise"] = memory["process"]
+        measurements, noise = self.with_pseudo(sample, measurements, noise, memory)
+        if inputs[0] < self.minimum_speed:
+            measurements = np.full_like(measurements, np.nan)
+            memory["noise"] = ROLLING
+        return FilterStep(measurements, inputs, process[None], noise[None])
+
+    def with_pseudo(
+        self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
+    ) -> tuple[FloatArray, FloatArray]:
+        """A measurement (m,) and its covariance with those that a network adds, whose process noise
+        is left in ``memory``.
+        """
+        return measurement, noise
+
+
+def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
+    """Covariances of what sensors measure and a network adds, (..., 5, 5), differentiable in the
+    variance.
+
+    Parameters
+    ----------
+    sensors : Tensor
+        Of the four measured numbers, diagonal, (..., 4, 4).
+    variance : Tensor
+        Of the network's angle (...) [rad²].
+    """
+    return torch.diag_embed(
+        torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1)
+    )
