@@ -4,8 +4,9 @@ docs/figures.csv lists them, a row a statement:
 
 - ``page``, ``stated``: the page, and the shortest text on it that holds the number or numbers and occurs once;
 - ``source``: a CSV, JSON, Markdown or text file, a test, or ``not a result``;
-- ``rows``: of a table the rows, as `pandas.DataFrame.query` takes them (empty: all); of a test or module the name of the function, class
-  or constant (a share of 0.05 in it agrees with 5 % on a page); of prose in Markdown or text (``column`` empty) a phrase of it; for ``not a result`` the reason;
+- ``rows``: of a table the rows, as `pandas.DataFrame.query` takes them (empty: all); of a test or module the name of the function,
+  class or constant (a share of 0.05 in it agrees with 5 % on a page); of prose in Markdown or text (``column`` empty) a phrase of it;
+  for ``not a result`` the reason;
 - ``column``: column or expression of columns (`pandas.DataFrame.eval`), several separated by ``;``; of a test that compares the page
   itself ``reads the page``;
 - ``statistic``: min, max, median, mean, sum or count over these rows, several separated by ``;``; empty for a single row.
