@@ -264,6 +264,12 @@ def _one_line(error: Exception, command: str, composed: Any) -> str:
         return f"the configuration of '{command}' cannot be read ({first_line(error)})"
     text = str(error).strip()
     if unknown := re.search(r"Could not override '([^']+)'", text):
+        group, _, option = unknown[1].partition(".")
+        family = composed.get(group, {}).get("name") if isinstance(composed, dict) else None
+        if group == "estimator" and family and option and "." not in option:
+            from vehest.estimators.registry import unknown_option  # imports all families
+
+            return unknown_option(str(family), option)
         listing = f"'vehest config {command}' prints the options there are"
         meant = close_key(unknown[1], composed)
         hint = option_hint(unknown[1])
