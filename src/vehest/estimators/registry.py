@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import entry_points
 
 import vehest.estimators as package
-from vehest.data.errors import ConfigurationError, listed, printable, suggestion
+from vehest.data.errors import ConfigurationError, printable
 from vehest.data.text_files import first_line
 from vehest.estimators.base import Estimator
 
@@ -62,44 +62,12 @@ def estimator_classes() -> dict[str, type[Estimator]]:
     return classes
 
 
-def unknown_option(family: str, option: str) -> str:
-    """Message on an option that a family does not have, with the one that was probably meant.
-
-    Parameters
-    ----------
-    family : str
-        Name of an estimator.
-    option : str
-        Name of the option without ``estimator.``.
-
-    Returns
-    -------
-    str
-        The error; it suggests the closest option of the family, else other families that have an
-        option of this name but for case and underscores.
-    """
-    options = {
+def option_names() -> dict[str, list[str]]:
+    """Names of the options of each estimator, without ``estimator.``."""
+    return {
         name: [entry.name for entry in fields(estimator.settings_type)]
         for name, estimator in estimator_classes().items()
     }
-    hint = suggestion(option, options.get(family, ()), "estimator.")
-    if not hint:
-        spelling = _spelling(option)
-        families = {
-            name: match
-            for name, names in options.items()
-            for match in names
-            if name != family and _spelling(match) == spelling
-        }
-        if families:
-            match = next(iter(families.values()))
-            hint = f"; '{match}' is an option of {listed(list(families))};"
-    listing = f"'vehest config train estimator={family}' prints the options there are"
-    return f"unknown option 'estimator.{option}' of {family}{hint or ';'} {listing}"
-
-
-def _spelling(name: str) -> str:
-    return name.replace("_", "").lower()
 
 
 def is_plugin(name: str) -> bool:
