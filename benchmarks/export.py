@@ -320,7 +320,7 @@ def report(table: pd.DataFrame) -> str:
 def main() -> None:
     """Measure, write, print."""
     from vehest.estimators.model_files import read_description
-    from vehest.run.table_records import record_tables
+    from vehest.run.table_records import RowKeys, record_tables
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "export")
@@ -348,9 +348,12 @@ def main() -> None:
         except Exception as error:  # one model that cannot be measured hides no other
             print(f"{folder.name} on {dataset}: {type(error).__name__}: {error}", file=sys.stderr)
     table = pd.DataFrame(rows)
+    former_families: list[str] = []
     if words.only and (words.out / "metrics.csv").is_file():
         former = pd.read_csv(words.out / "metrics.csv")
-        table = pd.concat([former[former["family"] != words.only], table])
+        former = former[former["family"] != words.only]
+        former_families = sorted(set(former["family"]))
+        table = pd.concat([former, table])
         table = table.sort_values(["drive", "family", "variant", "precision"], ignore_index=True)
     words.out.mkdir(parents=True, exist_ok=True)
     table.to_csv(words.out / "metrics.csv", index=False, float_format="%.6g")
@@ -360,10 +363,12 @@ def main() -> None:
         "make export_all",
         [
             "script benchmarks/export.py",
-            *(f"data {dataset}" for dataset in sorted({row["drive"] for row in rows})),
-            *(f"calibrate {family}" for family in sorted({row["family"] for row in rows})),
+            *(f"data {drive}" for drive in sorted(set(table["drive"]))),
         ],
-        f"rows of other families than {words.only}" if words.only else "",
+        rows=RowKeys(
+            {family: f"calibrate {family}" for family in sorted({row["family"] for row in rows})},
+            {family: f"calibrate {family}" for family in former_families},
+        ),
     )
     print(report(table))
 

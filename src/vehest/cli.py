@@ -43,12 +43,12 @@ app = typer.Typer(
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable data, 4 something is missing, "
     "5 some jobs failed, 130 or 143 stopped by a signal.",
 )
-data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings and channels.")
+data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 LONGEST_LINE = 4_000
-STAGES = "Single stages, which `run` goes through by itself"
+STAGES = "Single stages, all of which `run` includes"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")
@@ -80,7 +80,7 @@ DryRun = Annotated[
     bool,
     typer.Option("--dry-run", help="List the stages that would run or be reused; run nothing."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
+Force = Annotated[bool, typer.Option("--force", help="Run again although the result exists.")]
 DatasetOrFile = Annotated[
     str,
     typer.Argument(
@@ -143,7 +143,7 @@ Overrides = Annotated[
 @app.callback(invoke_without_command=True)
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)
     ] = False,
 ) -> None:
     if version:
@@ -154,7 +154,7 @@ def _root(
 @app.command("new")
 def new_car(
     name: Annotated[
-        str, typer.Argument(help="Name of the data set to be, such as my_car.", show_default=False)
+        str, typer.Argument(help="Name of the new data set, such as my_car.", show_default=False)
     ],
     files: Annotated[
         list[Path],
@@ -168,9 +168,7 @@ def new_car(
             "--yes", "-y", help="Accept all proposals, ask nothing, and list open questions."
         ),
     ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write files anew that are there already.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the files that would be written; write nothing.")
     ] = False,
@@ -201,7 +199,7 @@ def new_car(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Begin with logs of your own car: `vehest new my_car lap*.csv`.
+    """Start with logs of your own car: `vehest new my_car lap*.csv`.
 
     Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs do not decide, and writes
     conf/dataset, conf/split and pipelines/my_car.yaml; where the logs have no reference, conf/dataset alone, and the command that estimates
@@ -246,7 +244,7 @@ def ingest(
     quiet: Quiet = False,
     jobs: Jobs = None,
 ) -> None:
-    """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
+    """Read raw files, or simulate, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     from vehest.run.ingest import download_files
     from vehest.run.study_run import open_runner
 
@@ -284,7 +282,7 @@ def simulate(
 ) -> None:
     """Simulate a data set into the store: `vehest simulate sim_bmw seed=1`.
 
-    The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
+    The same seed gives the same samples. Drives are made side by side; a run that was stopped continues with the missing ones. Drives
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
     from vehest.run.ingest import outcome_of, simulation_config
@@ -312,7 +310,7 @@ def downsample(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
+    """Resample a data set, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
     from vehest.configuration.composition import positive_rate
     from vehest.run.study_run import open_runner
 
@@ -423,7 +421,7 @@ def estimate(
     is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
     For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` uses the self-calibrating
-    filter, with a note; estimator.smoothed=true makes it the whole drive's at once.
+    filter, with a note; estimator.smoothed=true smooths over the whole drive (offline).
 
     Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
@@ -449,7 +447,7 @@ def identify(
     ] = Path("my_car.yaml"),
     as_json: AsJson = False,
 ) -> None:
-    """Find a car's numbers on its drives, without a reference: `vehest identify lap*.csv estimator.wheelbase=2.7 -o my_car.yaml`.
+    """Identify a car's parameters on its drives, without a reference: `vehest identify lap*.csv estimator.wheelbase=2.7 -o my_car.yaml`.
 
     Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest estimate lap.csv --car my_car.yaml` starts from
     wheelbase, leakage and rear axle.
@@ -731,7 +729,7 @@ def run(
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
     Existing artefacts are reused, and so are published weights of trainings with the same key. Overrides
-    apply to every sweep that has their key. Sweeps are worked off in the order of the file.
+    apply to every sweep that has their key. Sweeps run in the order of the file.
     """
     options = RunOptions(
         force,
@@ -772,7 +770,7 @@ def report(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draw a study's tables, figures and page from what `vehest run` has made; trains nothing.
+    """Draw a study's tables, figures and page from existing artefacts; trains nothing.
 
     `vehest report --check` needs neither models nor an output root. A line a study: up to date; stale, and what has changed; or not known.
     Exit code 3 unless all are up to date; without names, those that results/stale.yaml lists may be stale.
@@ -942,7 +940,7 @@ def data_list(as_json: AsJson = False) -> None:
 
 @data_app.command("channels")
 def data_channels(as_json: AsJson = False) -> None:
-    """List the channels that vehest knows, with units and signs."""
+    """List all channels with units and signs."""
     from vehest.data.channels import CHANNELS
 
     table = TerminalTable(

@@ -30,7 +30,7 @@ import torch
 import vehest
 from vehest.configuration.composition import compose_config
 from vehest.data.resampling import transforms_of
-from vehest.run.table_records import record_tables
+from vehest.run.table_records import RowKeys, record_tables
 from vehest.sources.base import open_source
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
@@ -267,10 +267,8 @@ def main():
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument(
-        "--only", help="one estimator; rows of the others stay as they are in --out"
-    )
-    parser.add_argument("--data", help="one data set")
+    parser.add_argument("--only", help="one estimator; all other rows stay as they are in --out")
+    parser.add_argument("--data", help="one data set; all other rows stay")
     asked = parser.parse_args()
     cases = [
         (ground, name)
@@ -282,9 +280,11 @@ def main():
     cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
     started = time.monotonic()
     former = pd.DataFrame(columns=HEADER)
-    if asked.only and asked.out.is_file():
+    if (asked.only or asked.data) and asked.out.is_file():
         former = pd.read_csv(asked.out, dtype=str, keep_default_na=False)
-        former = former[former["estimator"] != asked.only]
+        remade = former["estimator"].isin([asked.only] if asked.only else former["estimator"])
+        remade &= former["data"].isin([asked.data] if asked.data else former["data"])
+        former = former[~remade]
     tables = {}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
@@ -300,15 +300,18 @@ def main():
                 f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s",
                 flush=True,
             )
+    estimators = sorted(set(former["estimator"]))
     record_tables(
         [asked.out],
         "make online_faults",
         [
             "script tests/faults/online_faults.py",
-            *(f"data {data}" for data in sorted({ground.data for ground, _ in cases})),
-            *(f"train {name}" for name in sorted({name for _, name in cases})),
+            *(f"data {data}" for data in sorted({*table["data"], *former["data"]})),
         ],
-        f"rows of other estimators than {asked.only}" if len(former) else "",
+        rows=RowKeys(
+            {name: f"train {name}" for name in sorted({*table["estimator"]} - {*estimators})},
+            {name: f"train {name}" for name in estimators},
+        ),
     )
     held = {
         "finite": table["finite"],

@@ -140,9 +140,13 @@ def test_claim_that_zero_meets_too_is_met_by_a_trivial_baseline():
     assert "zero" in found.reason
     worse = studied(a=ratio(0.5), b=LEVELS, zero=ratio(1.3), static_map=ratio(1.0))
     assert judged(claim_of(ratio=0.5), worse).verdict == "reproduced"
-    # of "b is higher" the baseline takes the place of the better one, a
-    turned = claim_of(candidate="b", other="a", direction="higher")
-    assert judged(turned, blocks).verdict == "met by a trivial baseline"
+
+
+def test_weakness_that_a_baseline_does_not_share_is_reproduced():
+    """ "b has a higher error than a" is on b: that zero is better than b, too, confirms it."""
+    blocks = studied(a=ratio(0.5), b=LEVELS, zero=ratio(0.7))
+    weakness = claim_of(candidate="b", other="a", direction="higher", ratio=2.0)
+    assert judged(weakness, blocks).verdict == "reproduced"
 
 
 def test_not_testable_comes_before_everything():

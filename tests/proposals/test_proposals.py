@@ -65,7 +65,7 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
     units |= {"handwheel": ("Steer", "deg", 1), "sideslip_ref": ("Beta", "deg", 1)}
     assert {name: (one.column, one.unit, one.sign) for name, one in found.items()} == units
     assert found["yaw_rate"].in_words.startswith(
-        "yaw_rate: column Gyro, deg/s, sign -1: ay and vx·yaw_rate agree -"
+        "yaw_rate: column Gyro, deg/s, sign -1: ay vs. vx·yaw_rate: correlation -"
     )
 
 
@@ -254,7 +254,7 @@ def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps
         "my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))]
     )
     assert any(
-        "agrees 1.000, as of another place" in text
+        "of another place or filtered: correlation 1.000" in text
         for text in examined.proposals.by_channel["ay"].evidence
     )
     outcome, _ = write_files(examined, dry_run=True)

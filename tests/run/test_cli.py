@@ -371,12 +371,6 @@ TESTED = [{"recording": "three"}]
             2,
             "must agree in 'evaluation'",
         ),
-        (
-            {"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]},
-            RUN,
-            2,
-            "two jobs are both called gru-states_5-seed0",
-        ),
         ({"tests": {"validation": TESTED}}, TRAIN, 2, "a test set cannot be called 'validation'"),
         ({"tests": {"../x": TESTED}}, TRAIN, 2, "becomes part of file names"),
         ({"tests": {"t": []}}, TRAIN, 2, "test set 't' is empty"),

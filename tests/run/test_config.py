@@ -15,6 +15,8 @@ from vehest.configuration.composition import compose_config, expand
 from vehest.configuration.estimate_options import estimate_options
 from vehest.configuration.files import GROUPS, choices, packaged
 from vehest.data.errors import ConfigurationError, MissingError
+from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.inference.car_values import with_settings
 from vehest.run.setting_lines import config_as_commented_yaml
 from vehest.run.study import jobs_of, read_study
 
@@ -59,6 +61,11 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
         ),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
+        (
+            ["estimator=self_calibrating", "estimator.nlocal=3"],
+            "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
+            "'vehest config train estimator=self_calibrating' prints",
+        ),
         (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),
         (["quickly"], "'quickly' is not an override; write key=value"),
         (["seed=1,2"], "names several values"),
@@ -312,3 +319,13 @@ def test_config_prints_settings_with_the_comments_of_their_files(elsewhere, caps
         key, _, value = key_and_value.strip().partition(": ")
         value = {"n_states": "3", "patience": "7"}.get(key, value.strip())
         assert f"{f'  {key}: {value}':<44} # {comment}" in printed
+
+
+def test_an_unknown_option_of_the_shipped_filter_names_the_families_that_have_it():
+    said = refusal(
+        lambda: with_settings(SelfCalibrating(SelfCalibrating.settings_type()), {"nlocal": 3}),
+        ConfigurationError,
+    )
+    assert said.startswith(
+        "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
+    )

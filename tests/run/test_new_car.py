@@ -56,7 +56,7 @@ def held(position):
 def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     said = log.typed("lap.csv", answers=["", "2.7", "1500", "15"])
     for words in (
-        "yaw_rate: column Gyro, deg/s: ay and vx·yaw_rate agree",
+        "yaw_rate: column Gyro, deg/s: ay vs. vx·yaw_rate: correlation",
         "in a left turn, does column 'Gyro' count up?",
         "vehest run my_car",
     ):
@@ -125,11 +125,9 @@ def test_a_column_can_be_declared_otherwise_or_left_out(log):
 def test_yes_asks_nothing_lists_what_it_left_open_and_overwrites_nothing_without_force(log):
     out, err = log.new("lap.csv", "--yes")
     assert err == ""
-    assert "open, taken as proposed:\n  left_right: yes (in a left turn" in out
+    assert "open questions, answered as proposed:\n  left_right: yes (in a left turn" in out
     assert all(f"wrote {file}: " in out for file in FILES)
-    assert "Open, not decided by the log: in a left turn" in Path(FILES[0]).read_text(
-        encoding="utf-8"
-    )
+    assert "Not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
     for file in FILES:
         Path(file).unlink()
     Path(FILES[1]).write_text("mine")
@@ -258,11 +256,14 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(lo
     parts = [held(1)["train"], held(1)["validation"], held(1)["tests"]["test"]]
     assert [len(own) for own in parts] == [5, 2, 3]
     out, _ = log.new(*files, "--yes", "--force", "--steering-ratio", "15")
-    assert "left out: velocity_gru: 15 s in each range for validation (the shortest has 8 s)" in out
+    assert (
+        "left out: velocity_gru, velocity_lstm: 15 s in each range for validation (the shortest has 8 s)"
+        in out
+    )
     assert sorted(one["recording"] for own in parts for one in own) == names
     out, _ = log.new(*files[:2], "--yes", "--force")
     assert (
-        "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more"
+        "16 s in 2 recordings are too short to train, validate and test on: record two minutes or more"
         in out
     )
     assert "vehest run" not in out

@@ -14,6 +14,7 @@ import yaml
 import vehest
 from place import write_csv
 from vehest.configuration.composition import compose_config
+from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class
 from vehest.inference.models import pretrained_folder
@@ -151,3 +152,30 @@ def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_car
     ]
     assert "hardly a sample is valid" in text
     assert bands_on("roboracer", data_root)[2] < 0.01
+
+
+def test_a_step_of_a_window_network_is_the_batch_estimate_one_sample_later():
+    """The figures of docs/export.md: KS-NN, GRU and LSTM predict t(k+1) from samples up to t(k)."""
+    table = pd.read_csv(ROOT / "docs" / "examples" / "lap.csv")
+    channels = {
+        "vx": table["Speed"].to_numpy() / 3.6,
+        "yaw_rate": np.radians(table["GyroZ"].to_numpy()),
+        "ax": table["AccX"].to_numpy(),
+        "ay": -table["AccY"].to_numpy(),
+    }
+    recording = Recording("lap", "unknown", 20.0, 0.0, channels, "simulated")
+    model = vehest.load_model("pretrained")
+    batch = vehest.estimate(model, recording)
+    stepper = vehest.online(model)
+    steps = [
+        stepper.step({name: channels[name][k] for name in model.channels})
+        for k in range(len(table))
+    ]
+    vy = np.array([step["vy"] for step in steps])
+    sideslip = np.array([step["sideslip"] for step in steps])
+    assert stepper.horizon_steps == 1
+    assert np.array_equal(vy[:-1], batch["vy"][1:], equal_nan=True)
+    same_row = np.nanmax(np.abs(vy - batch["vy"]))
+    assert round(float(same_row), 2) == 0.34  # m/s
+    next_row = np.degrees(np.nanmax(np.abs(sideslip[:-1] - batch["sideslip"][1:])))
+    assert round(float(next_row), 2) == 0.04  # deg

@@ -15,7 +15,7 @@ from vehest.artefacts import artefact as artefacts
 from vehest.data.errors import MissingError
 from vehest.run import table_records
 from vehest.run.publishing import PROVENANCE, RESULTS
-from vehest.run.table_records import record_tables, today_of
+from vehest.run.table_records import RowKeys, record_tables, today_of
 from vehest.run.versions import VERSIONS, code_of
 
 CHECK = ("report", "--check", "tables")
@@ -80,6 +80,39 @@ def test_rows_without_keys_leave_the_state_not_known(table, outcome):
     assert outcome() == (3, "tables: not known: b.csv: rows of gru without keys (make b)\n")
     record_tables([other], "make b", [])
     assert outcome() == (0, "tables: up to date\n")
+
+
+def test_keys_of_rows_that_stay_are_those_with_which_they_were_made(
+    place, table, outcome, monkeypatch
+):
+    gru = {"gru": "train gru"}
+    script = f"script {SCRIPT}"
+    record_tables([table], "make a", [script], rows=RowKeys(gru | {"lstm": "train lstm"}, {}))
+    former = json.loads((table.parent / PROVENANCE).read_text())["keys"]
+    record_tables([table], "make a", [script], rows=RowKeys({"ksnn": "train ksnn"}, gru))
+    keys = json.loads((table.parent / PROVENANCE).read_text())["keys"]
+    assert keys["a.csv: train gru"] == former["a.csv: train gru"]
+    assert set(keys) == {
+        "a.csv: content",
+        f"a.csv: {script}",
+        "a.csv: train gru",
+        "a.csv: train ksnn",
+    }
+    assert outcome() == (0, "tables: up to date\n")
+
+    monkeypatch.setitem(VERSIONS, "train", "another")
+    (place.folder / SCRIPT).write_text('VERSION = "2"\n')
+    record_tables([table], "make a", [script], rows=RowKeys({"ksnn": "train ksnn"}, gru))
+    stale = f"tables: stale: code (a.csv: script {SCRIPT}, a.csv: train gru)\n"
+    assert outcome() == (3, stale)
+    record_tables([table], "make a", [script], rows=RowKeys({"ksnn": "train ksnn"} | gru, {}))
+    assert outcome() == (0, "tables: up to date\n")
+
+
+def test_rows_that_stay_without_a_recorded_key_are_named(table, outcome):
+    rows = RowKeys({"ksnn": "train ksnn"}, {"gru": "train gru", "lstm": "train lstm"})
+    record_tables([table], "make a", [], rows=rows)
+    assert outcome() == (3, "tables: not known: a.csv: rows of lstm without keys (make a)\n")
 
 
 def test_a_trial_outside_results_is_not_recorded(tmp_path):

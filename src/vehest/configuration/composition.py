@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
@@ -34,11 +34,17 @@ from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from vehest.configuration.files import GROUPS, choices, conf_folders, packaged
-from vehest.data.errors import ConfigurationError, VehestError, closest, printable
+from vehest.data.errors import (
+    ConfigurationError,
+    VehestError,
+    closest,
+    printable,
+    unknown_option,
+)
 from vehest.data.files import stamp_of
 from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
 from vehest.data.schema import FURTHER_KEYS, validated
-from vehest.data.text_files import check_yaml_size, first_line, read_text
+from vehest.data.text_files import check_yaml_size, first_line, read_text, read_yaml
 from vehest.data.transforms import Preparation
 
 Config = dict[str, Any]
@@ -268,6 +274,10 @@ def _one_line(error: Exception, command: str, composed: Any) -> str:
         return f"the configuration of '{command}' cannot be read ({first_line(error)})"
     text = str(error).strip()
     if unknown := re.search(r"Could not override '([^']+)'", text):
+        group, _, option = unknown[1].partition(".")
+        family = composed.get(group, {}).get("name") if isinstance(composed, dict) else None
+        if group == "estimator" and family and option and "." not in option:
+            return unknown_option(str(family), option, _option_names())
         listing = f"'vehest config {command}' prints the options there are"
         meant = close_key(unknown[1], composed)
         hint = option_hint(unknown[1])
@@ -282,6 +292,22 @@ def _one_line(error: Exception, command: str, composed: Any) -> str:
         if key
         else " ".join(line.strip() for line in text.splitlines()[:2])
     )
+
+
+def _option_names() -> dict[str, list[str]]:
+    """Names of the options of each estimator by its file in conf/estimator, without ``estimator.``."""
+    names: dict[str, list[str]] = {}
+    for folder in conf_folders():
+        for file in sorted((folder / "estimator").glob("*.yaml")):
+            content: Any = None
+            with suppress(VehestError):
+                content = read_yaml(file)
+            # a file that also chooses a training has its options under ``estimator``
+            settings = content.get("estimator", content) if isinstance(content, dict) else None
+            if isinstance(settings, dict):
+                family = str(settings.get("name", file.stem))
+                names.setdefault(family, [str(key) for key in settings if key != "name"])
+    return names
 
 
 @lru_cache(maxsize=4096)

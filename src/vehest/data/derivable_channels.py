@@ -12,7 +12,7 @@ SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate,
 
 UNKNOWN = {
     "wheel_radius": "rolling radius of the tyres [m]",
-    "ratio": "of the handwheel's angle to the road wheels'",
+    "ratio": "overall steering ratio",
 }
 """Options that only the user knows, with their meaning."""
 

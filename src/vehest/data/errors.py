@@ -7,7 +7,7 @@ something. Functions that take plain values of a configuration (``…_from_confi
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 
 
@@ -68,6 +68,43 @@ def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
     """What was probably meant by an unknown name, to append to a message; empty if no choice is close."""
     close = closest(name, choices)
     return f"; did you mean '{prefix}{close}'?" if close else ""
+
+
+def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]]) -> str:
+    """Message on an option that a family of estimators does not have, with the one that was probably meant.
+
+    Parameters
+    ----------
+    family : str
+        Name of the estimator.
+    option : str
+        Name of the option without ``estimator.``.
+    names : mapping
+        Family -> names of its options.
+
+    Returns
+    -------
+    str
+        The error. It suggests the closest option of the family, else the other families that have
+        an option of this name but for case and underscores.
+    """
+    hint = suggestion(option, names.get(family, ()), "estimator.")
+    if not hint:
+        families = {
+            other: name
+            for other, options in names.items()
+            for name in options
+            if other != family and _spelling(name) == _spelling(option)
+        }
+        if families:
+            name = next(iter(families.values()))
+            hint = f"; '{name}' is an option of {listed(list(families))};"
+    listing = f"'vehest config train estimator={family}' prints the options there are"
+    return f"unknown option 'estimator.{option}' of {family}{hint or ';'} {listing}"
+
+
+def _spelling(name: str) -> str:
+    return name.replace("_", "").lower()
 
 
 def printable(text: str, keep: str = "") -> str:

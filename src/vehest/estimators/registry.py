@@ -10,6 +10,7 @@ import importlib
 import pkgutil
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import fields
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
@@ -74,6 +75,14 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
         if is_plugin(name):
             raise plugin_failure(name, "made", error) from error
         raise
+
+
+def option_names() -> dict[str, list[str]]:
+    """Names of the options of each estimator, without ``estimator.``."""
+    return {
+        name: [entry.name for entry in fields(estimator.settings_type)]
+        for name, estimator in estimator_classes().items()
+    }
 
 
 def is_plugin(name: str) -> bool:

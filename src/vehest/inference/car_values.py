@@ -11,10 +11,11 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from vehest.data.car import CarValues
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, unknown_option
 from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
+from vehest.estimators.registry import option_names
 from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
 from vehest.trust.record import Trust
 
@@ -75,6 +76,9 @@ def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     if not isinstance(model, SelfCalibrating):
         what = "a car's record and estimator.KEY=VALUE are for the self-calibrating filter"
         raise ConfigurationError(f"{what}, not for '{model.name}'; leave the model out")
+    for option in changed:
+        if not hasattr(model.settings, option):
+            raise ConfigurationError(unknown_option(model.name, option, option_names()))
     new = SelfCalibrating(
         settings_from_config(
             SelfCalibrating.settings_type, asdict(model.settings) | changed, "estimator"

@@ -28,6 +28,7 @@ from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
 from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
+from vehest.run.training_differences import Differences, difference_text, differences_of
 from vehest.run.usable import lack
 from vehest.studies.reference_minutes import start_in_words
 
@@ -58,6 +59,9 @@ class Comparison:
     found: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
+    differences: Mapping[str, Differences] = field(
+        default_factory=dict
+    )  # key of a training -> options in which it differs from others of its variant and seed
 
     @property
     def usable(self) -> list[Job]:
@@ -75,7 +79,12 @@ class Comparison:
         """Trainings for which no time was left, by name."""
         trainings = [job.training for job in self.usable if job.training is not None]
         remaining = [own for own in trainings if own.plan.key not in self.found]
-        return list(dict.fromkeys(map(label_of, remaining)))
+        return list(
+            dict.fromkeys(
+                label_of(own) + difference_text(self.differences.get(own.plan.key, {}))
+                for own in remaining
+            )
+        )
 
     @property
     def failed(self) -> dict[str, str]:
@@ -90,7 +99,7 @@ class Comparison:
         Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
         """
         usable = self.usable
-        names = dict[Any, Any]()
+        labels = dict[Any, str]()
         self._print_failures(self.jobs, runner)
         evaluated = "evaluation" in usable[0].config
         try:
@@ -111,12 +120,15 @@ class Comparison:
                     data = runner.data_for(split, estimator_rate(job.config), job.config)
                     training = plan_training(job.config, split, data)
                     check_channels(faults_of(job.config), split, data)
-                    _check_name(job, training, names)
+                    _check_label(job, training, labels)
                     job.training = training
                 except VehestError as error:
                     if not job.label and not isinstance(error, DataError):
                         raise
                     job.failure = failure_of(error)
+            self.differences = differences_of(
+                job.training for job in checked if job.training is not None and not job.label
+            )
             if evaluated and checked:
                 self.evaluation = runner.evaluation(usable[0].config, {})
         except DryRunStop:
@@ -289,18 +301,12 @@ def plan_training(
     return replace(job, plan=plan, training={**job.training, "start_from": str(folder.resolve())})
 
 
-def _check_name(job: Job, training: TrainJob, names: dict[Any, Any]) -> None:
-    """Refuse a training that cannot be distinguished from another: one of two combinations of a sweep, or of two of one name in a study."""
-    key = training.plan.key
+def _check_label(job: Job, training: TrainJob, labels: dict[Any, str]) -> None:
+    """Refuse a combination of a sweep that is the same training as another one."""
     if job.label:
-        twin = names.setdefault((key, faults_of(job.config)), job.label)
+        twin = labels.setdefault((training.plan.key, faults_of(job.config)), job.label)
         if twin != job.label:
             raise ConfigurationError(f"it is the same training as {twin}")
-    elif names.setdefault(training.plan.label, key) != key:
-        raise ConfigurationError(
-            f"two jobs are both called {training.plan.label}: they differ in what its name does not say; "
-            "sweep that in a pipeline of its own"
-        )
 
 
 def name_in_part(part: str, name: str, parts: Collection[str]) -> str:

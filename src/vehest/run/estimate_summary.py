@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
 from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.inference.tables import LOG_SUFFIXES
+from vehest.trust.health import HOLD_SECONDS
+from vehest.trust.health_kernel import CLEAR
 
 LABEL_WIDTH = 10
 
@@ -68,7 +70,7 @@ def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
         "sideslip": f"{sideslip['min']:.2f}° to {sideslip['max']:.2f}°{_band(outcome)}",
         "bands": outcome.get("band", ""),
         "valid": _valid(outcome),
-        "range": outcome["outside_training"],
+        "range": _range(outcome),
         "point": f"v and β at the {outcome['point']}",
         "warnings": f"{len(outcome['findings'])}, printed above" if outcome["findings"] else "none",
         "file": f"{outcome['out']}{_columns(Path(outcome['out']))}",
@@ -82,8 +84,29 @@ def _valid(outcome: Mapping[str, Any]) -> str:
     share = f"{outcome['valid_percent']:.3g} % of the estimated samples"
     if not outcome["has_calibration"]:
         return f"{share}, by gaps and speeds alone: the model has no calibration"
-    reasons = "; ".join(outcome["invalid_reasons"])
+    reasons = "; ".join(_grouped(outcome["invalid_reasons"]))
     return f"{share}{reasons and f'; the others: {reasons}'}"
+
+
+def _grouped(reasons: Sequence[str]) -> list[str]:
+    """Reasons that differ in the channel alone as one: ``outside the range of the training: |vx|, |ay|``."""
+    channels: dict[str, list[str]] = {}
+    for reason in reasons:
+        cause, _, channel = reason.partition(": ")
+        channels.setdefault(cause, []).append(channel)
+    return [
+        f"{cause}: {', '.join(names)}" if any(names) else cause for cause, names in channels.items()
+    ]
+
+
+def _range(outcome: Mapping[str, Any]) -> str:
+    """Share outside the range of the training, and for how long health flags it beyond that."""
+    if not outcome["outside_training"]:
+        return ""
+    return (
+        f"{outcome['outside_training']}; a sample is valid again once all signals have been below "
+        f"{100.0 * CLEAR:g} % of their limits for {HOLD_SECONDS:g} s"
+    )
 
 
 def _columns(out: Path) -> str:

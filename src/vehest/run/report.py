@@ -40,6 +40,7 @@ from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
 from vehest.run.train import read_fit_metrics, recording_file
+from vehest.run.training_differences import difference_suffix, difference_text
 from vehest.run.versions import code_of
 from vehest.run.weights import (
     FORMAT,
@@ -238,13 +239,17 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
     for member in part.members:
         assert member.model is not None
         assert member.evaluation is not None
-        tables.append(_table_of(member.evaluation.folder, METRICS))
         estimator = new_estimator(member.job.estimator)
+        differences = part.differences.get(member.job.plan.key, {})
+        variant = estimator.variant + difference_suffix(differences)
+        tables.append(_table_of(member.evaluation.folder, METRICS).assign(variant=variant))
         models.append(
             EvaluatedModel(
                 estimator=estimator.name,
-                variant=estimator.variant,
-                title=estimator.full_title + start_in_words(member.job.training),
+                variant=variant,
+                title=estimator.full_title
+                + start_in_words(member.job.training)
+                + difference_text(differences),
                 seed=member.job.seed,
                 model_folder=member.model.folder,
                 evaluation_folder=member.evaluation.folder,
@@ -293,7 +298,7 @@ def _timings_of(part: PartArtefacts) -> pd.DataFrame:
     """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s]; in no published file."""
     tables = []
     for model in part.models:
-        own = _table_of(model.evaluation_folder, TIMINGS)
+        own = _table_of(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
         fit = {
             name: value
             for name, value in read_fit_metrics(model.model_folder).items()

@@ -14,6 +14,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from vehest.artefacts.artefact import CHECKOUT, provenance
 from vehest.artefacts.keys import hash_of
@@ -28,8 +29,27 @@ from vehest.run.versions import code_of
 VERSION_LINE = re.compile(r'^VERSION = "(.+?)"', re.MULTILINE)
 
 
+class RowKeys(NamedTuple):
+    """Keys of a table's groups of rows, where a command may make some groups alone, as ``--only gru``.
+
+    Attributes
+    ----------
+    remade : mapping
+        Group that was made anew -> what its numbers follow from, ``{"gru": "train gru"}``.
+    former : mapping
+        The same of groups with rows of an earlier run, whose keys stay as they were recorded.
+    """
+
+    remade: Mapping[str, str]
+    former: Mapping[str, str]
+
+
 def record_tables(
-    tables: Sequence[Path], command: str, determined_by: Sequence[str], without_keys: str = ""
+    tables: Sequence[Path],
+    command: str,
+    determined_by: Sequence[str],
+    without_keys: str = "",
+    rows: RowKeys | None = None,
 ) -> None:
     """Write to provenance.json beside tables how they were made; other tables' records stay.
 
@@ -38,8 +58,10 @@ def record_tables(
     Args:
         tables: files just written, all in one folder; files that are not there are left out.
         command: what makes them again.
-        determined_by: what else their numbers follow from, as in the names of keys.
+        determined_by: what else all numbers follow from, as in the names of keys. While rows of an earlier run
+            stay, a recorded key of it stays too: the table is stale until all rows are made with today's.
         without_keys: what of them was made before keys were recorded.
+        rows: further keys, each of some rows; groups without a recorded key are named as ``without_keys``.
 
     Raises:
         MissingError: raw files that the numbers follow from are not here, as where a record is written
@@ -48,25 +70,39 @@ def record_tables(
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
         return
-    former = read_json(file) if file.is_file() else {}
+    recorded = read_json(file) if file.is_file() else {}
     names = [table.name for table in tables if table.is_file()]
     about = provenance()
     record = {"command": command, "created": about["created"], "commit": about["commit"]}
-    if without_keys:
-        record["without_keys"] = without_keys
     keys = {
         what: key
-        for what, key in former.get("keys", {}).items()
+        for what, key in recorded.get("keys", {}).items()
         if what.partition(": ")[0] not in names
     }
+    remade, former = rows or RowKeys({}, {})
+    records = dict(recorded.get("tables", {}))
     for name in names:
-        for what in ("content", *determined_by):
-            keys[f"{name}: {what}"] = key = today_of(f"{name}: {what}", file.parent)
-            if what.startswith(("data ", "files ")) and "data" not in key:
+        before = {
+            what: key
+            for what, key in recorded.get("keys", {}).items()
+            if what.startswith(f"{name}: ")
+        }
+        keys[f"{name}: content"] = today_of(f"{name}: content", file.parent)
+        for what in (*determined_by, *former.values(), *remade.values()):
+            key = f"{name}: {what}"
+            if former and key in before and what not in remade.values():
+                keys[key] = before[key]
+            elif what not in former.values():
+                keys[key] = today_of(key, file.parent)
+            else:
+                continue
+            if what.startswith(("data ", "files ")) and "data" not in keys[key]:
                 raise MissingError(
                     f"'{file}' cannot record '{name}': raw files of {what} are not here"
                 )
-    records = former.get("tables", {}) | dict.fromkeys(names, record)
+        groups = [group for group, what in former.items() if f"{name}: {what}" not in before]
+        remark = f"rows of {', '.join(groups)}" if groups else without_keys
+        records[name] = record | ({"without_keys": remark} if remark else {})
     with written_aside(file) as aside:
         aside.write_text(
             json.dumps({"tables": records, "keys": keys}, indent=1, ensure_ascii=False) + "\n",

@@ -7,7 +7,8 @@ hold most of the error: then there is no significant difference. Verdicts, in th
 ==========================  =========================================================================
 not testable                data that are not public would be needed
 not assessed                no errors by block are published of a candidate
-met by a trivial baseline   met, and would be with ``zero`` or ``static_map`` in the candidate's place
+met by a trivial baseline   met, and would be with ``zero`` or ``static_map`` in the candidate's place;
+                            not of a claim that the candidate's error is higher
 reproduced                  met, and the paper's size lies in the interval of ours, or it states none
 direction only              met, but the interval of our size excludes the paper's
 contradicted                significant in the other direction; an interval wholly off the claimed range
@@ -422,20 +423,19 @@ def _verdict_of_size(claim: Claim, size: Contrast) -> tuple[Verdict, str]:
 
 
 def _baseline_in_place(claim: Claim, level: float, blocks: Mapping[Key, BlockErrors]) -> str:
-    """The baseline that is significantly lower too, in place of the one that the claim has lower; empty if none is."""
-    assert claim.candidate is not None
+    """The baseline that is significantly lower too, in the candidate's place; empty if none is.
+
+    A claim that the candidate's error is higher is on a weakness of it, which a baseline with a
+    lower error confirms.
+    """
     assert claim.other is not None
-    better = claim.candidate
-    worse = claim.other
-    part = claim.part
-    worse_part = claim.other_part or claim.part
     if claim.direction == "higher":
-        better, worse = worse, better
-        part, worse_part = worse_part, part
-    against = blocks[Key(worse_part, worse, claim.test_set, claim.metric)]
+        return ""
+    other_part = claim.other_part or claim.part
+    against = blocks[Key(other_part, claim.other, claim.test_set, claim.metric)]
     for name in BASELINES:
-        errors = blocks.get(Key(part, name, claim.test_set, claim.metric))
-        if name in (better, worse) or errors is None:
+        errors = blocks.get(Key(claim.part, name, claim.test_set, claim.metric))
+        if name in (claim.candidate, claim.other) or errors is None:
             continue
         pair = paired_errors(errors, against, claim.metric, f"claim {claim.id!r}, baseline {name}")
         if pair.n_diverged[0] == 0 and pair.is_testable:

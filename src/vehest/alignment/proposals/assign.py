@@ -35,6 +35,7 @@ from vehest.alignment.proposals.turning import (
     CLOSE,
     FAR,
     RARE,
+    SAME_QUANTITY,
     Search,
     Turning,
     find_turning,
@@ -294,7 +295,8 @@ def _expected_ay(
 
 
 def _excess(*scales: float) -> str:
-    size = " to ".join(dict.fromkeys(f"{abs(100.0 * (1.0 / scale - 1.0)):.0f}" for scale in scales))
+    sizes = sorted(abs(100.0 * (1.0 / scale - 1.0)) for scale in scales)
+    size = " to ".join(dict.fromkeys(f"{size:.0f}" for size in sizes))
     return f"{size} % too {'much' if scales[0] < 1.0 else 'little'}"
 
 
@@ -457,10 +459,12 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
     """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
     is_close = abs(math.log(turning.scale)) < FAR
     if "ay" in turning.columns:
-        evidence = f"ay and vx·yaw_rate agree {turning.correlation:.2f}, ay {turning.scale:.3g} times as large in these units"
+        evidence = (
+            f"ay vs. vx·yaw_rate: correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"
+        )
         asked = "" if turning.decided else "other units explain the scale as well"
         if not is_close:
-            asked = f"ay is {turning.scale:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
+            asked = f"ay vs. vx·yaw_rate: gain {turning.scale:.2g} in these units: one of the three is in another unit"
     else:
         evidence = "its name and unit" if turning.decided else "its name and size"
         asked = (
@@ -508,7 +512,9 @@ def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Prop
         if channel is None:
             continue
         column = turning.columns[channel]
-        others = column.name != one.column or any("agrees" in text for text in one.evidence[1:])
+        others = column.name != one.column or any(
+            text.startswith(SAME_QUANTITY) for text in one.evidence[1:]
+        )
         confirming = AGREEING[channel] | (AGREEING["vx"] if is_related else set())
         pieces = [is_related, bool(sure & confirming), others]
         pieces += [bool(column.unit), channel in column.hints]

@@ -325,8 +325,8 @@ def agreement(
         )
     for one in relations:
         if one.left == left:
-            scale = f", {abs(one.scale):.3g} times as large" if math.isfinite(one.tolerance) else ""
-            text = f"{one.text} agree {one.correlation:.2f}{scale}"
+            gain = f", gain {abs(one.scale):.3g}" if math.isfinite(one.tolerance) else ""
+            text = f"{one.text.replace(' and ', ' vs. ')}: correlation {one.correlation:.2f}{gain}"
             return Agreement(
                 channel,
                 unit,

@@ -49,7 +49,7 @@ class Proposal:
 
     @property
     def in_words(self) -> str:
-        """For example ``yaw_rate: column Gyro, deg/s, sign -1: ay/vx agrees 0.97``."""
+        """For example ``yaw_rate: column Gyro, deg/s, sign -1: ay vs. vx·yaw_rate: correlation 0.97``."""
         parts = [f"column {self.column}", self.unit]
         parts += [f"sign {self.sign}"] if self.sign != 1 else []
         parts += [f"factor {self.factor:.5g}"] if self.factor != 1.0 else []

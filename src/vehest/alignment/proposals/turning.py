@@ -46,6 +46,7 @@ SAME = 0.97  # correlation of one quantity measured twice
 SAME_NAMED = {"vx": 0.7, "yaw_rate": 0.9}  # of columns that are named alike; wheels slip
 SAME_AY = 0.99
 SAME_SCALE = 0.35  # logarithm
+SAME_QUANTITY = "same quantity as"  # start of the evidence that a second column measures it
 LIKELY = 2  # units to try; a speed that seems to be in others may be in counts
 
 
@@ -290,7 +291,7 @@ def repeated(search: Search) -> Iterator[Proposal]:
             and column.hint("ay") >= 0.0
         ):
             search.free.remove(column)
-            text = f"'{column.name}' agrees {abs(correlation(column.slow, ay.slow)):.3f}, as of another place or filtered"
+            text = f"{SAME_QUANTITY} '{column.name}', of another place or filtered: correlation {abs(correlation(column.slow, ay.slow)):.3f}"
             yield Proposal(
                 ay.name, "ay", search.turning.units["ay"], search.turning.signs["ay"], (text,)
             )
@@ -353,7 +354,8 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     references = [one for one in plain if one.column.is_reference] or [
         one for one in plain if one not in own
     ]
-    text = f"agrees {min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain):.2f} with the other {channel}"
+    smallest = min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain)
+    text = f"{SAME_QUANTITY} the other {channel}: correlation {smallest:.2f}"
 
     def proposal(
         one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()
@@ -386,7 +388,7 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
             Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",))
             for one in plain
         ]
-    asked = f"which is the car's own {channel}, and which the reference's: no name decides"
+    asked = f"the car's {channel} or that of the reference sensor: the names do not decide"
     roughness = {
         id(one): float(np.std(np.diff(one.column.values, 2)))
         / max(float(np.std(one.column.values)), 1e-12)
@@ -394,6 +396,6 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     }
     rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]
     return [
-        proposal(rough, channel, "the rougher of the two", asked=asked, others=(reference,)),
-        proposal(smooth, reference, "the smoother", asked=asked, others=(channel,)),
+        proposal(rough, channel, "the noisier of the two", asked=asked, others=(reference,)),
+        proposal(smooth, reference, "the less noisy of the two", asked=asked, others=(channel,)),
     ]

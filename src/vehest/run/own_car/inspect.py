@@ -50,8 +50,8 @@ LAYOUT = {
 """Options of a table's layout with their defaults."""
 VEHICLE = {
     "wheelbase": "wheelbase [m], if you know it (for the filter without a reference, the steering ratio, and baselines of the data sheet)",
-    "mass": "mass [kg], if you know it (with the wheelbase, filters over a single track)",
-    "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
+    "mass": "mass [kg], if you know it (with the wheelbase, for single-track filters)",
+    "steering_ratio": "overall steering ratio, if you know it (estimated from slow corners if the wheelbase is known)",
 }
 """Values of the car that no log holds, as questions."""
 

@@ -151,7 +151,7 @@ def questions_of(examined: Examined) -> Iterator[Question]:
             f"in a left turn, does column '{own.column}' count {'up' if own.sign == 1 else 'down'}?"
         )
         signs = ", ".join(f"{one.column} {one.sign:+d}" for one in lateral)
-        evidence = (f"signs that agree with each other, as they would all reversed: {signs}",)
+        evidence = (f"the signs are mutually consistent, and so is the mirrored set: {signs}",)
         yield Question("left_right", text, "yes", ("no",), evidence, "yes or no")
 
 
@@ -160,7 +160,7 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
     for line in question.evidence:
         echo(f"    {line}")
     if question.candidates:
-        echo(f"    other answers: {', '.join(question.candidates)}")
+        echo(f"    alternatives: {', '.join(question.candidates)}")
     text = printable(f"? {question.text} ({question.hint})")
     while True:
         try:
@@ -170,8 +170,9 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
         except typer.Abort:
             if sys.stdin is not None and sys.stdin.isatty():
                 raise
+            echo("")  # ends the line of the prompt
             raise ConfigurationError(
-                "no terminal for questions; add --yes to take what is proposed, or --answer KEY=ANSWER"
+                "no terminal for questions; add --yes to accept all proposals, or --answer KEY=ANSWER"
             ) from None
         try:
             return _answered(examined, question, answer)

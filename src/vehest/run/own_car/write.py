@@ -318,14 +318,17 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
     lines += [f"note: {note}" for note in made.notes]
     lines += [f"warning: {remark}" for remark in made.remarks]
-    lines += ["open, taken as proposed:"] if left else []
+    lines += ["open questions, answered as proposed:"] if left else []
     lines += [
         f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left
     ]
     return [
         *lines,
         *_limits(made),
-        *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items()),
+        *(
+            f"left out: {', '.join(name for name, own in plan.lacking.items() if own == lack)}: {lack}"
+            for lack in dict.fromkeys(plan.lacking.values())
+        ),
     ]
 
 
@@ -492,7 +495,7 @@ def _limits(own: Draft) -> list[str]:
     if not missing and _is_too_short(own):
         lengths = f"{own.seconds:.0f} s in {len(own.durations)} recording{'s' if len(own.durations) > 1 else ''}"
         return [
-            f"{lengths} are too short to train, stop and test on: record two minutes or more with bends, or three drives or more, "
+            f"{lengths} are too short to train, validate and test on: record two minutes or more with bends, or three drives or more, "
             f"with the reference; until then {_without_reference(own)}"
         ]
     if not missing and not _cut(own):
@@ -533,7 +536,7 @@ def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
         f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."
     ]
     head += [
-        f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}."
+        f"Not decided by the log: {question.text} Answered as proposed: {question.proposed or 'nothing'}."
         for question in left
     ]
     for channel, late in made.late.items():
