@@ -31,6 +31,7 @@ from vehest.run.usable import lack
 from vehest.studies.reference_minutes import start_in_words
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
+NOT_TRAINED = "not trained yet"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
 Note = tuple[
@@ -57,6 +58,7 @@ class Comparison:
     found: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
+    reason_unfinished: str = NO_TIME
 
     @property
     def usable(self) -> list[Job]:
@@ -81,7 +83,7 @@ class Comparison:
         """Name of what is left out -> why."""
         return {
             name: failure.message for name, failure in named_failures(self.jobs)
-        } | dict.fromkeys(self.unfinished, NO_TIME)
+        } | dict.fromkeys(self.unfinished, self.reason_unfinished)
 
     def plan(self, runner: Runner) -> Sequence[Group]:
         """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.
