@@ -85,8 +85,9 @@ def publish_study(
 
     CSV files are published with six significant digits (`published_content`).
 
-    A published report that shows data which this run could not read, or more trainings with the same keys, stays. Where keys and all other files are the same, the provenance
-    stays that of the first run with these results.
+    A published report stays that shows data which this run could not read, or more trainings with
+    the same keys. Where keys and all other files are the same, the provenance stays that of the
+    first run with these results.
     Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds something else or is reached by a link.
     """
     if publication is None:

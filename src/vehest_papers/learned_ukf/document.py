@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import REPORT, Block, Document, as_text
-from vehest.report.style import fixed, listed
+from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
@@ -19,7 +19,12 @@ from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import claims_table, one_line
+from vehest_papers.kit.verdict_table import (
+    CLAIMS,
+    claims_table,
+    decided_claims,
+    one_line,
+)
 from vehest_papers.learned_ukf import (
     block_errors,
     coverage,
@@ -40,9 +45,8 @@ NAME = "learned_ukf"  # of the paper's package
 TEMPLATE = Path(__file__).with_name("report.md.j2")
 MAIN = "real"
 LIKELIHOOD = "likelihood"
-SCRATCH = "scratch"
 LENGTH = "length_"
-VARIANTS = ("diagonal", SCRATCH, "curvature")  # parts with a variant of a candidate
+VARIANTS = ("diagonal", block_errors.SCRATCH, "curvature")  # parts with a variant of a candidate
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_FIRST = (paper.NNTF_UH, paper.NNTF, paper.NN_U, paper.PC, paper.GRU, paper.LSTM, "zero")
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
@@ -80,30 +84,39 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     rows = block_errors.error_rows(artefacts.parts)
     outcome = _outcome(MAIN, part, artefacts, blocks_of(rows), data)
     rows += [*outcome.rows, *block_errors.rise_rows(MAIN, part, rows)]
-    if SCRATCH in artefacts.parts:
-        rows += block_errors.scratch_rows(SCRATCH, artefacts.parts[SCRATCH], part)
-    trained = block_errors.training_rows(artefacts.parts, MAIN)
+    if block_errors.SCRATCH in artefacts.parts:
+        scratch = artefacts.parts[block_errors.SCRATCH]
+        rows += block_errors.scratch_rows(block_errors.SCRATCH, scratch, part)
+    not_trained = block_errors.seeds_not_trained(artefacts.not_trained)
+    trained = block_errors.training_rows(artefacts.parts, MAIN, not_trained)
     kinds = {
         block_errors.part_name(name): words_of_kinds(own) for name, own in artefacts.parts.items()
     }
     claims = claims_table(content, rows, trained, kinds)
-    values = _values(artefacts, part, content, rows)
+    values = _values(artefacts, part, content, rows, trained)
     blocks = [
-        *fill_template(TEMPLATE, values, [*outcome.front, claims]),
+        *fill_template(TEMPLATE, values, [*outcome.front, decided_claims(claims)]),
         *outcome.appendix,
         *how_it_was_made(artefacts, {MAIN: part}, data),
     ]
+    data |= {CLAIMS: claims.frame}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
 def _values(
-    artefacts: StudyArtefacts, part: PartArtefacts, content: Paper, rows: Sequence[BlockRow]
+    artefacts: StudyArtefacts,
+    part: PartArtefacts,
+    content: Paper,
+    rows: Sequence[BlockRow],
+    trained: Sequence[TrainingRow],
 ) -> dict[str, object]:
     """Numbers and names that the template has places for."""
     blocks = blocks_of(rows)
+    seeds = {key.candidate: len(errors.seeds) for key, errors in blocks.items() if key.part == MAIN}
     main_rows = [
-        {"name": name} | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
+        {"name": name, "seeds": seeds.get(name, 0) or MISSING}
+        | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
         for name in SHOWN_FIRST
     ]
     return {
@@ -114,27 +127,23 @@ def _values(
         "main_rows": main_rows,
         "authors": {test: fixed(value, 4) for test, value in paper.AUTHORS_CODE.items()},
         "absent_parts": absent_parts(artefacts),
-        "missing": _missing(artefacts, content, rows),
+        "not_trained": [row.candidate for row in trained if row.training == "not trained"],
+        "fewer_seeds": [
+            {
+                "name": row.candidate,
+                "seeds": seeds.get(row.candidate, 0),
+                "planned": row.seeds_planned,
+            }
+            for row in trained
+            if row.seeds_planned and row.training != "not trained"
+        ],
+        "parts_not_done": [
+            artefacts.titles[name]
+            for name in artefacts.titles
+            if name in artefacts.not_trained and name not in artefacts.parts
+        ],
+        "n_not_trained": sum(len(names) for names in artefacts.not_trained.values()),
     }
-
-
-def _missing(artefacts: StudyArtefacts, content: Paper, rows: Sequence[BlockRow]) -> list[str]:
-    """Candidates of the claims that are not trained yet, and trainings of the parts that are there."""
-    scored = {row.candidate for row in rows}
-    absent = [name for name in content.candidates if name not in scored]
-    unfinished = [
-        f"{artefacts.titles.get(name, name)} has {len(part.models)} of {len(part.models) + len(part.failed)}"
-        for name, part in artefacts.parts.items()
-        if part.failed
-    ]
-    lines = []
-    if absent:
-        lines.append(
-            f"**Not trained yet, so that claims on them are not assessed:** {'; '.join(absent)}."
-        )
-    if unfinished:
-        lines.append(f"Trainings that are there: {'; '.join(unfinished)}.")
-    return lines
 
 
 def _outcome(
