@@ -39,6 +39,9 @@ from vehest_papers.learned_ukf.prediction import AFTER, BEFORE, Compared
 
 DOUBLED = "doubled"
 FOLD = re.compile(r"(tyre_a_fold)_\d+")
+LIKELIHOOD = "likelihood"
+GIVEN_NOISE = "given_noise"
+NAMED_ALIKE = (DOUBLED, LIKELIHOOD, GIVEN_NOISE)  # parts whose candidates have the names of others
 SCRATCH = "scratch"
 LENGTH = re.compile(r"length_(\d+)(_samples)?")
 LONGEST = 500  # samples of a sequence, which both ways of Figure 7 share
@@ -207,7 +210,7 @@ def rise_rows(name: str, part: PartArtefacts, rows: Sequence[BlockRow]) -> list[
 def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """Candidate as blocks.csv has it -> number of its trainings that are planned and not done.
 
-    Those with twice the epochs, of folds and of searches belong to no candidate.
+    Those of `NAMED_ALIKE` and of folds belong to no candidate of their own.
 
     Parameters
     ----------
@@ -216,7 +219,7 @@ def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int
     """
     counts: Counter[str] = Counter()
     for part, names in not_trained.items():
-        if part == DOUBLED or FOLD.fullmatch(part):
+        if part in NAMED_ALIKE or FOLD.fullmatch(part):
             continue
         for name in names:
             from_scratch = paper.FROM_SCRATCH if part == SCRATCH else ""
