@@ -54,6 +54,7 @@ from vehest_papers.learned_ukf.filtering import (
     swapped,
 )
 from vehest_papers.learned_ukf.lengths import lengths
+from vehest_papers.learned_ukf.order import order_lines
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
 
@@ -750,3 +751,19 @@ def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
     vy = [row for row in found if row.metric == "rmse_vy" and row.test_set == "tyre_a"]
     assert {row.part for row in vy} == {"tyre_a_folds"}
     assert [row.block for row in vy] == [f"{name} {k}.00 s" for name in "ad" for k in range(3)]
+
+
+def test_order_of_methods_trained_anew_is_compared_with_the_published_one(tmp_path):
+    published = tmp_path / "overview.csv"
+    rows = ["candidate,ours_tyre_a,ours_tyre_d", "NNTF_UH,0.009,0.018", "PC,0.03,0.06"]
+    published.write_text("\n".join([*rows, "zero,0.12,0.14"]) + "\n", encoding="utf-8")
+    trained = [
+        {"candidate": "NNTF_UH", "ours_tyre_a": 0.04, "ours_tyre_d": 0.05},
+        {"candidate": "PC", "ours_tyre_a": 0.035, "ours_tyre_d": 0.07},
+        {"candidate": "GRU", "ours_tyre_a": 0.01, "ours_tyre_d": 0.09},
+    ]
+    first, second = order_lines(trained, published)
+    assert first.startswith("tyre A: GRU 0.0100 < PC 0.0350 < NNTF_UH 0.0400; another order of")
+    assert "another order of NNTF_UH and PC as in" in first
+    assert second.startswith("tyre D: NNTF_UH 0.0500 < PC 0.0700 < GRU 0.0900; same order")
+    assert second.endswith("; not published: GRU")
