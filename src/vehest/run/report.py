@@ -22,7 +22,7 @@ from vehest.data.splits import VALIDATION
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
-from vehest.run.comparison import Comparison, name_in_part
+from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
@@ -88,6 +88,7 @@ def draw_report(
         name_in_part(part_name, name, shown): reason
         for part_name, part in shown.items()
         for name, reason in part.failed.items()
+        if reason != NOT_TRAINED  # the run prints how many these are
     }
     shown_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(

@@ -116,9 +116,10 @@ def _values(
     blocks = blocks_of(rows)
     seeds = {key.candidate: len(errors.seeds) for key, errors in blocks.items() if key.part == MAIN}
     main_rows = [
-        {"name": name, "seeds": seeds.get(name, 0) or MISSING}
+        {"name": name, "seeds": seeds[name]}
         | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
         for name in SHOWN_FIRST
+        if name in seeds
     ]
     return {
         "recommendation": one_line(content.recommendation),

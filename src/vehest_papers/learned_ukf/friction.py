@@ -163,8 +163,10 @@ def figure(
         grid[0].set_ylabel("friction [1]")
         legend_above(drawn, grid[0], columns=4)
     first = next(iter(next(iter(tracks.values())).values()))
+    n_seeds = len(first.mean)
+    seeds = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
     caption = (
-        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {len(first.mean)} seeds; shaded: 95 % interval of the mean over "
+        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {seeds}; shaded: 95 % interval of the mean over "
         f"sequences. Grey: not scored. Data: {data}."
     )
     return Figure(f"friction_{name}", caption, drawn)
