@@ -86,6 +86,7 @@ PARTS_AWAY = {
 
 
 FACTORIAL = re.compile(r"factorial_(plain|smooth)_(paper|free)")  # tyre curve, process noise
+FLOOR = re.compile(r"floor_(1e-\d)")  # ε of Eq. 6 [rad²]
 
 RENAMED: Mapping[str, Mapping[str, str]] = {
     "before": {paper.CNN: paper.BEFORE},
@@ -100,6 +101,8 @@ def name_in(part: str, candidate: str) -> str:
     if (point := FACTORIAL.fullmatch(part)) is not None:
         words = "paper's" if point[2] == "paper" else point[2]
         return f"{candidate.partition(',')[0]} ({point[1]} tyres, {words} noise)"
+    if (point := FLOOR.fullmatch(part)) is not None:
+        return f"{candidate}, ε = {point[1]} rad²"
     return RENAMED.get(part, {}).get(candidate, candidate)
 
 
