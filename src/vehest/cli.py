@@ -715,6 +715,15 @@ def run(
     retrain: Annotated[
         bool, typer.Option("--retrain", help="Train also what is published with weights.")
     ] = False,
+    train_missing: Annotated[
+        bool | None,
+        typer.Option(
+            "--train-missing/--no-train-missing",
+            help="Train what is neither here nor published, or leave it out and name it in the report. By default it is trained, unless "
+            "results/STUDY is published without some trainings.",
+            show_default=False,
+        ),
+    ] = None,
     publish_weights: Annotated[
         bool,
         typer.Option(
@@ -738,6 +747,7 @@ def run(
         jobs,
         minutes=minutes,
         retrain=retrain,
+        train_missing=train_missing,
         publish_weights=publish_weights,
         launcher=launcher,
         address=address,

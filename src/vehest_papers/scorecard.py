@@ -239,7 +239,7 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         *_table_of_counts(
             studies,
             "training",
-            TRAINING_STATES[::-1],
+            [state for state in TRAINING_STATES[::-1] if state != "not trained"],
             [study.counts_of_training() for study in studies],
         ),
         "",

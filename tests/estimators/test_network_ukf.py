@@ -350,3 +350,14 @@ def test_one_recording_decides_less_where_recordings_count():
         )
     )
     assert np.sqrt(both) == pytest.approx(0.5 * (np.sqrt(first) + np.sqrt(second)))
+
+
+@pytest.mark.parametrize("least_variance", [1e-6, 1e-8])
+def test_floor_of_the_variance_is_a_setting_of_both_hybrids(least_variance):
+    variance = np.array([0.0, 1e-12, 1e-7])
+    scaled = scaled_variance(variance, np.array([0.0, 1.0]), least_variance)
+    np.testing.assert_allclose(scaled, variance + least_variance, rtol=1e-6, atol=1e-11)
+    estimator = estimator_class("cnn_ukf").from_config({"least_variance": least_variance})
+    estimator.network = estimator.new_network()
+    found = estimator.output_of(torch.full((2, 4), -40.0))
+    np.testing.assert_allclose(found.variance.numpy(), least_variance, rtol=1e-6)

@@ -30,10 +30,11 @@ from vehest.evaluation.metrics import (
 from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts, Trial
 from vehest.training.through_filter import Drive
-from vehest_papers.kit.block_errors import BlockErrors, Key
+from vehest_papers.kit.block_errors import BlockErrors, Key, read_training
 from vehest_papers.kit.block_rows import BlockRow, checked_training
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import metric_values
+from vehest_papers.kit.verdict_table import DECIDED
 from vehest_papers.kit.verdicts import VERDICTS
 from vehest_papers.learned_ukf import block_errors, documents, friction, measures, paper, tables
 from vehest_papers.learned_ukf.budgets import samples_trained_on, validation_losses
@@ -53,6 +54,7 @@ from vehest_papers.learned_ukf.filtering import (
     swapped,
 )
 from vehest_papers.learned_ukf.lengths import lengths
+from vehest_papers.learned_ukf.order import order_lines
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
 
@@ -294,28 +296,21 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     }
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {
-        "claims",
-        "budgets_real",
+        "decided_claims",
         "overview",
-        "sequence_length",
-        *(
-            f"{name}_real"
-            for name in (
-                "table_1",
-                "table_2",
-                "by_state",
-                "consistency",
-                "budget",
-                "friction",
-                "start",
-                "coverage",
-            )
-        ),
+        *(f"{name}_real" for name in ("consistency", "friction", "start", "coverage")),
     }
-    table = next(
-        block for block in document.blocks if isinstance(block, Table) and block.name == "claims"
-    )
-    claims = table.frame.set_index("id")
+    files = {"claims", "budgets_real", "sequence_length", "data"}
+    files |= {f"{name}_real" for name in ("table_1", "table_2", "by_state", "budget")}
+    assert set(document.data) >= files
+    claims = document.data["claims"].set_index("id")
+    decided = next(
+        block
+        for block in document.blocks
+        if isinstance(block, Table) and block.name == "decided_claims"
+    ).frame
+    assert set(decided["verdict"]) <= set(DECIDED)
+    assert len(decided) == claims["verdict"].isin(DECIDED).sum()
     content = claims_of("learned_ukf")
     assert set(claims.index) == {claim.id for claim in content.claims}
     assert set(claims["verdict"]) <= set(VERDICTS)
@@ -331,14 +326,12 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
         assert claims.loc[measured, "verdict"] != "not assessed"
     assert claims.loc["nntf_below_pc_tyre_a", "verdict"] == "not assessed"
     assert "no per-block errors of PC" in claims.loc["nntf_below_pc_tyre_a", "why"]
-    absent = next(
-        block for block in document.blocks if isinstance(block, str) and "Not trained yet" in block
-    )
-    assert "PCR" in absent
-    assert "NNTF_UH*" not in absent
     first_300 = " ".join(text.split()[:300])
-    for word in ("**Question.**", "**Answer.**", "**Evidence.**"):
+    for word in ("**Question.**", "**Answer.**", "**Evidence.**", "**Recommendation.**"):
         assert word in first_300
+    assert "| the authors' public code, NNTF_UH | 0.0158 | 0.0441 | 1 |" in first_300
+    assert "Not complete" not in text
+    assert len(text.split()) <= 3000
     template = (Path(documents.__code__.co_filename).parent / "report.md.j2").read_text()
     assert len(template.split()) <= 3000
     assert "{% if" not in template
@@ -346,7 +339,6 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
         f"{name}_real" for name in ("slip_density", "traces", "figure_5", "figure_6")
     }
     assert "SIMULATED data of a small racing car" in text
-    assert "gave 0.0158 on tyre A and 0.0441 on tyre D" in text
     assert "Not in this report, since the recordings are missing: Curved tyres" in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
@@ -528,6 +520,8 @@ def test_starts_agree_as_soon_as_all_of_them_stay_within_the_limit():
     assert measures.final_deviations(by_start[0.3], 0.45) == pytest.approx(
         np.array([[abs(np.mean([0.3, 0.40, 0.45, 0.47, 0.5, 0.5]) - 0.45)]])
     )
+    covered = tracks([0.9, 0.40, 0.50, 0.60, 0.44], deviation=0.1).covered(0.45, 0.1)
+    assert covered == pytest.approx(np.array([[0.75]])), "three of the four after 0.1 s"
     apart = {0.3: tracks([0.3] * 4), 0.6: tracks([0.6] * 4), 0.9: tracks([0.9] * 4)}
     assert measures.agreement_times(apart) == pytest.approx(np.array([[0.4]])), "never"
 
@@ -556,23 +550,47 @@ def test_validation_losses_from_scratch_are_held_against_the_worst_pre_trained_s
 
 def test_report_is_drawn_with_one_candidate_alone(part, tmp_path, monkeypatch):
     undrawn(monkeypatch)
-    unfinished = replace(only(part, "GRU"), failed={"learned_ukf-nntf_uh-seed0": "not done yet"})
+    not_trained = {
+        "real": [
+            "learned_ukf-nntf_uh-seed0",
+            "learned_ukf-nntf_u-seed1",
+            "velocity_gru-states_64-seed2",
+        ],
+        "scratch": ["learned_ukf-nntf_uh-seed0"],
+        "length_250": ["learned_ukf-nntf_u-seed0"],
+        "doubled": ["learned_ukf-pc-seed0"],
+    }
+    titles = dict.fromkeys(not_trained, "T")
     artefacts = StudyArtefacts(
-        "learned_ukf", "t", "a", "c", {"real": "Tyre sets", "scratch": "S"}, {"real": unfinished}
+        "learned_ukf",
+        "t",
+        "a",
+        "c",
+        titles,
+        {"real": only(part, "GRU")},
+        not_trained=not_trained,
     )
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
-    assert "Not trained yet, so that claims on them are not assessed:** PC; PCR" in text
-    assert "Trainings that are there: Tyre sets has 2 of 3." in text
-    claims = pd.read_csv(tmp_path / "tables" / "claims.csv")
+    said = " ".join(text.split())
+    assert "**Not complete:** 6 planned trainings are not done." in said
+    assert "where fewer than planned: GRU 2 of 3." in said
+    assert (
+        "not assessed: NNTF_UH; NNTF_U; NNTF_UH from scratch; NNTF_U, 250 steps, constant" in said
+    )
+    assert "without any training: `scratch`, `length_250`, `doubled`." in said
+    claims = pd.read_csv(tmp_path / "tables" / "claims.csv").set_index("id")
     assert set(claims["verdict"]) == {"not assessed", "not testable"}
+    assert claims.loc["nntf_uh_below_gru_tyre_a", "why"] == "NNTF_UH is not trained"
+    assert claims.loc["nntf_uh_below_nntf_u_tyre_a", "why"] == "NNTF_UH and NNTF_U are not trained"
     blocks = pd.read_csv(tmp_path / "tables" / "blocks.csv")
     assert set(blocks["candidate"]) == {"GRU"}
-    assert pd.read_csv(tmp_path / "tables" / "training.csv")["training"].tolist() == [
-        "not checked",
-        *["not applicable"] * 3,
-    ]
+    trained = read_training(tmp_path / "tables" / "training.csv")
+    assert (trained["GRU"].state, trained["GRU"].seeds_planned) == ("not checked", 3)
+    assert (trained["NNTF_UH"].state, trained["NNTF_UH"].seeds_planned) == ("not trained", 1)
+    assert trained["zero"].state == "not applicable"
+    assert "PC" not in trained, "twice the epochs are no candidate"
 
 
 @pytest.mark.parametrize("name", ["learned_ukf", "cnn_ukf"])
@@ -733,3 +751,19 @@ def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
     vy = [row for row in found if row.metric == "rmse_vy" and row.test_set == "tyre_a"]
     assert {row.part for row in vy} == {"tyre_a_folds"}
     assert [row.block for row in vy] == [f"{name} {k}.00 s" for name in "ad" for k in range(3)]
+
+
+def test_order_of_methods_trained_anew_is_compared_with_the_published_one(tmp_path):
+    published = tmp_path / "overview.csv"
+    rows = ["candidate,ours_tyre_a,ours_tyre_d", "NNTF_UH,0.009,0.018", "PC,0.03,0.06"]
+    published.write_text("\n".join([*rows, "zero,0.12,0.14"]) + "\n", encoding="utf-8")
+    trained = [
+        {"candidate": "NNTF_UH", "ours_tyre_a": 0.04, "ours_tyre_d": 0.05},
+        {"candidate": "PC", "ours_tyre_a": 0.035, "ours_tyre_d": 0.07},
+        {"candidate": "GRU", "ours_tyre_a": 0.01, "ours_tyre_d": 0.09},
+    ]
+    first, second = order_lines(trained, published)
+    assert first.startswith("tyre A: GRU 0.0100 < PC 0.0350 < NNTF_UH 0.0400; another order of")
+    assert "another order of NNTF_UH and PC as in" in first
+    assert second.startswith("tyre D: NNTF_UH 0.0500 < PC 0.0700 < GRU 0.0900; same order")
+    assert second.endswith("; not published: GRU")

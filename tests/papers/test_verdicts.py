@@ -266,6 +266,22 @@ def test_candidate_that_was_trained_once_gets_no_verdict():
     assert judged(limit, studied(a=LEVELS), {}).verdict == "reproduced"
 
 
+def test_candidates_that_are_not_trained_are_named_and_fewer_seeds_than_planned_counted():
+    trained = {
+        "a": Training("10", "1000", "not checked", "", 5),
+        "b": Training("", "1000", "not trained", "", 5),
+    }
+    twice = studied(a=[ratio(0.5), ratio(0.5)])
+    found = judged(claim_of(), twice, trained)
+    assert (found.verdict, found.reason) == ("not assessed", "b is not trained")
+    assert judged(claim_of(), {}, trained).reason == "b is not trained"
+    trained["b"] = Training("10", "1000", "not checked", "", 0)
+    found = judged(claim_of(), studied(a=[ratio(0.5), ratio(0.5)], b=[LEVELS] * 5), trained)
+    assert found.verdict == "reproduced"
+    assert found.reason.endswith("; a with 2 of 5 seeds")
+    assert "no per-block errors of b" in judged(claim_of(), twice, {}).reason
+
+
 def test_a_claim_has_the_training_of_its_least_trained_candidate():
     trained = {
         "a": Training("10", "1000", "insufficient", ""),

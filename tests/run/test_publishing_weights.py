@@ -11,6 +11,7 @@ import pytest
 from place import write_drives
 from vehest.artefacts.artefact import read_artefact
 from vehest.data.files import ASIDE_PREFIX
+from vehest.data.text_files import read_json
 from vehest.run import runner, weights
 from vehest.run.weights import PublishedWeights, WeightsTooLargeError
 
@@ -198,3 +199,84 @@ def test_what_is_not_published_as_it_is_or_somewhere_else_is_refused(pair):
     other.parent.mkdir(parents=True)
     other.write_text("mine", encoding="utf-8")
     pair.refused(*RUN, code=2, says="holds files that vehest did not publish")
+
+
+PUBLISH = (*RUN[:3], "--no-train-missing", "--jobs", "1")
+
+
+def published_files(pair):
+    folder = pair.folder / "results/pair"
+    return {
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file() and file.name != "provenance.json"
+    }
+
+
+def said_by_report(pair):
+    return (pair.folder / "results/pair/report.md").read_text()
+
+
+def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others(pair, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_once_published(patch, 3)
+        pair(*RUN)
+    assert len(PublishedWeights(pair.folder / FILE)._models) == 3
+    shutil.rmtree("outputs")
+    pair.change("results/stale.yaml", pair="its second part is not trained")
+    _, err = pair.done(*PUBLISH)
+    assert "epochs," not in err, "nothing is trained"
+    said = " ".join(err.split())
+    assert "3 of 6 not done" in said
+    assert "vehest run pair tracking=none --train-missing" in said
+    assert "nothing could be trained or scored: back" in said_by_report(pair)
+    assert read_json(pair.folder / "results/pair/provenance.json")["n_not_trained"] == 3
+    incomplete = published_files(pair)
+
+    code, out, _ = pair("report", "--check")
+    assert (code, "pair: up to date: published without 3 trainings" in out) == (0, True)
+    (pair.folder / "results/stale.yaml").unlink()
+    code, out, _ = pair("report", "--check")
+    assert code == 3, "an incomplete study has to be listed with its reason"
+
+    shutil.rmtree("outputs")
+    _, err = pair.done(*RUN[:3])
+    assert "epochs," not in err, "a fresh clone repeats what is published"
+    assert published_files(pair) == incomplete
+
+    _, err = pair.done(*RUN[:3], "--train-missing")
+    assert err.count("epochs,") == 2, "two seeds of the second part"
+    assert "n_not_trained" not in read_json(pair.folder / "results/pair/provenance.json")
+    assert pair("report", "--check")[:2] == (0, "pair: up to date\n")
+    complete = published_files(pair)
+    shutil.rmtree("outputs")
+    (pair.folder / FILE).write_bytes(incomplete["weights.safetensors"])
+    _, err = pair.done(*PUBLISH)
+    refusal = "not published: 'results/pair' shows 3 trainings that this run lacks"
+    assert refusal in " ".join(err.split())
+    assert said_by_report(pair).encode() == complete["report.md"]
+
+
+def test_an_incomplete_study_is_stale_once_its_configuration_changes(pair, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_once_published(patch, 3)
+        pair(*RUN)
+    pair.change("results/stale.yaml", pair="its second part is not trained")
+    pair.done(*PUBLISH)
+    pipeline = pair.change("pipelines/pair.yaml")
+    pipeline["parts"]["back"]["sweeps"] = [LUENBERGER, [*GRU[:3], "training.max_epochs=3"]]
+    pair.change("pipelines/pair.yaml", parts=pipeline["parts"])
+    assert (
+        "pair: stale: configuration (back: train gru); published without 3"
+        in pair("report", "--check")[1]
+    )
+
+
+def test_what_is_missing_is_announced_before_it_is_trained(pair, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_once_published(patch, 3)
+        pair(*RUN)
+    _, err = pair.done(*RUN[:3])
+    assert "note train 3 of 6 are neither here nor published, and are trained" in " ".join(
+        err.split()
+    )

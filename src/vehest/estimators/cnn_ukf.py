@@ -19,7 +19,7 @@ from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.sample_network import (
     SampleNetwork,
     clip_sideslip,
@@ -84,11 +84,12 @@ class NetworkOutput(NamedTuple):
     sideslip: Tensor  # β_DD (...) [rad]
     distrust: Tensor  # σ_DD (...) [rad]
     process: Tensor  # σ_Vy and σ_ψ̇ (..., 2) [m/s, rad/s], of one sample's step
+    least_variance: float  # ε [rad²]
 
     @property
     def variance(self) -> Tensor:
         """Of the sideslip angle as a measurement [rad²]."""
-        return self.distrust.square() + LEAST_VARIANCE
+        return self.distrust.square() + self.least_variance
 
 
 class Cuts(NamedTuple):
@@ -163,7 +164,10 @@ class CnnUkf(NetworkUkf):
         """Outputs of the network, (..., 4), as angle and noise."""
         shares = torch.sigmoid(outputs[..., 1:].double())
         return NetworkOutput(
-            outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:]
+            outputs[..., 0].double() * self.network.unit.double(),
+            shares[..., 0],
+            shares[..., 1:],
+            self.least_variance,
         )
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:

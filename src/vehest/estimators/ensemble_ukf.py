@@ -139,7 +139,7 @@ class EnsembleUkf(NetworkUkf):
 
         def cost(scaling: FloatArray) -> float:
             pseudo = [
-                PseudoMeasurement(sideslip, scaled_variance(variance, scaling))
+                PseudoMeasurement(sideslip, scaled_variance(variance, scaling, self.least_variance))
                 for sideslip, variance in found
             ]
             return self.mean_squared_error(
@@ -160,7 +160,8 @@ class EnsembleUkf(NetworkUkf):
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
         """Mean of the networks, and its scaled variance."""
         sideslip, variance = self._mean_and_variance(inputs)
-        return PseudoMeasurement(sideslip, scaled_variance(variance, self.scaling))
+        scaled = scaled_variance(variance, self.scaling, self.least_variance)
+        return PseudoMeasurement(sideslip, scaled)
 
     def c_values(self) -> dict[str, Any]:
         """With the scaling of the variance."""
@@ -189,10 +190,12 @@ class EnsembleUkf(NetworkUkf):
         self.scaling = scaling
 
 
-def scaled_variance(variance: FloatArray, scaling: FloatArray) -> FloatArray:
+def scaled_variance(
+    variance: FloatArray, scaling: FloatArray, least_variance: float = LEAST_VARIANCE
+) -> FloatArray:
     """10^p₁ (σ²)^p₂, and ε on top so that no filter takes it for exact; (T,) [rad²] (Eq. 11)."""
     size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, LEAST_SPREAD))
-    return LEAST_VARIANCE + 10.0 ** np.clip(size, *MOST_SIZE)
+    return least_variance + 10.0 ** np.clip(size, *MOST_SIZE)
 
 
 ESTIMATOR = EnsembleUkf

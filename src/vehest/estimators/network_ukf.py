@@ -11,13 +11,14 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord
 from vehest.estimators.dugoff_ukf import CHANNELS, DugoffUkf, PseudoMeasurement
 from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetworkEstimator
 from vehest.training.context import FitContext
 
 LEAST_VARIANCE = 1e-6
-"""Added to the variance of a network's angle [rad²], so that no filter takes it for exact; ε of Bertipaglia et al. 2024, Eq. 6."""
+"""Usual ε of Bertipaglia et al. 2024, Eq. 6 [rad²]: a deviation of 0.057°."""
 
 
 class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
@@ -28,6 +29,12 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     """
 
     skippable = ()
+    least_variance: float = setting(
+        LEAST_VARIANCE,
+        "added to the variance of the network's angle, so that no filter takes it for exact; ε of Eq. 6",
+        unit="rad²",
+        positive=True,
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -130,6 +137,6 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         return values | {
             "network": True,
             "seen": self.network_inputs,
-            "least_variance": LEAST_VARIANCE,
+            "least_variance": self.least_variance,
             "m": values["m"] + 1,
         }

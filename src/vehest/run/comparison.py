@@ -33,6 +33,7 @@ from vehest.run.usable import lack
 from vehest.studies.reference_minutes import start_in_words
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
+NOT_TRAINED = "not trained yet"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
 Note = tuple[
@@ -62,6 +63,7 @@ class Comparison:
     differences: Mapping[str, Differences] = field(
         default_factory=dict
     )  # key of a training -> options in which it differs from others of its variant and seed
+    reason_unfinished: str = NO_TIME
 
     @property
     def usable(self) -> list[Job]:
@@ -91,7 +93,7 @@ class Comparison:
         """Name of what is left out -> why."""
         return {
             name: failure.message for name, failure in named_failures(self.jobs)
-        } | dict.fromkeys(self.unfinished, NO_TIME)
+        } | dict.fromkeys(self.unfinished, self.reason_unfinished)
 
     def plan(self, runner: Runner) -> Sequence[Group]:
         """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.

@@ -198,7 +198,12 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
         settled.add(study)
     names = {file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")} - settled
     for verdict in check_published(sorted(names), overrides) if names or not settled else ():
-        if verdict["state"] == "up to date" and verdict["study"] in reasons:
+        is_incomplete = verdict["n_not_trained"] > 0
+        if is_incomplete and verdict["study"] not in reasons:
+            verdict["failure"] = f"it is incomplete, and not in '{RESULTS / STALE_LIST}'"
+        elif is_incomplete and verdict["state"] == "up to date":
+            pass  # the list says what will complete it
+        elif verdict["state"] == "up to date" and verdict["study"] in reasons:
             verdict["failure"] = f"it is up to date; remove it from '{RESULTS / STALE_LIST}'"
         elif verdict["state"] != "up to date" and verdict["study"] not in reasons:
             verdict["failure"] = f"it is not in '{RESULTS / STALE_LIST}'"
@@ -261,17 +266,25 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
         except ConfigurationError as error:
             note = f"today it cannot be run ({error})"
         state = "stale" if changes else "up to date"
-    return _outcome(study, state, changes, note)
+    n_not_trained = 0 if published is None else published.n_not_trained
+    if n_not_trained:
+        note = "; ".join(filter(None, (f"published without {n_not_trained} trainings", note)))
+    return _outcome(study, state, changes, note, n_not_trained)
 
 
 def _outcome(
-    study: str, state: str, changes: Sequence[tuple[str, str]] = (), note: str = ""
+    study: str,
+    state: str,
+    changes: Sequence[tuple[str, str]] = (),
+    note: str = "",
+    n_not_trained: int = 0,
 ) -> dict[str, Any]:
     return {
         "study": study,
         "state": state,
         "changes": [{"what": what, "cause": cause} for what, cause in changes],
         "note": note,
+        "n_not_trained": n_not_trained,
     }
 
 

@@ -41,6 +41,7 @@ class Publication:
         str, str
     ]  # name of a part or data set that the study went on without -> the same for people
     keys: Keys  # `vehest.run.published.keys_of_study`
+    n_not_trained: int = 0  # trainings that the report names as missing
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Published:
     parts: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
     keys: Keys = field(default_factory=dict)  # empty where they were not recorded yet
+    n_not_trained: int = 0  # trainings that the report names as missing
     tables: dict[str, TableRecord] = field(default_factory=dict)  # of a folder without a pipeline
 
 
@@ -83,8 +85,9 @@ def publish_study(
 
     CSV files are published with six significant digits (`published_content`).
 
-    A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
-    stays that of the first run with these results.
+    A published report stays that shows data which this run could not read, or more trainings with
+    the same keys. Where keys and all other files are the same, the provenance stays that of the
+    first run with these results.
     Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds something else or is reached by a link.
     """
     if publication is None:
@@ -99,13 +102,17 @@ def publish_study(
     if lost:
         messages.warn(f"not published: '{folder}' shows {lost[0]}, and this run could not read it")
         return None
+    n_fewer = publication.n_not_trained - former.n_not_trained
+    if n_fewer > 0 and former.keys and not changed_keys(former.keys, publication.keys):
+        messages.warn(f"not published: '{folder}' shows {n_fewer} trainings that this run lacks")
+        return None
     with held(Lock(report.folder.parents[1], "publish", publication.study), lambda: False):
-        if _is_published(report, folder, publication.keys):
+        if _is_published(report, folder, publication):
             return folder
         if changed := uncommitted_changes():
             messages.warn(f"not published: {changed}")
             return None
-        _publish(report, folder, publication.keys)
+        _publish(report, folder, publication)
         messages.line("done", "publish", str(folder))
     return folder
 
@@ -149,11 +156,13 @@ def _contents(report: Artefact) -> dict[str, bytes]:
     return {name: published_content(report.folder / name) for name in names}
 
 
-def _is_published(report: Artefact, folder: Path, keys: Keys) -> bool:
+def _is_published(report: Artefact, folder: Path, publication: Publication) -> bool:
     """Whether a folder holds these results already, its provenance aside."""
     check_results_folder(folder)
     former = published_in(folder)
-    if former is None or changed_keys(former.keys, keys):
+    if former is None or changed_keys(former.keys, publication.keys):
+        return False
+    if former.n_not_trained != publication.n_not_trained:
         return False
     present = {
         file.relative_to(folder).as_posix(): sha256_of(file)
@@ -166,13 +175,15 @@ def _is_published(report: Artefact, folder: Path, keys: Keys) -> bool:
     return {**present, PROVENANCE: ""} == {**needed, PROVENANCE: ""}
 
 
-def _publish(report: Artefact, folder: Path, keys: Keys) -> None:
+def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
     contents = _contents(report)
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
             (aside / name).write_bytes(content)
-        about = {**read_json(report.folder / PROVENANCE), "keys": keys}
+        about = {**read_json(report.folder / PROVENANCE), "keys": publication.keys}
+        if publication.n_not_trained:
+            about["n_not_trained"] = publication.n_not_trained
         (aside / PROVENANCE).write_text(
             json.dumps(about, indent=1, ensure_ascii=False) + "\n",
             encoding="utf-8",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from vehest.data.splits import VALIDATION
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
-from vehest.run.comparison import Comparison, name_in_part
+from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
@@ -79,13 +80,17 @@ def draw_report(
 ) -> tuple[Artefact, TerminalSummary]:
     """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent.
 
-    Trials of searches are in no part, so that a report is the same whether they were trained here or published before.
+    Trials of searches are in no part, so that a report is the same whether they were trained here or published before. The weights of an
+    incomplete study include all that were published before, so that no training is lost.
     """
+    is_complete = not any(part.unfinished for part in comparisons.values())
+    comparisons = {name: part for name, part in comparisons.items() if name not in study.trials}
     shown = {name: part for name, part in comparisons.items() if part.members}
     left_out = {
         name_in_part(part_name, name, shown): reason
         for part_name, part in shown.items()
         for name, reason in part.failed.items()
+        if reason != NOT_TRAINED  # the run prints how many these are
     }
     shown_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(
@@ -99,6 +104,9 @@ def draw_report(
             for name, part in shown.items()
         },
         absent=[name for name in shown_parts if name not in comparisons],
+        not_trained={
+            name: part.unfinished for name, part in comparisons.items() if part.unfinished
+        },
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
         trials=trials,
@@ -125,6 +133,7 @@ def draw_report(
         "absent_datasets": [asdict(dataset) for dataset in artefacts.absent_datasets],
         **({"trials": [asdict(trial) for trial in trials]} if trials else {}),
         **({"search_remarks": list(search_remarks)} if search_remarks else {}),
+        **({"not_trained": artefacts.not_trained} if artefacts.not_trained else {}),
         **({"weights": FORMAT} if study.publish else {}),
     }
     ingested = [
@@ -151,6 +160,8 @@ def draw_report(
         if trials:
             write_trials(trials, folder / SEARCHES)
         if study.publish and models:
+            if not is_complete and runner.weights is not None and runner.weights.path.is_file():
+                shutil.copyfile(runner.weights.path, folder / PUBLISHED_WEIGHTS)
             try:
                 PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models)
             except WeightsTooLargeError as error:

@@ -72,6 +72,7 @@ class Runner:
     )
     publishes_to: PublishedWeights | None = None  # to which finished trainings are added
     train_first: str = ""  # command to run first where a training is missing; empty to train here
+    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
     artefacts: dict[Path, Artefact] = field(
         default_factory=dict
     )  # those found or made so far, by folder
@@ -269,8 +270,8 @@ class Runner:
             waiting += [replace(group, jobs=missing)] if missing else []
         self._publish_weights(members.values())
         failures: dict[str, Failure] = {}
-        if waiting and self.train_first:
-            return members, {}  # `Comparison.unfinished` has the others
+        if self.train_first:  # `Comparison.unfinished` has the others
+            waiting = self._without_trainings(waiting) if self.evaluates_trained else []
         if waiting:
             self._announce(waiting, len(members))
         while waiting:
@@ -296,6 +297,19 @@ class Runner:
             self.stop.raise_if_requested()
             waiting = alone
         return members, failures
+
+    def _without_trainings(self, groups: Sequence[Group]) -> list[Group]:
+        """Those jobs of groups that take no time to train: the model exists, or is learnt at once."""
+        reduced = [
+            replace(
+                group,
+                jobs=[
+                    job for job in group.jobs if job.is_learnt_at_once or find(job.plan) is not None
+                ],
+            )
+            for group in groups
+        ]
+        return [group for group in reduced if group.jobs]
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
         """Take models that are published under the key of a training and are not there."""

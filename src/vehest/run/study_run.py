@@ -26,6 +26,7 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.inference.models import calibration_of, find_model, preparation_of
 from vehest.run.calibrate import plan_calibrate
 from vehest.run.comparison import (
+    NOT_TRAINED,
     Comparison,
     lower_rate,
     name_in_part,
@@ -48,6 +49,7 @@ from vehest.run.publishing import (
     Publication,
     check_results_folder,
     publish_study,
+    published_in,
     uncommitted_changes,
 )
 from vehest.run.report import STAGE as REPORT
@@ -63,6 +65,8 @@ from vehest.run.train import learnt_spans, model_artefact, read_fit_metrics, tra
 from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
+
+MOST_NAMED = 6  # trainings in one message
 
 
 @contextmanager
@@ -144,7 +148,9 @@ def run_study(
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
         if options.publish_weights:
             runner.publishes_to = _weights_to_add_to(study, overrides)
-        runner.train_first = command_line("run", study.words) if only_report else ""
+        runner.evaluates_trained = not (only_report or _trains_missing(study, overrides, options))
+        if only_report or runner.evaluates_trained:
+            runner.train_first = command_line("run", study.words)
         shown = [job.config for job in jobs[""]] if study.datasets else []
         used = [config["dataset"] for config in shown]
         for part in study.parts:
@@ -169,7 +175,10 @@ def run_study(
                 f"taken from {RESULTS / study.study / SEARCHES}; --retrain trains them",
             )
         comparisons = {name: own for name, own in planned.items() if name not in values}
+        _note_missing(comparisons, runner)
         for comparison in comparisons.values():
+            if runner.evaluates_trained:
+                comparison.reason_unfinished = NOT_TRAINED
             with suppress(DryRunStop):
                 comparison.collect(*runner.run(comparison.groups))
         if any(status == "plan" for status, *_ in runner.messages.printed):
@@ -183,14 +192,10 @@ def run_study(
             remarks = remarks_on(study, planned, trials)
             for remark in remarks:
                 runner.messages.warn(remark)
-            compared = {name: own for name, own in comparisons.items() if name not in study.trials}
-            report, summary = draw_report(study, compared, datasets, runner, trials, remarks)
+            report, summary = draw_report(study, comparisons, datasets, runner, trials, remarks)
         published = None
-        if (
-            error is None
-            and not runner.dry_run
-            and not any(own.unfinished for own in comparisons.values())
-        ):
+        n_not_trained = sum(len(own.unfinished) for own in comparisons.values())
+        if error is None and not runner.dry_run and (runner.evaluates_trained or not n_not_trained):
             publication = None
             if study.publish and not content_overrides(overrides):
                 gone = {name: f"part '{name}'" for name in study.parts if name not in planned}
@@ -205,9 +210,13 @@ def run_study(
                     if own.stage == INGEST
                 }  # raw files as they were
                 publication = Publication(
-                    study.study, gone, keys_of_study(study, jobs, gone, runner, inputs)
+                    study.study,
+                    gone,
+                    keys_of_study(study, jobs, gone, runner, inputs),
+                    n_not_trained,
                 )
-            cache.save(runner, report, summary, raw, publication)
+            if not n_not_trained:  # a later run looks for trainings again
+                cache.save(runner, report, summary, raw, publication)
             published = publish_study(publication, report, runner.messages)
     return Ran(
         summary,
@@ -231,6 +240,40 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
     folder = RESULTS / study.study
     check_results_folder(folder)
     return PublishedWeights(folder / PUBLISHED_WEIGHTS)
+
+
+def _trains_missing(study: Study, overrides: Sequence[str], options: RunOptions) -> bool:
+    """Whether a run trains what is missing: as its option says, else unless the study is published without some trainings."""
+    if options.train_missing is not None:
+        return options.train_missing
+    trains = options.force or options.retrain or options.publish_weights
+    if trains or not study.publish or content_overrides(overrides):
+        return True
+    published = published_in(RESULTS / study.study)
+    return published is None or not published.n_not_trained
+
+
+def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None:
+    """Print how many trainings neither exist here nor are published, before the first of them begins."""
+    if runner.weights is None or not runner.weights.path.is_file() or runner.train_first:
+        return
+    plans = {
+        job.plan.key: job.plan
+        for comparison in comparisons.values()
+        for group in comparison.groups
+        for job in group.jobs
+        if not job.is_learnt_at_once
+    }
+    missing = [
+        plan for key, plan in plans.items() if key not in runner.weights and find(plan) is None
+    ]
+    if missing:
+        runner.messages.line(
+            "note",
+            TRAIN,
+            f"{len(missing)} of {len(plans)}",
+            "are neither here nor published, and are trained; --no-train-missing leaves them out",
+        )
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
@@ -292,7 +335,8 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
         return AbsentDataset(own["name"], title, licence, citation)
-    if runner.train_first and find(planned, runner.messages.warn) is None:
+    is_only_drawn = runner.train_first and not runner.evaluates_trained
+    if is_only_drawn and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
@@ -327,8 +371,10 @@ def _error_of(
         for name in own.unfinished
     ]
     if unfinished and runner.train_first and (nothing or not study.shows_failed):
+        option = " --train-missing" if runner.evaluates_trained else ""
         raise MissingError(
-            f"{unfinished[0]} has not been trained and evaluated; run '{runner.train_first}' first"
+            f"{unfinished[0]} has not been trained and evaluated; "
+            f"run '{runner.train_first}{option}' first"
         )
     if error is not None and (nothing or not study.shows_failed):
         raise error
@@ -338,11 +384,13 @@ def _error_of(
         )
     if unfinished and not runner.dry_run:
         going_on = command_line("run" if study.file.name else "sweep", study.words)
+        option = " --train-missing" if runner.evaluates_trained else ""
+        more = f" and {len(unfinished) - MOST_NAMED} more" if len(unfinished) > MOST_NAMED else ""
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished)}; '{going_on}' goes on with them",
+            f"{', '.join(unfinished[:MOST_NAMED])}{more}; '{going_on}{option}' goes on with them",
         )
     return error
 

@@ -48,6 +48,11 @@ class TrainJob:
     data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
 
     @property
+    def is_learnt_at_once(self) -> bool:
+        """Whether it has no training to configure: nothing is fitted, or a closed form."""
+        return bool(self.training["name"] == "none")
+
+    @property
     def group(self) -> tuple[Any, ...]:
         """Jobs of one group may be trained together."""
         estimator = new_estimator(self.estimator)

@@ -216,6 +216,9 @@ class StudyArtefacts:
     # part -> what was compared in it; a study that is not in parts has one without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
     absent: Sequence[str] = ()  # parts whose raw files were not here
+    not_trained: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # part -> names of trainings that are planned and not done; also of parts that are not here
     trials: Sequence[Trial] = ()  # of searches, which are in no part
     search_remarks: Sequence[str] = ()  # on parts that do not use what a search chose
     datasets: Sequence[

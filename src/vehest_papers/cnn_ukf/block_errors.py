@@ -184,8 +184,13 @@ def _rows_among_four(main: ManoeuvreErrors) -> list[BlockRow]:
     return rows
 
 
-def training_rows(parts: Mapping[str, Runs], content: Paper) -> list[TrainingRow]:
-    """How far every candidate was trained; those of the full set are checked by a part with twice the epochs."""
+def training_rows(
+    parts: Mapping[str, Runs], content: Paper, *, is_complete: bool = True
+) -> list[TrainingRow]:
+    """How far every candidate was trained; those of the full set are checked by a part with twice the epochs.
+
+    ``is_complete``: whether all planned trainings are done; else candidates without a training are rows as well.
+    """
     doubled = _validation(parts.get(DOUBLED, {}))
     rows: dict[str, TrainingRow] = {}
     for part, runs in parts.items():
@@ -214,6 +219,11 @@ def training_rows(parts: Mapping[str, Runs], content: Paper) -> list[TrainingRow
             )
     if paper.FULL_SCALING in content.candidates and paper.DEEP in rows:
         rows[paper.FULL_SCALING] = replace(rows[paper.DEEP], candidate=paper.FULL_SCALING)
+    absent = [] if is_complete else [name for name in content.candidates if name not in rows]
+    for name in absent:
+        of_paper = content.candidates[name].epochs_paper
+        epochs_paper = "" if of_paper is None else str(of_paper)
+        rows[name] = TrainingRow(name, "", epochs_paper, "not trained", "no seed is trained yet")
     return list(rows.values())
 
 

@@ -134,7 +134,7 @@ def _report(
         *block_errors.error_rows(parts, learnt, content),
         *block_errors.measured_rows(main, outputs, off, local),
     ]
-    trained = block_errors.training_rows(parts, content)
+    trained = block_errors.training_rows(parts, content, is_complete=not artefacts.not_trained)
     drawn = {
         name: chosen(seeds)
         for name, seeds in runs.items()
@@ -186,7 +186,7 @@ def _summary(
     return [
         f"**{kind} data**, {len(main.manoeuvres)} held-out test manoeuvres, scored until |β| exceeds 12°: "
         f"{_cut_in_words(driven)} cut there. The paper's recordings are real, of a BMW 545i, and not public. "
-        f"{artefacts.about}{methods.absent_parts(artefacts)} {NOTE}",
+        f"{artefacts.about}{methods.absent_parts(artefacts)}{methods.not_trained(artefacts)} {NOTE}",
         f"**{answer}**",
     ]
 

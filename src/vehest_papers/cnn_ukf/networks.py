@@ -15,7 +15,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.metrics import Scored
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import IdentificationSettings
@@ -127,7 +127,7 @@ def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
             drive.start_time, drive.start_time + len(drive) / drive.rate_hz
         )
         error = own.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
-        pseudo.append(own._replace(variance=LEAST_VARIANCE + np.square(error)))
+        pseudo.append(own._replace(variance=fitted.least_variance + np.square(error)))
     test = {}
     for drive, span, sideslip in zip(
         drives, spans, filtered_with(fitted, drives, pseudo), strict=True

@@ -17,7 +17,6 @@ from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
@@ -88,10 +87,11 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
     changed = copy.deepcopy(fitted)
     changed.scaling = np.array([0.0, 1.0])
     pseudo = changed.pseudo_measurements(recordings)
+    least = changed.least_variance
 
     def cost(powers: FloatArray) -> float:
         scaled = [
-            own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers))
+            own._replace(variance=scaled_variance(own.variance - least, powers, least))
             for own in pseudo
         ]
         return finite_cost(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -84,6 +85,9 @@ PARTS_AWAY = {
 """Part of a variant's name -> what is taken away, in words."""
 
 
+FACTORIAL = re.compile(r"factorial_(plain|smooth)_(paper|free)")  # tyre curve, process noise
+FLOOR = re.compile(r"floor_(1e-\d)")  # ε of Eq. 6 [rad²]
+
 RENAMED: Mapping[str, Mapping[str, str]] = {
     "before": {paper.CNN: paper.BEFORE},
     "free": {paper.SMOOTH: paper.FREE, paper.CNN: paper.CNN_FREE},
@@ -94,6 +98,11 @@ RENAMED: Mapping[str, Mapping[str, str]] = {
 
 def name_in(part: str, candidate: str) -> str:
     """What a candidate of a part is called among those of all parts."""
+    if (point := FACTORIAL.fullmatch(part)) is not None:
+        words = "paper's" if point[2] == "paper" else point[2]
+        return f"{candidate.partition(',')[0]} ({point[1]} tyres, {words} noise)"
+    if (point := FLOOR.fullmatch(part)) is not None:
+        return f"{candidate}, ε = {point[1]} rad²"
     return RENAMED.get(part, {}).get(candidate, candidate)
 
 

@@ -12,7 +12,13 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.text_files import number_in, read_rows
-from vehest_papers.kit.block_rows import BlockRow, TrainingRow, TrainingState, columns_of
+from vehest_papers.kit.block_rows import (
+    SEEDS_PLANNED,
+    BlockRow,
+    TrainingRow,
+    TrainingState,
+    columns_of,
+)
 
 TRAINING_STATES: tuple[TrainingState, ...] = get_args(TrainingState)  # from the least trained on
 
@@ -49,6 +55,7 @@ class Training:
     epochs_paper: str
     state: TrainingState
     reason: str
+    seeds_planned: int = 0  # 0: all that are planned are trained
 
 
 def read_blocks(path: Path) -> dict[Key, BlockErrors]:
@@ -109,7 +116,8 @@ def blocks_of(rows: Iterable[BlockRow], where: str = "errors by block") -> dict[
 def read_training(path: Path) -> dict[str, Training]:
     """Read training.csv: candidate -> epochs, the paper's, whether they suffice."""
     trained = {}
-    for row in read_rows(path, columns_of(TrainingRow)):
+    columns = [name for name in columns_of(TrainingRow) if name != SEEDS_PLANNED]
+    for row in read_rows(path, columns):
         state = row["training"]
         if state not in TRAINING_STATES:
             raise DataError(
@@ -117,7 +125,11 @@ def read_training(path: Path) -> dict[str, Training]:
                 f"which is not one of: {', '.join(TRAINING_STATES)}"
             )
         trained[row["candidate"]] = Training(
-            row["epochs"], row["epochs_paper"], state, row["reason"]
+            row["epochs"],
+            row["epochs_paper"],
+            state,
+            row["reason"],
+            int(number_in(row, SEEDS_PLANNED, path)) if SEEDS_PLANNED in row else 0,
         )
     return trained
 
@@ -125,7 +137,9 @@ def read_training(path: Path) -> dict[str, Training]:
 def training_of(rows: Iterable[TrainingRow]) -> dict[str, Training]:
     """Candidate -> how far it was trained."""
     return {
-        row.candidate: Training(row.epochs, row.epochs_paper, row.training, row.reason)
+        row.candidate: Training(
+            row.epochs, row.epochs_paper, row.training, row.reason, row.seeds_planned
+        )
         for row in rows
     }
 

@@ -14,13 +14,16 @@ from vehest.constants import FloatArray
 
 BLOCKS = "blocks"
 TRAINING = "training"
+SEEDS_PLANNED = "seeds_planned"  # optional column of training.csv
 BASELINE_NAMES: Mapping[str, str] = {
     "zero": "zero",
     "static map": "static_map",
 }  # name in a report -> name in blocks.csv
 MOST_IMPROVED = 0.03  # by doubled epochs, up to which a training was long enough
 
-TrainingState = Literal["insufficient", "not checked", "sufficient", "not applicable"]
+TrainingState = Literal[
+    "not trained", "insufficient", "not checked", "sufficient", "not applicable"
+]
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class TrainingRow:
     epochs_paper: str
     training: TrainingState
     reason: str
+    seeds_planned: int = 0  # 0: all that are planned are trained
 
 
 def block_rows(
@@ -108,8 +112,11 @@ def columns_of(row_type: type[Any]) -> tuple[str, ...]:
 
 
 def frame(rows: Sequence[BlockRow] | Sequence[TrainingRow], row_type: type[Any]) -> pd.DataFrame:
-    """Rows as a table with the columns of their type."""
-    return pd.DataFrame([astuple(row) for row in rows], columns=columns_of(row_type))
+    """Rows as a table with the columns of their type; one without `SEEDS_PLANNED` where it is 0 in all rows."""
+    table = pd.DataFrame([astuple(row) for row in rows], columns=columns_of(row_type))
+    if SEEDS_PLANNED in table and not table[SEEDS_PLANNED].any():
+        return table.drop(columns=SEEDS_PLANNED)
+    return table
 
 
 def checked_training(

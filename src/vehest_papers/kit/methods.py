@@ -26,6 +26,15 @@ def absent_parts(artefacts: StudyArtefacts) -> str:
     return f" Not in this report, since the recordings are missing: {absent}." if absent else ""
 
 
+def not_trained(artefacts: StudyArtefacts) -> str:
+    """A sentence after a space on planned trainings that are not done, by part; empty where all are."""
+    counts = {name: len(names) for name, names in artefacts.not_trained.items() if names}
+    if not counts:
+        return ""
+    parts = "; ".join(f"{artefacts.titles[name]}: {number}" for name, number in counts.items())
+    return f" **Not complete:** {sum(counts.values())} planned trainings are not done ({parts})."
+
+
 def scoring(part: PartArtefacts, reading: str = "") -> str:
     """How estimates of a part are scored; ``reading`` follows the rate at which they are read."""
     protocol = part.protocol

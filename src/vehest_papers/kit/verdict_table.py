@@ -16,6 +16,8 @@ from vehest_papers.kit.claim_files import Claim, Paper
 from vehest_papers.kit.verdicts import VERDICTS, Figure, Judgement, judge_paper, least_training
 
 CLAIMS = "claims"
+DECIDED_CLAIMS = "decided_claims"
+DECIDED = ("reproduced", "direction only", "met by a trivial baseline", "contradicted")
 COLUMNS = {
     "claim": Column("claim"),
     "published": Column("paper"),
@@ -54,11 +56,26 @@ def claims_table(
     rows = [_row(paper, claim, judgements[claim.id], trained, origins) for claim in paper.claims]
     counts = Counter(judgements[claim.id].verdict for claim in paper.claims if not claim.is_added)
     numbers = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict])
+    frame = pd.DataFrame(rows)
     caption = (
         f"The paper's claims, judged from the errors by block and seed of tables/blocks.csv: {numbers}. What decided each is in "
         "the CSV; `docs/scorecard.md` says what the verdicts mean."
     )
-    return Table(CLAIMS, caption, pd.DataFrame(rows), COLUMNS)
+    return Table(CLAIMS, caption, frame, COLUMNS)
+
+
+def decided_claims(claims: Table) -> Table:
+    """Those claims of `claims_table` that the study decides, without sources and trainings.
+
+    The scorecard lists all of them.
+    """
+    frame = claims.frame[claims.frame["verdict"].isin(DECIDED)]
+    columns = {name: COLUMNS[name] for name in ("claim", "published", "ours", "verdict")}
+    caption = (
+        f"The {len(frame)} claims that this study decides, of {len(claims.frame)}; the "
+        f"[scorecard](../scorecard.md) has the others. {claims.caption}"
+    )
+    return Table(DECIDED_CLAIMS, caption, frame[list(columns)], columns)
 
 
 def _row(

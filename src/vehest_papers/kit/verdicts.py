@@ -251,7 +251,8 @@ def judge_row(
     if blocks is None:
         return Judgement("not assessed", NOT_PUBLISHED, {})
     judgement = _with_divergence(_judge_pooled(claim, blocks, with_baselines=False))
-    return _without_single_trainings(judgement, claim, training)
+    judgement = _without_single_trainings(judgement, claim, training)
+    return _with_missing_trainings(judgement, claim, training)
 
 
 def least_training(claim: Claim, training: Mapping[str, Training]) -> tuple[str, Training | None]:
@@ -315,7 +316,28 @@ def _judge(
     else:
         judgement = _judge_pooled(claim, blocks)
     judgement = _with_divergence(judgement)
-    return _without_single_trainings(judgement, claim, training)
+    judgement = _without_single_trainings(judgement, claim, training)
+    return _with_missing_trainings(judgement, claim, training)
+
+
+def _with_missing_trainings(
+    judgement: Judgement, claim: Claim, training: Mapping[str, Training]
+) -> Judgement:
+    """Names candidates of a claim that are not trained, or with fewer seeds than planned."""
+    states = {name: training[name] for name in claim.names if name in training}
+    if judgement.verdict == "not assessed":
+        absent = [name for name, state in states.items() if state.state == "not trained"]
+        if not absent:
+            return judgement
+        verb = "is" if len(absent) == 1 else "are"
+        return replace(judgement, reason=f"{' and '.join(absent)} {verb} not trained")
+    counts = judgement.n_seeds or {}
+    fewer = [
+        f"{name} with {counts[name]} of {state.seeds_planned} seeds"
+        for name, state in states.items()
+        if counts.get(name, state.seeds_planned) < state.seeds_planned
+    ]
+    return replace(judgement, reason="; ".join([judgement.reason, *fewer]))
 
 
 def _with_divergence(judgement: Judgement) -> Judgement:

@@ -13,6 +13,7 @@ from vehest.report.document import Block, Column, Table, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
+from vehest_papers.kit.block_rows import TRAINING
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
@@ -27,7 +28,7 @@ def appendix_of_part(
     where: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Errors by state, consistency, slip angles and budgets of the main part."""
+    """Consistency of the filters and slip angles; errors by state and budgets of the main part as files."""
     kind = words_of_kinds(part).upper()
     state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
@@ -39,13 +40,15 @@ def appendix_of_part(
         f"What was spent: seeds, and epochs as medians of seeds. {paper.NNTF_UH_LOW} is {paper.NNTF_UH} with another start and shares its "
         f"training. Data: {kind}."
     )
-    return [
-        "## Appendix: errors by state, and consistency of the filters",
+    for table in (
         tables.by_state(runs, list(SETS), f"by_state_{name}", state),
+        tables.budget(part, runs, f"budget_{name}", budget),
+    ):
+        data[table.name] = table.frame
+    return [
+        "## Appendix: consistency of the filters",
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
         *_slips(part, name, where, data),
-        "## Appendix: budgets",
-        tables.budget(part, runs, f"budget_{name}", budget),
     ]
 
 
@@ -72,11 +75,11 @@ def how_it_was_made(
         remarks = " ".join(f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks)
         table = trials_table(artefacts.trials)
         blocks += ["## Appendix: trials", *([remarks] if remarks else []), table]
-    return [
-        *blocks,
-        methods.how_it_was_made(lines),
-        _ranges(artefacts, main),
-    ]
+    ranges = _ranges(artefacts, main)
+    data[ranges.name] = ranges.frame
+    names = sorted({*data, TRAINING})
+    files = ", ".join(f"[{name}](tables/{name}.csv)" for name in names)
+    return [*blocks, methods.how_it_was_made(lines), f"Further tables: {files}."]
 
 
 def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
@@ -160,5 +163,5 @@ def _slips(
     }
     note = f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts from."
     figure, table, drawn = slips.distribution(angles, name, where, note)
-    data[f"slip_density_{name}"] = drawn
-    return ["## Appendix: slip angles", figure, table]
+    data |= {f"slip_density_{name}": drawn, table.name: table.frame}
+    return ["## Appendix: slip angles", figure]

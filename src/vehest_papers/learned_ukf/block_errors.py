@@ -6,7 +6,9 @@ A block is a sequence of 10 s, as the paper scores it. The four folds over tyre 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,12 +29,20 @@ from vehest_papers.kit.block_rows import (
 )
 from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import measures, paper
-from vehest_papers.learned_ukf.candidates import models_by_candidate, scored_of
+from vehest_papers.learned_ukf.candidates import (
+    candidate_of_training,
+    models_by_candidate,
+    scored_of,
+)
 from vehest_papers.learned_ukf.filtering import MOVING
 from vehest_papers.learned_ukf.prediction import AFTER, BEFORE, Compared
 
 DOUBLED = "doubled"
 FOLD = re.compile(r"(tyre_a_fold)_\d+")
+LIKELIHOOD = "likelihood"
+GIVEN_NOISE = "given_noise"
+NAMED_ALIKE = (DOUBLED, LIKELIHOOD, GIVEN_NOISE)  # parts whose candidates have the names of others
+SCRATCH = "scratch"
 LENGTH = re.compile(r"length_(\d+)(_samples)?")
 LONGEST = 500  # samples of a sequence, which both ways of Figure 7 share
 WHEEL_SPEED = {"rim_speed": "wheel_speed"}  # name of a state -> name in a metric
@@ -197,8 +207,33 @@ def rise_rows(name: str, part: PartArtefacts, rows: Sequence[BlockRow]) -> list[
     return measured_rows(name, part, "tyre_d", measured, range(len(values)))
 
 
-def training_rows(parts: Mapping[str, PartArtefacts], main: str) -> list[TrainingRow]:
-    """How far every candidate was trained; those of the main part are checked by the part with twice the epochs."""
+def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Candidate as blocks.csv has it -> number of its trainings that are planned and not done.
+
+    Those of `NAMED_ALIKE` and of folds belong to no candidate of their own.
+
+    Parameters
+    ----------
+    not_trained
+        Part of the pipeline -> names of its trainings.
+    """
+    counts: Counter[str] = Counter()
+    for part, names in not_trained.items():
+        if part in NAMED_ALIKE or FOLD.fullmatch(part):
+            continue
+        for name in names:
+            from_scratch = paper.FROM_SCRATCH if part == SCRATCH else ""
+            counts[candidate_name(part, candidate_of_training(name)) + from_scratch] += 1
+    return dict(counts)
+
+
+def training_rows(
+    parts: Mapping[str, PartArtefacts], main: str, not_trained: Mapping[str, int]
+) -> list[TrainingRow]:
+    """How far every candidate was trained; those of the main part are checked by the part with twice the epochs.
+
+    ``not_trained``: candidate -> number of its seeds that are not trained yet.
+    """
     doubled = _validation(parts[DOUBLED]) if DOUBLED in parts else {}
     rows: dict[str, TrainingRow] = {}
     for name, part in parts.items():
@@ -210,8 +245,16 @@ def training_rows(parts: Mapping[str, PartArtefacts], main: str) -> list[Trainin
             if named in rows or candidate in paper.BASELINES:
                 continue
             twice = doubled.get(_trained_as(candidate), {}) if name == main else {}
-            rows[named] = checked_training(
+            row = checked_training(
                 named, epochs_of(models[0]), paper.epochs(candidate), errors[candidate], twice
+            )
+            if named in not_trained:
+                row = replace(row, seeds_planned=len(models) + not_trained[named])
+            rows[named] = row
+    for named, number in not_trained.items():
+        if named not in rows:
+            rows[named] = TrainingRow(
+                named, "", paper.epochs(named), "not trained", "no seed is trained yet", number
             )
     for baseline in paper.BASELINES:
         named = BASELINE_NAMES.get(baseline, baseline)

@@ -50,11 +50,21 @@ _BASELINES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP, "data_sheet": 
 
 def candidate_of(model: EvaluatedModel | Trial) -> str:
     """What the paper calls a model; its own title if the paper has none like it."""
-    if model.estimator == "learned_ukf":
-        name = (_FILTERS | _VARIANTS).get(model.variant, model.title)
-        pre_training = model.training.get("one_step", {})
-        return f"{name}{paper.FROM_SCRATCH}" if pre_training.get("max_epochs") == 0 else name
-    return (_NETWORKS | _BASELINES).get(model.estimator, model.title)
+    name = _name_of(model.estimator, model.variant, model.title)
+    pre_training = model.training.get("one_step", {})
+    return f"{name}{paper.FROM_SCRATCH}" if pre_training.get("max_epochs") == 0 else name
+
+
+def candidate_of_training(name: str) -> str:
+    """What the paper calls a training that is planned, ``learned_ukf-nntf_u-seed0``; itself if the paper has none like it."""
+    estimator, _, variant = name.rpartition("-seed")[0].partition("-")
+    return _name_of(estimator, variant, name)
+
+
+def _name_of(estimator: str, variant: str, title: str) -> str:
+    if estimator == "learned_ukf":
+        return (_FILTERS | _VARIANTS).get(variant, title)
+    return (_NETWORKS | _BASELINES).get(estimator, title)
 
 
 def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:

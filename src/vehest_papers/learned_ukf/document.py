@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import REPORT, Block, Document, as_text
-from vehest.report.style import fixed, listed
+from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
@@ -19,7 +19,14 @@ from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import claims_table, one_line
+from vehest_papers.kit.verdict_table import (
+    CLAIMS,
+    claims_table,
+    decided_claims,
+    figure_in_words,
+    one_line,
+)
+from vehest_papers.kit.verdicts import paired_errors, ratio_of
 from vehest_papers.learned_ukf import (
     block_errors,
     coverage,
@@ -39,10 +46,8 @@ from vehest_papers.learned_ukf.lengths import figure_7, lengths
 NAME = "learned_ukf"  # of the paper's package
 TEMPLATE = Path(__file__).with_name("report.md.j2")
 MAIN = "real"
-LIKELIHOOD = "likelihood"
-SCRATCH = "scratch"
 LENGTH = "length_"
-VARIANTS = ("diagonal", SCRATCH, "curvature")  # parts with a variant of a candidate
+VARIANTS = ("diagonal", block_errors.SCRATCH, "curvature")  # parts with a variant of a candidate
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_FIRST = (paper.NNTF_UH, paper.NNTF, paper.NN_U, paper.PC, paper.GRU, paper.LSTM, "zero")
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
@@ -80,31 +85,41 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     rows = block_errors.error_rows(artefacts.parts)
     outcome = _outcome(MAIN, part, artefacts, blocks_of(rows), data)
     rows += [*outcome.rows, *block_errors.rise_rows(MAIN, part, rows)]
-    if SCRATCH in artefacts.parts:
-        rows += block_errors.scratch_rows(SCRATCH, artefacts.parts[SCRATCH], part)
-    trained = block_errors.training_rows(artefacts.parts, MAIN)
+    if block_errors.SCRATCH in artefacts.parts:
+        scratch = artefacts.parts[block_errors.SCRATCH]
+        rows += block_errors.scratch_rows(block_errors.SCRATCH, scratch, part)
+    not_trained = block_errors.seeds_not_trained(artefacts.not_trained)
+    trained = block_errors.training_rows(artefacts.parts, MAIN, not_trained)
     kinds = {
         block_errors.part_name(name): words_of_kinds(own) for name, own in artefacts.parts.items()
     }
     claims = claims_table(content, rows, trained, kinds)
-    values = _values(artefacts, part, content, rows)
+    values = _values(artefacts, part, content, rows, trained)
     blocks = [
-        *fill_template(TEMPLATE, values, [*outcome.front, claims]),
+        *fill_template(TEMPLATE, values, [*outcome.front, decided_claims(claims)]),
         *outcome.appendix,
         *how_it_was_made(artefacts, {MAIN: part}, data),
     ]
+    data |= {CLAIMS: claims.frame}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
 def _values(
-    artefacts: StudyArtefacts, part: PartArtefacts, content: Paper, rows: Sequence[BlockRow]
+    artefacts: StudyArtefacts,
+    part: PartArtefacts,
+    content: Paper,
+    rows: Sequence[BlockRow],
+    trained: Sequence[TrainingRow],
 ) -> dict[str, object]:
     """Numbers and names that the template has places for."""
     blocks = blocks_of(rows)
+    seeds = {key.candidate: len(errors.seeds) for key, errors in blocks.items() if key.part == MAIN}
     main_rows = [
-        {"name": name} | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
+        {"name": name, "seeds": seeds[name]}
+        | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
         for name in SHOWN_FIRST
+        if name in seeds
     ]
     return {
         "recommendation": one_line(content.recommendation),
@@ -114,27 +129,44 @@ def _values(
         "main_rows": main_rows,
         "authors": {test: fixed(value, 4) for test, value in paper.AUTHORS_CODE.items()},
         "absent_parts": absent_parts(artefacts),
-        "missing": _missing(artefacts, content, rows),
+        "ratios": {test: _ratio(blocks, test) for test in SETS},
+        "incomplete": _incomplete(artefacts, trained, seeds),
     }
 
 
-def _missing(artefacts: StudyArtefacts, content: Paper, rows: Sequence[BlockRow]) -> list[str]:
-    """Candidates of the claims that are not trained yet, and trainings of the parts that are there."""
-    scored = {row.candidate for row in rows}
-    absent = [name for name in content.candidates if name not in scored]
-    unfinished = [
-        f"{artefacts.titles.get(name, name)} has {len(part.models)} of {len(part.models) + len(part.failed)}"
-        for name, part in artefacts.parts.items()
-        if part.failed
+def _ratio(blocks: Mapping[Key, BlockErrors], test: str) -> str:
+    """Weighted MSE of NNTF_UH over that of the GRU with its interval; a dash where one is not trained."""
+    ours, other = (
+        blocks.get(Key(MAIN, name, test, "mse_weighted")) for name in (paper.NNTF_UH, paper.GRU)
+    )
+    if ours is None or other is None:
+        return MISSING
+    return figure_in_words(ratio_of(paired_errors(ours, other, "mse_weighted", test)))
+
+
+def _incomplete(
+    artefacts: StudyArtefacts, trained: Sequence[TrainingRow], seeds: Mapping[str, int]
+) -> list[dict[str, object]]:
+    """What the template says of trainings that are planned and not done: one entry, or none."""
+    number = sum(len(names) for names in artefacts.not_trained.values())
+    if not number:
+        return []
+    fewer = [
+        f"{row.candidate} {seeds.get(row.candidate, 0)} of {row.seeds_planned}"
+        for row in trained
+        if row.seeds_planned and row.training != "not trained"
     ]
-    lines = []
-    if absent:
-        lines.append(
-            f"**Not trained yet, so that claims on them are not assessed:** {'; '.join(absent)}."
-        )
-    if unfinished:
-        lines.append(f"Trainings that are there: {'; '.join(unfinished)}.")
-    return lines
+    absent = [row.candidate for row in trained if row.training == "not trained"]
+    parts = [name for name in artefacts.titles if name not in artefacts.parts]
+    return [
+        {
+            "number": number,
+            "fewer": "; ".join(fewer) or MISSING,
+            "candidates": "; ".join(absent) or MISSING,
+            "parts": ", ".join(f"`{name}`" for name in parts if name in artefacts.not_trained)
+            or MISSING,
+        }
+    ]
 
 
 def _outcome(
@@ -149,16 +181,16 @@ def _outcome(
     kind = words_of_kinds(part)
     where = f"{kind.upper()}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
     own = Outcome()
-    _accuracy(own, name, blocks, kind)
+    _accuracy(own, name, blocks, kind, data)
     _friction(own, name, part, where, kind)
-    _instability(own, name, part)
+    _instability(own, name, artefacts.parts, data)
     beside = {
         title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind
     }
     _likelihood(own, name, part, beside, kind)
     _prediction(own, name, part, where, data)
-    _variants(own, name, part, beside, kind)
-    _lengths(own, beside, blocks, kind)
+    _variants(name, part, beside, kind, data)
+    _lengths(own, beside, blocks, kind, data)
     groups = models_by_candidate(part)
     shown: dict[str, EvaluatedModel] = {
         method: chosen(part, runs, method) for method in SHOWN_IN_FIGURE_4 if method in groups
@@ -171,9 +203,14 @@ def _outcome(
     return own
 
 
-def _accuracy(own: Outcome, name: str, blocks: Mapping[Key, BlockErrors], kind: str) -> None:
+def _accuracy(
+    own: Outcome,
+    name: str,
+    blocks: Mapping[Key, BlockErrors],
+    kind: str,
+    data: dict[str, pd.DataFrame],
+) -> None:
     own.front.append(tables.overview(blocks, name, kind))
-    own.appendix.append(f"## Appendix: Tables I and II, {kind}")
     for test, tyre in SETS.items():
         which = (
             "which was trained on"
@@ -186,7 +223,7 @@ def _accuracy(own: Outcome, name: str, blocks: Mapping[Key, BlockErrors], kind: 
             "gyroscope."
         )
         table = f"table_{1 if test == 'tyre_a' else 2}_{name}"
-        own.appendix.append(tables.accuracy(blocks, name, test, table, caption))
+        data[table] = tables.accuracy(blocks, name, test, table, caption).frame
 
 
 def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: str) -> None:
@@ -219,7 +256,7 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
     own.front += [
         friction.figure(tracks, part.protocol.skip_seconds, name, where),
-        friction.convergence_table(tracks, times, name, kind.upper()),
+        friction.convergence_table(tracks, times, part.protocol.skip_seconds, name, kind.upper()),
     ]
     own.appendix += [
         f"## Appendix: the start of the friction, {kind}",
@@ -227,21 +264,41 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     ]
 
 
-def _instability(own: Outcome, name: str, part: PartArtefacts) -> None:
+def _instability(
+    own: Outcome,
+    name: str,
+    parts: Mapping[str, PartArtefacts],
+    data: dict[str, pd.DataFrame],
+) -> None:
+    """Sequences of tyre D whose covariance loses definiteness, with both starts of the noise; the main part decides the claims."""
     claim = {paper.NNT: "nnt_becomes_unstable", paper.NNT_U: "nnt_u_becomes_unstable"}
-    for method, models in models_by_candidate(part).items():
-        if method not in claim:
-            continue
-        filters = [loaded(model) for model in models]
-        drives = drives_of(part, filters[0], "tyre_d")
-        of_seeds = np.array([lost_sequences(estimator, drives) for estimator in filters])
-        measured = {(claim[method], method): of_seeds.astype(np.float64)}
-        seeds = [model.seed for model in models]
-        own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
+    shares = []
+    for title in (name, block_errors.GIVEN_NOISE):
+        groups = models_by_candidate(parts[title]) if title in parts else {}
+        for method, models in groups.items():
+            if method not in claim:
+                continue
+            filters = [loaded(model) for model in models]
+            drives = drives_of(parts[title], filters[0], "tyre_d")
+            is_lost = np.array([lost_sequences(estimator, drives) for estimator in filters])
+            shares += [
+                {"part": title, "candidate": method, "seed": model.seed, "share_lost": float(lost)}
+                for model, lost in zip(models, is_lost.mean(axis=1), strict=True)
+            ]
+            if title == name:
+                measured = {(claim[method], method): is_lost.astype(np.float64)}
+                seeds = [model.seed for model in models]
+                own.rows += block_errors.measured_rows(name, parts[name], "tyre_d", measured, seeds)
+    if shares:
+        data["unstable"] = pd.DataFrame(shares)
 
 
 def _variants(
-    own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str
+    name: str,
+    part: PartArtefacts,
+    beside: Mapping[str, PartArtefacts],
+    kind: str,
+    data: dict[str, pd.DataFrame],
 ) -> None:
     """What the variants of a candidate were trained on, with the candidates that they are compared with."""
     groups = models_by_candidate(part)
@@ -256,10 +313,8 @@ def _variants(
     compared: dict[str, Candidate] = {
         title: (part, groups[title]) for title in (paper.NNTF_UH, paper.PC) if title in groups
     }
-    own.appendix += [
-        "## Appendix: variants",
-        budgets_table(compared | variants, name, kind.upper()),
-    ]
+    table = budgets_table(compared | variants, name, kind.upper())
+    data[table.name] = table.frame
 
 
 def _lengths(
@@ -267,23 +322,26 @@ def _lengths(
     beside: Mapping[str, PartArtefacts],
     blocks: Mapping[Key, BlockErrors],
     kind: str,
+    data: dict[str, pd.DataFrame],
 ) -> None:
     trained = {title: other for title, other in beside.items() if title.startswith(LENGTH)}
     if trained:
-        own.appendix += [
-            "## Appendix: length of the training sequences",
-            *figure_7(lengths(trained), blocks, kind.upper()),
-        ]
+        figure, table = figure_7(lengths(trained), blocks, kind.upper())
+        own.appendix += ["## Appendix: length of the training sequences", figure]
+        data[table.name] = table.frame
 
 
 def _likelihood(
     own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str
 ) -> None:
-    if LIKELIHOOD not in beside:
+    if block_errors.LIKELIHOOD not in beside:
         return
     trained = {
         words: (which, models_by_candidate(which)[paper.NNTF_UH])
-        for words, which in (("squared errors", part), ("with likelihood", beside[LIKELIHOOD]))
+        for words, which in (
+            ("squared errors", part),
+            ("with likelihood", beside[block_errors.LIKELIHOOD]),
+        )
         if paper.NNTF_UH in models_by_candidate(which)
     }
     if trained:

@@ -51,6 +51,13 @@ class Tracks:
         own: FloatArray = self.mean[..., -round(LAST_SECONDS * self.rate_hz) :].mean(axis=-1)
         return own
 
+    def covered(self, nominal: float, skip_seconds: float, deviations: float = 1.0) -> FloatArray:
+        """Share of the samples after ``skip_seconds`` whose distance from a friction is within the filter's deviations, (S, B)."""
+        first = round(skip_seconds * self.rate_hz)
+        distance = np.abs(self.mean[..., first:] - nominal)
+        is_within = distance <= deviations * self.deviation[..., first:]
+        return np.asarray(is_within.mean(axis=-1))
+
 
 def settled(outside: np.ndarray, rate_hz: float) -> FloatArray:
     """Time after the last sample that is outside, (..., T) -> (...) [s]; 0 where none is."""
@@ -70,6 +77,7 @@ def tracks_of(filters: Sequence[LearnedUkf], drives: Drive, start: float) -> Tra
 def convergence_table(
     tracks: Mapping[str, Mapping[float, Tracks]],
     times: Mapping[str, Sequence[FloatArray]],
+    skip_seconds: float,
     name: str,
     data: str,
 ) -> Table:
@@ -81,6 +89,8 @@ def convergence_table(
         Test set -> friction at the start -> tracks.
     times
         Test set -> both times of agreement [s], (S, B) each.
+    skip_seconds
+        At the start of each sequence, which are not counted in the coverage [s].
     name, data
         Part and data, for the caption.
     """
@@ -96,6 +106,7 @@ def convergence_table(
                 "final": _text(final.final, 3),
                 "deviation": float(final.deviation[..., -1].mean()),
                 "nominal": paper.NOMINAL_FRICTION[test],
+                "covered": _text(final.covered(paper.NOMINAL_FRICTION[test], skip_seconds), 2),
             }
         )
     columns = {
@@ -105,6 +116,7 @@ def convergence_table(
         "final": Column("final value"),
         "deviation": Column("deviation that the filter gives", decimals=3),
         "nominal": Column("nominal, paper", decimals=2),
+        "covered": Column("nominal within one deviation (Gaussian: 0.68)"),
     }
     starts = ", ".join(f"{start:g}" for start in STARTS)
     caption = (
@@ -151,8 +163,10 @@ def figure(
         grid[0].set_ylabel("friction [1]")
         legend_above(drawn, grid[0], columns=4)
     first = next(iter(next(iter(tracks.values())).values()))
+    n_seeds = len(first.mean)
+    seeds = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
     caption = (
-        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {len(first.mean)} seeds; shaded: 95 % interval of the mean over "
+        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {seeds}; shaded: 95 % interval of the mean over "
         f"sequences. Grey: not scored. Data: {data}."
     )
     return Figure(f"friction_{name}", caption, drawn)

@@ -34,6 +34,7 @@ class RunOptions:
     track: bool = False
     minutes: float | None = None
     retrain: bool = False
+    train_missing: bool | None = None  # none: unless the study is published without some trainings
     publish_weights: bool = False
     launcher: str = "local"  # one of `LAUNCHERS`
     address: str | None = None  # of a cluster
