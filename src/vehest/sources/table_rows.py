@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.sources.clocks import bridged
 from vehest.sources.columns import Column, Positive
 
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
@@ -94,22 +95,40 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
 
 
 def timed_runs(
-    times: FloatArray, max_gap: float | None, *, restarts: bool
+    times: FloatArray,
+    max_gap: float | None,
+    *,
+    restarts: bool,
+    columns: Iterable[FloatArray] = (),
 ) -> dict[int | None, slice]:
-    """Rows of each run, which begins where times [s], (N,), go backwards, if ``restarts``, or leave a gap longer than ``max_gap`` [s].
+    """Rows of each run of a table.
 
-    Pieces between gaps that last less than ``max_gap`` are left out.
+    Parameters
+    ----------
+    times : FloatArray
+        Times of the rows [s], shape (N,).
+    max_gap : float or None
+        Longest time without a row, or without a sample of a column, within a run [s]; runs that
+        last less are left out.
+    restarts : bool
+        Whether a run begins where times go backwards.
+    columns : iterable of FloatArray
+        Columns that must have samples throughout, NaN where there is none, shape (N,) each.
     """
-    steps = np.diff(times)
-    begins = (steps < 0) & restarts
     if max_gap is None:
-        return {**dict(enumerate(stretches(begins, len(times))))}
-    runs = stretches(begins | (steps > max_gap), len(times))
-    return {
-        **dict(
-            enumerate(rows for rows in runs if times[rows.stop - 1] - times[rows.start] >= max_gap)
-        )
-    }
+        return {**dict(enumerate(stretches((np.diff(times) < 0) & restarts, len(times))))}
+    measured = np.ones(len(times), dtype=np.bool_)
+    for column in columns:
+        measured &= np.isfinite(bridged(column, times, max_gap))
+    rows = np.flatnonzero(measured)
+    steps = np.diff(times[rows])
+    runs = [
+        slice(int(rows[run.start]), int(rows[run.stop - 1]) + 1)
+        for run in stretches(((steps < 0) & restarts) | (steps > max_gap), len(rows))
+        if run.stop > run.start
+    ]
+    lasting = [run for run in runs if times[run.stop - 1] - times[run.start] >= max_gap]
+    return {**dict(enumerate(lasting))}
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:

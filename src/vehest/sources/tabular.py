@@ -19,7 +19,7 @@ from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.clocks import Clock, ClockPolicy, even_clock, uniform_clock
+from vehest.sources.clocks import Clock, ClockPolicy, bridged, even_clock, uniform_clock
 from vehest.sources.columns import (
     ChannelMap,
     ChannelNames,
@@ -252,6 +252,11 @@ class TabularSource(FileSource):
         """The recording of a file's columns, or of one run of them, or of a part by its number, that of all parts and its clock."""
         n_rows = len(next(iter(values.values())))
         where = f"'{file}'" if run is None else f"'{file}', run {run}"
+        max_gap = self.options.max_gap
+        if self.time is not None and max_gap is not None:
+            times = self.time.to_si(values[self.time.column], "s")
+            lines = {name: bridged(values[name], times, max_gap) for name in self._spanning(file)}
+            values = {**values, **lines}
         if clock is None and self.time is not None:
             clock = uniform_clock(
                 self.time.to_si(values[self.time.column], "s"), where, self.options.clock
@@ -313,14 +318,22 @@ class TabularSource(FileSource):
         if counter is None or is_stored_recording(file):
             return super()._runs(file)
         require_files([file], self.name)
-        numbers = self._values(file, [counter])[counter]
         if self.time is not None and self._cuts:
+            names = self._spanning(file) if self.options.max_gap else []
+            values = self._values(file, [counter, *names])
             return timed_runs(
-                self.time.to_si(numbers, "s"),
+                self.time.to_si(values[counter], "s"),
                 self.options.max_gap,
                 restarts=self.options.time_restarts,
+                columns=(values[name] for name in names),
             )
-        return counted_runs(numbers, counter, file)
+        return counted_runs(self._values(file, [counter])[counter], counter, file)
+
+    def _spanning(self, file: Path) -> list[str]:
+        """Columns that must have samples throughout a run: of channels that are not gappy or held."""
+        sparse = {*self.gappy, *(self.held.channels if self.held else ())}
+        columns = self._columns_of(file)
+        return list({own.column: None for name, own in columns.items() if name not in sparse})
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:

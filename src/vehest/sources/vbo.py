@@ -23,7 +23,7 @@ from vehest.data.files import regular_file
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
-from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Positive
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
@@ -97,12 +97,15 @@ class VboSource(FileSource):
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Rows between pauses."""
         require_files([file], self.name)
-        longest = self.options.max_gap
-        return (
-            super()._runs(file)
-            if longest is None
-            else timed_runs(self._log(file).seconds, longest, restarts=False)
+        max_gap = self.options.max_gap
+        if max_gap is None:
+            return super()._runs(file)
+        log = self._log(file)
+        require_columns(file, list(log.columns), [own.column for own in self.columns.values()])
+        columns = (
+            log.columns[own.column] for name, own in self.columns.items() if name not in self.gappy
         )
+        return timed_runs(log.seconds, max_gap, restarts=False, columns=columns)
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a log; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
@@ -121,9 +124,10 @@ class VboSource(FileSource):
             unit = channel(name).unit
             where = f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
-            channels[name] = clock.align(
-                column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy
-            )
+            samples = log.columns[column.column][rows]
+            if self.options.max_gap is not None and name not in self.gappy:
+                samples = bridged(samples, log.seconds[rows], self.options.max_gap)
+            channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)
         provenance = {"file": file.name, **number, **log.provenance}
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
