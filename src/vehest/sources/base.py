@@ -8,20 +8,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import vehest.sources as package
 from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, DataError, MissingError, suggestion
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable, suggestion
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
+from vehest.data.text_files import first_line
 from vehest.data.transforms import ReferenceLever, transform_from_config
 from vehest.sources.clocks import require_clock
 
+ENTRY_POINTS = "vehest.sources"
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
@@ -305,27 +308,47 @@ def require_no_spreadsheet(file: Path) -> None:
 
 
 def source_class(dataset: Mapping[str, Any]) -> type[Source]:
-    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``; raises `ConfigurationError` without one."""
+    """The class of a data set's source.
+
+    It is ``SOURCE`` of the module ``vehest.sources.NAME``, or what another package offers by an
+    entry point NAME in the group ``vehest.sources``.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such source, or that of another package cannot be loaded.
+    """
     name = str(dataset.get("source"))
-    found: type[Source] | None = _source_of(name) if name in _modules() else None
-    if found is None:
-        raise ConfigurationError(
-            f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}"
-        )
-    return found
+    where = f"data set '{dataset.get('name')}': source '{name}'"
+    if name in _modules() and (own_class := _class_of(name)):
+        return own_class
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            loaded = point.load()
+        except Exception as error:  # a package may raise anything when it is imported
+            reason = f"{type(error).__name__}: {printable(first_line(error))}"
+            raise ConfigurationError(
+                f"{where} of another package cannot be loaded ({reason}); repair or remove it"
+            ) from error
+        if not (isinstance(loaded, type) and issubclass(loaded, Source)):
+            raise ConfigurationError(f"{where} of another package is no class derived from Source")
+        return loaded
+    raise ConfigurationError(f"{where} is not one of: {', '.join(source_names())}")
 
 
 @cache
 def source_names() -> list[str]:
-    """Names of all sources."""
-    return sorted(name for name in _modules() if _source_of(name) is not None)
+    """Names of all sources: vehest's own, then those of other packages."""
+    names = sorted(name for name in _modules() if _class_of(name))
+    others = {point.name for point in entry_points(group=ENTRY_POINTS)}
+    return [*names, *sorted(others.difference(names))]
 
 
 def _modules() -> list[str]:
     return [module.name for module in pkgutil.iter_modules(package.__path__)]
 
 
-def _source_of(module: str) -> type[Source] | None:
+def _class_of(module: str) -> type[Source] | None:
     return getattr(importlib.import_module(f"{package.__name__}.{module}"), "SOURCE", None)
 
 

@@ -14,7 +14,8 @@ MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one ano
 WRITTEN = (
     r"^\s*(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]+"
     r"|(?P<days>\d+) days?,? *)?"
-    r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"|(?P<minutes>\d{1,3}):(?P<seconds>\d{2}[.,]\d+))"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
 DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
@@ -23,7 +24,7 @@ DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times that are written as a clock's, in seconds, (N,); None for other text.
 
-    ``10:59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024 10:59:30,25``,
+    ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024 10:59:30,25``,
     ``5/3/2024 10:59:30 AM`` and ``0 days 00:00:30.25``. With a date they count from 1970, without
     one from midnight, and on beyond the next. The zone is not read.
     """
@@ -32,10 +33,15 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     found = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
     if not len(found) or found.null_count:
         return None
-    seconds = compute.replace_substring_regex(found.field("second"), "[,:]", ".")
+    is_short = compute.not_equal(found.field("minutes"), "")
+    second = compute.if_else(is_short, found.field("seconds"), found.field("second"))
     hours, minutes, seconds = (
         np.asarray(compute.cast(part, pa.float64()))
-        for part in (found.field("hour"), found.field("minute"), seconds)
+        for part in (
+            compute.if_else(is_short, "0", found.field("hour")),
+            compute.if_else(is_short, found.field("minutes"), found.field("minute")),
+            compute.replace_substring_regex(second, "[,:]", "."),
+        )
     )
     half = compute.utf8_lower(found.field("half"))
     is_afternoon = np.asarray(compute.cast(compute.equal(half, "p"), pa.int8()))

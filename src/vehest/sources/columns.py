@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from vehest.constants import FloatArray
@@ -38,6 +39,18 @@ class Column:
         """Values in SI units and ISO 8855 signs."""
         factor = self.sign * self.factor * factor_to_si(self.unit, si_unit)
         return values if factor == 1.0 else values * factor
+
+
+@dataclass(frozen=True)
+class SampledColumn(Column):
+    """Declaration of a column in which some numbers mean that nothing was measured."""
+
+    invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
+
+    def measured(self, values: FloatArray) -> FloatArray:
+        """Values in the file's unit, (T,), NaN where nothing was measured."""
+        is_code = [np.isclose(values, code, rtol=1e-6, atol=0.0) for code in self.invalid]
+        return np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
 
 
 def columns_from_config(

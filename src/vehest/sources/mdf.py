@@ -6,13 +6,14 @@ Which signal is which channel, and in which unit and sign, is declared in conf/d
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.clocks import clock_fault
+from vehest.sources.columns import SampledColumn
 from vehest.sources.limited import read_limited, require_package
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
@@ -28,7 +29,7 @@ class MdfOptions(SignalOptions):
 
 
 @dataclass(frozen=True)
-class MdfChannel(SignalChannel):
+class MdfChannel(SignalChannel, SampledColumn):
     """A channel's signal, with the number or name of its group where its name occurs in several."""
 
     group: Annotated[int | str | None, "the number or name of a group"] = None
@@ -45,6 +46,10 @@ class MdfSource(SignalSource):
             name: (declared.column, declared.group) for name, declared in self.channels.items()
         }
         signals, _, about = read_measurement(file, wanted)
+        signals = {
+            name: replace(signal, values=self.channels[name].measured(signal.values))
+            for name, signal in signals.items()
+        }
         rates = {
             signal.origin.removeprefix("group "): round(signal.rate_hz, 3)
             for signal in signals.values()

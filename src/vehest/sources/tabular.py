@@ -26,6 +26,7 @@ from vehest.sources.columns import (
     Column,
     ColumnName,
     Positive,
+    SampledColumn,
     column_from_config,
     columns_from_config,
 )
@@ -102,7 +103,9 @@ class TabularSource(FileSource):
         options = self.options
         where = self.where
         self.columns = (
-            None if options.channels is None else columns_from_config(options.channels, self.name)
+            None
+            if options.channels is None
+            else columns_from_config(options.channels, self.name, SampledColumn)
         )
         self.time: TimeColumn | None = (
             None
@@ -188,7 +191,9 @@ class TabularSource(FileSource):
                     n_samples=rows.stop - rows.start,
                 )
                 yield self._prepared(
-                    self._made_of(file, None, columns, values, own, [number, len(slices)])
+                    self._made_of(
+                        file, None, columns, self._measured(values), own, [number, len(slices)]
+                    )
                 )
         except DataError:
             self.read_file(file)  # whose errors are of all its rows
@@ -234,11 +239,20 @@ class TabularSource(FileSource):
         values = read_columns(file, list(dict.fromkeys([*wanted, *sorting])), self.layout)
         if time is not None and time.column in values:
             values = time.in_order(values)
+        values = self._measured(values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values
         kept = kept_rows(len(next(iter(values.values()))), dropped, file)
         return {name: samples[kept] for name, samples in values.items()}
+
+    def _measured(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Columns, NaN where a channel's declaration says that nothing was measured."""
+        measured = {**values}
+        for column in (self.columns or {}).values():
+            if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
+                measured[column.column] = column.measured(measured[column.column])
+        return measured
 
     def _made_of(
         self,

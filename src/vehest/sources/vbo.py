@@ -24,7 +24,7 @@ from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive, SampledColumn
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
@@ -90,7 +90,7 @@ class VboSource(FileSource):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.columns = self._declared(self.options.channels)
+        self.columns = self._declared(self.options.channels, SampledColumn)
         self._require_pattern()
         self._log = lru_cache(1)(read_log)
 
@@ -103,7 +103,9 @@ class VboSource(FileSource):
         log = self._log(file)
         require_columns(file, list(log.columns), [own.column for own in self.columns.values()])
         columns = (
-            log.columns[own.column] for name, own in self.columns.items() if name not in self.gappy
+            own.measured(log.columns[own.column])
+            for name, own in self.columns.items()
+            if name not in self.gappy
         )
         return timed_runs(log.seconds, max_gap, restarts=False, columns=columns)
 
@@ -124,7 +126,7 @@ class VboSource(FileSource):
             unit = channel(name).unit
             where = f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
-            samples = log.columns[column.column][rows]
+            samples = column.measured(log.columns[column.column][rows])
             if self.options.max_gap is not None and name not in self.gappy:
                 samples = bridged(samples, log.seconds[rows], self.options.max_gap)
             channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)

@@ -11,11 +11,12 @@ from typing import Literal
 
 import numpy as np
 
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import DataError, MissingError, printable
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.mdf import read_measurement
+from vehest.sources.not_measured import codes_of_not_measured
 from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
@@ -49,7 +50,7 @@ def survey(path: Path) -> Log:
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)
-    log = _survey(path)
+    log = _without_codes(_survey(path))
     for run in log.runs:
         if (
             log.seconds is not None
@@ -71,6 +72,26 @@ def survey(path: Path) -> Log:
             f"'{path}' holds no column of numbers ({'; '.join(skipped[:3]) or 'it is empty'})"
         )
     return log
+
+
+def _without_codes(log: Log) -> Log:
+    """A log of which numbers that stand for a missing sample, such as -9999, are NaN."""
+    columns = []
+    skipped = list(log.skipped)
+    for column in log.columns if log.source != "rosbag" else ():
+        codes = codes_of_not_measured(column.values)
+        if codes:
+            is_code = np.isin(column.values, codes)
+            place = {**column.place, "invalid": codes}
+            values = np.where(is_code, np.nan, column.values)
+            column = replace(column, values=values, place=place)
+            texts = " and ".join(f"{code:.9g}" for code in codes)
+            skipped.append(
+                f"{texts} in {is_code.sum()} samples of '{printable(column.name)}', "
+                "which loggers write where nothing was measured"
+            )
+        columns.append(column)
+    return replace(log, columns=tuple(columns) or log.columns, skipped=tuple(skipped))
 
 
 def _survey(path: Path) -> Log:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.sources.clocks import span_fault
+from vehest.data.recording import HIGHEST_RATE
+from vehest.sources.clocks import RATE_TOLERANCE, span_fault
 from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
@@ -21,12 +22,13 @@ NAMED = re.compile(
 COUNTER = re.compile(
     r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$"
 )
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 SPELLINGS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+    **dict.fromkeys(("d", "day", "days"), "d"),
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
@@ -151,7 +153,7 @@ def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     ]
     chosen = unit if unit in fitting or not fitting else fitting[0]
     chosen = chosen or ("s" if named else "")
-    if not chosen:
+    if not chosen or step * UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None
     rate = 1.0 / (step * UNITS[chosen])
     how = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"

@@ -24,7 +24,14 @@ import pyarrow.csv as pc
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
-from vehest.data.parquet import DAMAGE, has_time_unit, numbers_of, parquet_file, read_numbers
+from vehest.data.parquet import (
+    DAMAGE,
+    has_time_unit,
+    is_numeric,
+    numbers_of,
+    parquet_file,
+    read_numbers,
+)
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
@@ -48,6 +55,7 @@ HEAD = 1 << 18  # bytes that are looked at
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # of its numbers
+MIN_SHARE_OF_KIND = 0.1  # of texts that name a kind of number
 MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
@@ -64,6 +72,13 @@ VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
 )
 """Names that end in ms for metres a second, as those of delays and ages do not."""
+DISGUISED = {
+    "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
+    "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
+    "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
+    "a separator of thousands": "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$",
+}
+"""Kinds of texts that are numbers for people: the pattern of each."""
 ABBREVIATED = {
     "radps": "rad/s",
     "degps": "deg/s",
@@ -103,7 +118,7 @@ def survey_table(file: Path) -> Log:
             names = [
                 field.name
                 for field in table.schema_arrow
-                if field.name in units or _is_numeric(field.type)
+                if field.name in units or is_numeric(field.type)
             ]
             skipped = [
                 f"column '{printable(field.name)}' holds {field.type}"
@@ -223,9 +238,14 @@ def shape_of(file: Path) -> Shape:
         (_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score
     )
     if not best.score:
-        raise DataError(
-            f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?"
-        )
+        cells = [
+            cell for row in [*tables[";"].values(), *tables[","].values()][-40:] for cell in row
+        ]
+        kind = _kind_of_text(pa.chunked_array([cells], pa.string()))
+        why = "is it a table of text, with names in a line above the numbers?"
+        if kind != "text":
+            why = f"it holds {kind}"
+        raise DataError(f"'{file}' holds no rows of two numbers or more; {why}")
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
@@ -378,8 +398,19 @@ def _columns(
         elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
             clocks[name] = seconds
         else:
-            skipped.append(f"column '{printable(name)}' holds text")
+            skipped.append(f"column '{printable(name)}' holds {_kind_of_text(column)}")
     return values, clocks, marks, skipped
+
+
+def _kind_of_text(column: pa.ChunkedArray) -> str:
+    """What the texts of a column are, and the way out where they are numbers in disguise."""
+    texts = column.cast(pa.string(), safe=False).drop_null()
+    for kind, pattern in DISGUISED.items():
+        example = texts.filter(compute.match_substring_regex(texts, pattern))
+        if len(example) > MIN_SHARE_OF_KIND * len(texts):
+            text = printable(example[0].as_py().strip())
+            return f"numbers with {kind}, such as '{text}'; export it without"
+    return "text"
 
 
 def _table(file: Path, shape: Shape) -> pa.Table:
@@ -408,7 +439,7 @@ def _numbers(
     Few odd cells among numbers count as marks. None where the column holds anything else.
     """
     if not pa.types.is_string(column.type):
-        return (numbers_of(column), set(), {}) if _is_numeric(column.type) else None
+        return (numbers_of(column), set(), {}) if is_numeric(column.type) else None
     plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
     is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
     is_other = compute.fill_null(compute.invert(is_number), False)
@@ -420,7 +451,3 @@ def _numbers(
         return None
     column = compute.if_else(is_other, pa.scalar(None, pa.string()), plain)
     return numbers_of(column), {text for text in others if text.strip()}, rows
-
-
-def _is_numeric(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))

@@ -10,6 +10,7 @@ from pathlib import Path
 from vehest.data.errors import DataError, printable
 
 _CANDUMP = re.compile(r"\s*\(\d+(\.\d+)?\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
+_ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
 _NAMES_SIGNAL = re.compile(
     r"(signal|channel|sensor|kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
     r"topic|tag|key)(_?(name|id))?|\w*_name|name",
@@ -45,6 +46,11 @@ def require_columns_of_signals(
         raise DataError(
             f"'{file}' holds raw frames of a CAN bus as candump writes them; "
             "declare it with the bus's DBC (docs/sources/can.md), or save its decoded signals"
+        )
+    if filled and sum(map(bool, map(_ALIGNED.fullmatch, filled))) > 0.9 * len(filled):
+        raise DataError(
+            f"'{file}' has columns that are aligned by blanks; put one mark between them, "
+            f"for example by: sed -E 's/^ +//; s/ +/;/g' {file.name} > {file.stem}.csv"
         )
     for delimiter, rows in tables.items():
         table = [row for row in rows.values() if len(row) > 1]
