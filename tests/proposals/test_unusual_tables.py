@@ -233,7 +233,7 @@ def test_days_of_a_spreadsheet_are_a_clock(tmp_path):
     name = table.columns[0]
     table[name] = 45000.5 + table[name] / 86_400.0
     made, recording = read_back(
-        write(tmp_path / "lap.csv", table.rename(columns={name: "Timestamp"}))
+        exact(tmp_path / "lap.csv", table.rename(columns={name: "Timestamp"}))
     )
     assert made.dataset["time"] == {"column": "Timestamp", "unit": "d"}
     assert recording.rate_hz == 50.0

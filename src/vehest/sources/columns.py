@@ -56,24 +56,32 @@ class SampledColumn(Column):
 def columns_from_config(
     entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column
 ) -> dict[str, Column]:
-    """Channel -> its declaration of ``kind``, as a data set declares them; `ConfigurationError` for an unknown channel, unit or key."""
+    """Channel -> its declaration of ``kind``, as a data set declares them.
+
+    `ConfigurationError` for an unknown channel, unit or key.
+    """
     columns = {}
     for name, entry in entries.items():
-        where = f"data set '{dataset}': channel '{name}'"
+        location = f"data set '{dataset}': channel '{name}'"
         try:
-            columns[str(name)] = column_from_config(entry, where, channel(str(name)).unit, kind)
+            columns[str(name)] = column_from_config(entry, location, channel(str(name)).unit, kind)
         except DataError as error:
-            raise ConfigurationError(f"{where}: {error}") from None
+            raise ConfigurationError(f"{location}: {error}") from None
     return columns
 
 
-def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
-    """A declaration of ``kind`` whose unit is convertible to ``si_unit``; raises `ConfigurationError` for another key or quantity."""
-    column = validated(kind, entry, where, error=ConfigurationError)
+def column_from_config(
+    entry: Any, location: str, si_unit: str, kind: type[Column] = Column
+) -> Column:
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
+
+    Raises `ConfigurationError` for another key or quantity.
+    """
+    column = validated(kind, entry, location, error=ConfigurationError)
     if column.factor == 0:
-        raise ConfigurationError(f"{where}: factor must be a number other than 0")
+        raise ConfigurationError(f"{location}: factor must be a number other than 0")
     try:
         factor_to_si(column.unit, si_unit)
     except DataError as error:
-        raise ConfigurationError(f"{where}: {error}") from None
+        raise ConfigurationError(f"{location}: {error}") from None
     return column

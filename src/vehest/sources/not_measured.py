@@ -1,4 +1,6 @@
-"""Texts and numbers by which files of a bus, measurements, loggers and spreadsheets mark a sample as not measured."""
+"""Texts and numbers by which files of a bus, measurements, loggers and spreadsheets mark a sample
+as not measured.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,8 @@ def marks_not_measured(text: str, signal: str = "") -> bool:
 def codes_of_not_measured(values: FloatArray) -> list[float]:
     """Numbers in a column that stand for a missing sample: -9999, 1e20, 327.67 and alike.
 
-    Such a code occurs repeatedly and is further from all other values than these are from one another.
+    Such a code occurs repeatedly and is further from all other values than these are from one
+    another.
 
     Parameters
     ----------
@@ -69,13 +72,13 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
         if not len(measured):
             break
         code = float(extreme(measured))
-        others = measured[measured != code]
-        if len(measured) - len(others) < MIN_CODES or len(others) < 0.5 * len(values):
+        samples = measured[measured != code]
+        if len(measured) - len(samples) < MIN_CODES or len(samples) < 0.5 * len(values):
             continue
-        distance = float(np.abs(others - code).min())
-        if _looks_like_code(code) and distance > float(np.ptp(others)) > 0.0:
+        distance = float(np.abs(samples - code).min())
+        if _looks_like_code(code) and distance > float(np.ptp(samples)) > 0.0:
             codes.append(code)
-            measured = others
+            measured = samples
     return codes
 
 
@@ -83,8 +86,8 @@ def _looks_like_code(value: float) -> bool:
     if abs(value) >= MIN_HUGE:
         return True
     for scale in (1.0, 10.0, 100.0, 1e3, 1e4):
-        whole = round(value * scale)
-        is_whole = abs(value * scale - whole) <= 1e-6 * abs(whole)  # of single precision, too
-        if is_whole and (whole in _ENDS_OF_RANGE or (scale < 1e3 and whole in _NINES)):
+        integer = round(value * scale)
+        is_integer = abs(value * scale - integer) <= 1e-6 * abs(integer)  # of single precision, too
+        if is_integer and (integer in _ENDS_OF_RANGE or (scale < 1e3 and integer in _NINES)):
             return True
     return False

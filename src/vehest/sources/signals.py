@@ -1,6 +1,8 @@
-"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to one clock.
+"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to
+one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that contradicts it is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that
+contradicts it is refused.
 
 file -> a `Signal` each channel -> ticks on which all that are not gappy have values -> channels
 """
@@ -51,7 +53,8 @@ class SignalChannel(Column):
         "linear"  # hold: for values that hold until the next one
     )
     max_gap: Positive | None = (
-        None  # longest time between two samples that is interpolated [s]; None for three median intervals
+        # longest time between two samples that is interpolated [s]; None for three median intervals
+        None
     )
 
 
@@ -61,7 +64,8 @@ class Signal:
 
     origin: str  # its channel group or message, for messages: group 3 (Gateway)
     stamps: FloatArray  # times of the samples [s], strictly increasing, shape (T,)
-    values: FloatArray  # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
+    # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
+    values: FloatArray
     unit: str  # as the file writes it
 
     @property
@@ -70,7 +74,9 @@ class Signal:
         return float(1.0 / np.median(np.diff(self.stamps)))
 
     def gaps(self, max_gap: float) -> list[tuple[float, float]]:
-        """First and last time of each gap between two samples that is longer than ``max_gap`` [s]."""
+        """First and last time of each gap between two samples that is longer than ``max_gap``
+        [s].
+        """
         times = self.stamps[~np.isnan(self.values)]
         first = np.flatnonzero(np.diff(times) > max_gap * (1.0 + SLACK))
         return list(zip(times[first].tolist(), times[first + 1].tolist(), strict=True))
@@ -82,7 +88,8 @@ class Signal:
         within = unmeasured[(unmeasured > begin) & (unmeasured < end)]
         if len(within):
             lines.append(
-                f"{len(within)} samples that are marked as not measured, the first at {within[0]:.6g} s, are interpolated"
+                f"{len(within)} samples that are marked as not measured, the first at "
+                f"{within[0]:.6g} s, are interpolated"
             )
         slack = 1.0 / self.rate_hz
         for left, right in self.gaps(max_gap):
@@ -112,7 +119,9 @@ class SignalOptions:
 
 
 class SignalSource(FileSource):
-    """Files of signals, a recording each, or one for each part between pauses of any signal that is not gappy."""
+    """Files of signals, a recording each, or one for each part between pauses of any signal that is
+    not gappy.
+    """
 
     options_type = SignalOptions
     options: SignalOptions
@@ -125,12 +134,14 @@ class SignalSource(FileSource):
         self.channels = self._declared(options.channels, self.channel_type)
         if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(
-                f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken"
+                f"{self.location}: give either rate_hz, or as raster the channel whose clock is "
+                "taken"
             )
         self._signals = lru_cache(1)(self._read_signals)
         if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
             raise ConfigurationError(
-                f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'"
+                f"{self.location}: raster must name one of its channels that is not gappy, not "
+                f"'{options.raster}'"
             )
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
@@ -182,23 +193,27 @@ class SignalSource(FileSource):
             valid = signal.stamps[~np.isnan(signal.values)]
             if not len(valid):
                 raise DataError(
-                    f"{self._signal_name(name, signal, file)} holds no valid sample; leave the channel out"
+                    f"{self._signal_name(name, signal, file)} holds no valid sample; leave the "
+                    "channel out"
                 )
             spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
         return common_span(spans, f"'{file}'")
 
     def _read(self, file: Path, run: int | None) -> Recording:
-        """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+        """Read a file of signals.
+
+        Raises `MissingError` without it, `DataError` where it or its clocks are unusable.
+        """
         (signals, provenance) = self._signals(file)
         number = {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():
-                where = self._signal_name(name, signal, file)
+                location = self._signal_name(name, signal, file)
                 require_unit(
                     signal.unit,
                     self.channels[name],
                     channel(name).unit,
-                    where,
+                    location,
                     "set file_units: ignore",
                 )
         stamps, ticks, rate_hz = self._clock(signals, file, run)
@@ -224,12 +239,16 @@ class SignalSource(FileSource):
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance."""
+        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the
+        provenance.
+        """
 
     def _clock(
         self, signals: Mapping[str, Signal], file: Path, run: int | None
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""
+        """Stamps [s] at which every signal that is not gappy has values, the even clock behind them
+        [s], and its rate [Hz].
+        """
         begin, end = self._common_span(self._spanning(signals), file)
         segment = self._runs_of(file)[run]
         if segment.start is not None:
@@ -240,8 +259,8 @@ class SignalSource(FileSource):
             return ticks, ticks, self.options.rate_hz
         raster = signals[str(self.options.raster)]
         stamps = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
-        where = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
-        clock = uniform_clock(stamps, where, fix="give rate_hz instead of raster")
+        location = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
+        clock = uniform_clock(stamps, location, fix="give rate_hz instead of raster")
         return stamps, clock.ticks(), clock.rate_hz
 
     def _at_ticks(
@@ -251,15 +270,20 @@ class SignalSource(FileSource):
         stamps: FloatArray,
         ticks: FloatArray,
         rate_hz: float,
-        where: str,
+        location: str,
     ) -> FloatArray:
-        """A signal's values at the ticks, in the file's unit; as they are where its samples are those of the raster."""
+        """A signal's values at the ticks, in the file's unit.
+
+        As they are where its samples are those of the raster.
+        """
         if signal.rate_hz > FASTER * rate_hz and "aliasing" not in (
             self.dataset.get("accept") or []
         ):
             raise DataError(
-                f"{where} comes at {signal.rate_hz:.6g} Hz, faster than the raster of {rate_hz:.6g} Hz, into which vibrations "
-                f"would fold; take that rate here and let 'vehest downsample' filter, or accept: [aliasing]"
+                f"{location} comes at {signal.rate_hz:.6g} Hz, faster than the raster of "
+                f"{rate_hz:.6g} Hz, into which vibrations "
+                "would fold; take that rate here and let 'vehest downsample' filter, or accept: "
+                "[aliasing]"
             )
         if name in self.gappy:
             return on_nearest(
@@ -273,21 +297,26 @@ class SignalSource(FileSource):
         times = times[first : last + 1]
         values = signal.values[measured][first : last + 1]
         if n_missing := int(np.count_nonzero(~measured)):
-            where += f" {n_missing} samples of which are marked as not measured,"
+            location += f" {n_missing} samples of which are marked as not measured,"
         declared = self.channels[name]
-        require_samples(values, times, self._max_gap(name, signal) * (1.0 + SLACK), where)
+        require_samples(values, times, self._max_gap(name, signal) * (1.0 + SLACK), location)
         if np.array_equal(times, stamps):
             return values
         return at_ticks(values, times, ticks, hold=declared.interpolation == "hold", slack=near)
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
-        return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
+        return (
+            f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel "
+            f"'{name}',"
+        )
 
 
 def _segments(
     gaps: Iterable[tuple[float, float]], begin: float, end: float, min_duration: float
 ) -> list[slice]:
-    """Times [s] from ``begin`` to ``end`` without gaps, of segments that last ``min_duration`` [s]."""
+    """Times [s] from ``begin`` to ``end`` without gaps, of segments that last ``min_duration``
+    [s].
+    """
     segments = []
     for left, right in sorted([*gaps, (end, math.inf)]):
         if left <= end and left - begin >= min_duration:

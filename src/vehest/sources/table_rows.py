@@ -45,50 +45,58 @@ def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
 
 
 def dropped_rows_from_config(
-    entries: Mapping[str, Iterable[int | str]], where: str
+    entries: Mapping[str, Iterable[int | str]], location: str
 ) -> dict[str, list[slice]]:
-    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or ranges; raises `ConfigurationError`."""
+    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or
+    ranges; raises `ConfigurationError`.
+    """
     return {
-        str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows]
+        str(stem): [_rows(row, f"{location}: drop_rows of '{stem}'") for row in rows]
         for stem, rows in entries.items()
     }
 
 
-def _rows(row: int | str, where: str) -> slice:
-    found = RANGE.fullmatch(str(row).strip())
-    first, last = found.groups(default=found[1]) if found else ("", "")
+def _rows(row: int | str, location: str) -> slice:
+    match = RANGE.fullmatch(str(row).strip())
+    first, last = match.groups(default=match[1]) if match else ("", "")
     if not first or (last and int(last) < int(first)):
         raise ConfigurationError(
-            f'{where}: \'{row}\' is neither a data row, counted from 1, nor a range such as "700-750" or "700-"'
+            f"{location}: '{row}' is neither a data row, counted from 1, nor a range such as "
+            '"700-750" or "700-"'
         )
     return slice(int(first) - 1, int(last) if last else None)
 
 
-def kept_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
+def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
     """Which rows count, shape (n_rows,); raises `DataError` where the table has no such row."""
-    kept = np.ones(n_rows, dtype=np.bool_)
+    is_remaining = np.ones(n_rows, dtype=np.bool_)
     for rows in dropped:
         last = rows.stop or rows.start + 1
         if last > n_rows:
             raise DataError(
-                f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another version of the file?"
+                f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another "
+                "version of the file?"
             )
-        kept[rows] = False
-    return kept
+        is_remaining[rows] = False
+    return is_remaining
 
 
 def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
-    """Rows of each run that a column of whole numbers counts; raises `DataError` where a number is none, or a run begins again."""
+    """Rows of each run that a column of whole numbers counts.
+
+    Raises `DataError` where a number is none, or a run begins again.
+    """
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
-        where = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
-        raise DataError(f"'{file}': {where}; runs are counted in whole numbers")
+        location = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
+        raise DataError(f"'{file}': {location}; runs are counted in whole numbers")
     runs: dict[int | None, slice] = {}
     for rows in stretches(np.diff(numbers) != 0, len(numbers)):
         run = int(numbers[rows.start])
         if run in runs:
             raise DataError(
-                f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is uninterrupted, sort the rows"
+                f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is "
+                "uninterrupted, sort the rows"
             )
         runs[run] = rows
     return runs
@@ -132,6 +140,8 @@ def timed_runs(
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
-    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N - 1,)."""
+    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N -
+    1,).
+    """
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]

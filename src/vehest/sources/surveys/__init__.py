@@ -1,4 +1,5 @@
-"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column that looks like a clock.
+"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column
+that looks like a clock.
 
 Nothing is made a channel here; ``vehest.alignment.proposals`` finds which column is which channel.
 """
@@ -46,7 +47,10 @@ UNITS = {  # of ROS's own types, REP 103
 
 
 def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder; raises `MissingError` without file or package, `DataError` where it cannot be read."""
+    """Columns of one file, or of a bag's folder.
+
+    Raises `MissingError` without file or package, `DataError` where it cannot be read.
+    """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)
@@ -59,13 +63,15 @@ def survey(path: Path) -> Log:
         ):
             raise DataError(f"'{path}': {fault}")
     faults = {
-        one.name: clock_fault(one.stamps, may_repeat=True)
-        for one in log.columns
-        if one.stamps is not None
+        column.name: clock_fault(column.stamps, may_repeat=True)
+        for column in log.columns
+        if column.stamps is not None
     }
     skipped = log.skipped + tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
     log = replace(
-        log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=skipped
+        log,
+        columns=tuple(column for column in log.columns if not faults.get(column.name)),
+        skipped=skipped,
     )
     if not log.columns:
         raise DataError(
@@ -103,11 +109,13 @@ def _survey(path: Path) -> Log:
         )
     if ending in CAN:
         raise DataError(
-            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare them (docs/sources/can.md)"
+            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare "
+            "them (docs/sources/can.md)"
         )
     if ending == ".bag":
         raise DataError(
-            f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'"
+            f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst "
+            f"{path.stem}'"
         )
     if path.is_dir() or ending in BAGS:
         return _survey_bag(path)
@@ -119,7 +127,8 @@ def _survey(path: Path) -> Log:
         return _survey_vbo(path)
     if is_stored_recording(path):
         raise DataError(
-            f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'"
+            f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data "
+            f"usable {path}'"
         )
     return survey_table(path)
 
@@ -134,7 +143,7 @@ def _survey_bag(path: Path) -> Log:
         name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
         for name, *_ in topics
     }
-    start = min((own[0] for own in times.values() if len(own) > 1), default=0.0)
+    start = min((stamps[0] for stamps in times.values() if len(stamps) > 1), default=0.0)
     for topic, kind, fields in topics:
         clock = "header" if f"{topic}@stamped" in arrays else "received"
         for field in fields if len(times[topic]) > 1 else ():
@@ -171,9 +180,9 @@ def _survey_vbo(file: Path) -> Log:
     skipped: tuple[str, ...] = ()
     try:
         require_slip_offsets(log, "Slip_COG, Slip_FL …")
-        wanted = log.columns
+        selected = log.columns
     except DataError as error:
-        wanted = {
+        selected = {
             name: samples
             for name, samples in log.columns.items()
             if not SLIP_AT_A_POINT.fullmatch(name)
@@ -182,11 +191,11 @@ def _survey_vbo(file: Path) -> Log:
     devices: dict[str, Literal["car", "reference"]] = {}
     if any("CAN" in module for module in log.modules.values()):
         devices = {
-            name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in wanted
+            name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in selected
         }
     columns = tuple(
         RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, ""))
-        for name, samples in wanted.items()
+        for name, samples in selected.items()
     )
     clock = Stamps("time", "s", "clock time of the format")
     seconds = log.seconds - log.seconds[0]

@@ -1,6 +1,8 @@
-"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of units below them.
+"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of
+units below them.
 
-file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers and clock times -> `Log`
+file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers
+and clock times -> `Log`
 """
 
 from __future__ import annotations
@@ -99,11 +101,16 @@ class Shape:
     units: Mapping[str, str] = field(
         default_factory=dict
     )  # name -> unit in the row below the names, if there is one
-    score: float = 0.0  # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row
+    # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no
+    # such row
+    score: float = 0.0
 
 
 def survey_table(file: Path) -> Log:
-    """What a table holds; raises `DataError` where it is no table, has no names, or holds no numbers."""
+    """What a table holds.
+
+    Raises `DataError` where it is no table, has no names, or holds no numbers.
+    """
     clocks: dict[str, FloatArray] = {}
     options: dict[str, Any] = {}
     skipped: list[str] = []
@@ -193,21 +200,24 @@ def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
     back = int((steps < 0).sum())
-    same = int((steps == 0).sum())
-    what = (
+    n_repeats = int((steps == 0).sum())
+    fault = (
         f"goes backwards {back} times"
         if back
-        else f"repeats {same} times"
-        if same
+        else f"repeats {n_repeats} times"
+        if n_repeats
         else "does not grow evenly"
     )
-    return f"column '{printable(name)}' as the time: it {what}" + (
+    return f"column '{printable(name)}' as the time: it {fault}" + (
         "; sort the rows" if back > 1 else ""
     )
 
 
 def unit_in_name(name: str) -> str:
-    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``; empty where there is none."""
+    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``.
+
+    Empty where there is none.
+    """
     bracketed = BRACKETED.match(name.strip())
     if bracketed:
         return bracketed["unit"].strip()
@@ -219,7 +229,10 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """Layout of a table of text, by its beginning; raises `DataError` where it is none, or has one column or no line of names."""
+    """Layout of a table of text, by its beginning.
+
+    Raises `DataError` where it is none, or has one column or no line of names.
+    """
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [
@@ -259,7 +272,9 @@ def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
 
 
 def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding: str) -> Shape:
-    """The table that a decimal mark makes of rows: names and units stand right above the first two rows of numbers."""
+    """The table that a decimal mark makes of rows: names and units stand right above the first two
+    rows of numbers.
+    """
     lengths = [len(row) for row in rows.values()][len(rows) // 2 :]
     n_columns = max(set(lengths), key=lengths.count, default=0)
     shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns > 1}
@@ -320,7 +335,9 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a row below the names holds units: some that are known, or brackets, and no longer words."""
+    """Whether a row below the names holds units: some that are known, or brackets, and no longer
+    words.
+    """
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     if not filled:
         return any(cell.strip() for cell in cells)
@@ -377,7 +394,9 @@ def _without_names(table: pa.Table, names: Sequence[str]) -> tuple[pa.Table, tup
 def _columns(
     file: Path, shape: Shape, table: pa.Table
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
-    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not read, and why."""
+    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not
+    read, and why.
+    """
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     values: dict[str, FloatArray] = {}
     clocks: dict[str, FloatArray] = {}
@@ -389,8 +408,8 @@ def _columns(
         elif not name:
             skipped.append(f"column {place} has no name")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
-            values[name], found, odd = numbers
-            marks |= found
+            values[name], column_marks, odd = numbers
+            marks |= column_marks
             skipped += [
                 f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
                 for text, row in odd.items()
@@ -414,7 +433,9 @@ def _kind_of_text(column: pa.ChunkedArray) -> str:
 
 
 def _table(file: Path, shape: Shape) -> pa.Table:
-    """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as they stand."""
+    """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as
+    they stand.
+    """
     inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
     text = pc.ConvertOptions(
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
@@ -443,11 +464,11 @@ def _numbers(
     plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
     is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
     is_other = compute.fill_null(compute.invert(is_number), False)
-    others = compute.unique(column.filter(is_other)).to_pylist()
-    odd = [text for text in others if text.strip() and not marks_not_measured(text)]
+    other_texts = compute.unique(column.filter(is_other)).to_pylist()
+    odd = [text for text in other_texts if text.strip() and not marks_not_measured(text)]
     rows = {text: compute.index(column, text).as_py() + 1 for text in odd[:MAX_ODD_CELLS]}
     n_odd = compute.sum(compute.is_in(column, pa.array(odd, pa.string()))).as_py() or 0
     if len(odd) > MAX_ODD_CELLS or n_odd > MAX_ODD_SHARE * (compute.sum(is_number).as_py() or 0):
         return None
     column = compute.if_else(is_other, pa.scalar(None, pa.string()), plain)
-    return numbers_of(column), {text for text in others if text.strip()}, rows
+    return numbers_of(column), {text for text in other_texts if text.strip()}, rows

@@ -56,7 +56,7 @@ def require_columns_of_signals(
         table = [row for row in rows.values() if len(row) > 1]
         if table:
             _require_no_frames(file, table)
-            _require_one_row_a_time(file, table)
+            _require_wide_format(file, table)
         quoted = [row for row in rows.values() if len(row) == 1 and row[0].count(delimiter) > 1]
         if delimiter in ";\t," and len(quoted) > 0.9 * len(rows) and filled[-1].startswith('"'):
             raise DataError(
@@ -81,7 +81,7 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
             )
 
 
-def _require_one_row_a_time(file: Path, table: Sequence[Sequence[str]]) -> None:
+def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
     for at, header in enumerate(table[:20]):
         rows = [row for row in table[at + 1 :] if len(row) == len(header)]
         of_signal = [k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip())]
