@@ -210,6 +210,11 @@ class Clock:
         """Times of the uniform clock [s]."""
         return self.start_time + np.arange(self.n_samples) / self.rate_hz
 
+    def part(self, rows: slice) -> Clock:
+        """The clock of some of its ticks."""
+        start_time = self.start_time + rows.start / self.rate_hz
+        return Clock(start_time, self.rate_hz, rows.stop - rows.start)
+
     def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
         """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
 

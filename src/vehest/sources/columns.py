@@ -53,6 +53,17 @@ class SampledColumn(Column):
         return np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
 
 
+def measured_columns(
+    columns: Mapping[str, Column], values: Mapping[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Columns of a table, (T,) each, NaN where a channel's declaration says so."""
+    measured = {**values}
+    for column in columns.values():
+        if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
+            measured[column.column] = column.measured(measured[column.column])
+    return measured
+
+
 def columns_from_config(
     entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column
 ) -> dict[str, Column]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.sources.clocks import bridged
 from vehest.sources.columns import Column, Positive
 
@@ -65,6 +66,27 @@ def _rows(row: int | str, location: str) -> slice:
             '"700-750" or "700-"'
         )
     return slice(int(first) - 1, int(last) if last else None)
+
+
+def remaining_files(
+    files: Sequence[Path], exclude: Iterable[str], dropped: Iterable[str], location: str
+) -> list[Path]:
+    """Files whose stems match no pattern of ``exclude``.
+
+    Raises `MissingError` where a pattern, or a stem of ``dropped``, matches no file, or none
+    remains.
+    """
+    patterns = list(exclude)
+    for option, names in (("exclude", patterns), ("drop_rows", dropped)):
+        for name in names:
+            if not any(name == file.stem or fnmatchcase(file.stem, name) for file in files):
+                raise MissingError(f"{location}: {option} names '{name}', which no file is called")
+    remaining = [
+        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
+    ]
+    if not remaining:
+        raise MissingError(f"{location}: exclude leaves none of its files")
+    return remaining
 
 
 def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:

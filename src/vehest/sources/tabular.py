@@ -6,8 +6,7 @@ Names, units and signs are declared in conf/dataset.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from dataclasses import dataclass
 from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -16,7 +15,7 @@ from pydantic import AfterValidator, Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
 from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import PART, Recording, part_slices
@@ -32,6 +31,7 @@ from vehest.sources.columns import (
     SampledColumn,
     column_from_config,
     columns_from_config,
+    measured_columns,
 )
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import sample_and_hold_from_config
@@ -40,6 +40,7 @@ from vehest.sources.table_rows import (
     TimeColumn,
     counted_runs,
     dropped_rows_from_config,
+    remaining_files,
     remaining_rows,
     timed_runs,
 )
@@ -196,20 +197,10 @@ class TabularSource(FileSource):
                 file, selected, self.layout, (rows.stop - rows.start for rows in slices)
             )
             for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
-                part_clock = replace(
-                    clock,
-                    start_time=clock.start_time + rows.start / clock.rate_hz,
-                    n_samples=rows.stop - rows.start,
-                )
+                measured = measured_columns(self.columns or {}, values)
+                part = [number, len(slices)]
                 yield self._prepared(
-                    self._recording_of(
-                        file,
-                        None,
-                        columns,
-                        self._measured(values),
-                        part_clock,
-                        [number, len(slices)],
-                    )
+                    self._recording_of(file, None, columns, measured, clock.part(rows), part)
                 )
         except DataError:
             self.read_file(file)  # whose errors are of all its rows
@@ -259,20 +250,12 @@ class TabularSource(FileSource):
         values = read_columns(file, list(dict.fromkeys([*selected, *sorting])), self.layout)
         if time is not None and time.column in values:
             values = time.in_order(values)
-        values = self._measured(values)
+        values = measured_columns(self.columns or {}, values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values
         is_remaining = remaining_rows(len(next(iter(values.values()))), dropped, file)
         return {name: samples[is_remaining] for name, samples in values.items()}
-
-    def _measured(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Columns, NaN where a channel's declaration says that nothing was measured."""
-        measured = {**values}
-        for column in (self.columns or {}).values():
-            if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
-                measured[column.column] = column.measured(measured[column.column])
-        return measured
 
     def _recording_of(
         self,
@@ -321,34 +304,15 @@ class TabularSource(FileSource):
             }
             lines, inside, rate = self.held.interpolated(sampled_columns, values, clock, location)
             channels = {name: samples[inside] for name, samples in {**channels, **lines}.items()}
-            clock = replace(
-                clock,
-                start_time=float(clock.ticks()[inside.start]),
-                n_samples=inside.stop - inside.start,
-                stamps=None,
-            )
+            clock = clock.part(inside)
             provenance["held"] = self.held.description(rate)
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
-        files = super()._files()
-        stems = {file.stem for file in files}
-        patterns = self.options.exclude or ()
-        for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
-            for name in named:
-                if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):
-                    raise MissingError(
-                        f"{self.location}: {option} names '{name}', which no file is called"
-                    )
-        remaining = [
-            file
-            for file in files
-            if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
-        ]
-        if not remaining:
-            raise MissingError(f"{self.location}: exclude leaves none of its files")
-        return remaining
+        return remaining_files(
+            super()._files(), self.options.exclude or (), self.dropped, self.location
+        )
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Rows of each run without those that are left out."""
