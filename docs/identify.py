@@ -31,7 +31,7 @@ from vehest.sources.clocks import uniform_times
 from vehest.sources.pose import PoseOptions, ground_plane
 from vehest.sources.rosbag import POSE_FIELDS
 from vehest.sources.rosbag.topics import read_bag
-from vehest.sources.table_rows import dropped_rows_from_config, kept_rows
+from vehest.sources.table_rows import dropped_rows_from_config, remaining_rows
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -222,7 +222,7 @@ def dart(folder: Path) -> Parts:
     for file in sorted(folder.glob("*/*.csv")):
         table = pd.read_csv(file)
         excluded = any(fnmatchcase(file.stem, pattern) for pattern in given["exclude"])
-        rows = kept_rows(len(table), () if excluded else dropped.get(file.stem, ()), file)
+        rows = remaining_rows(len(table), () if excluded else dropped.get(file.stem, ()), file)
         seconds = float(np.ptp(table["vicon time"]))
         poses = table[place].to_numpy(np.float64)
         title = ("left out " if excluded else "") + f"{file.parent.name}/{file.stem}"

@@ -151,7 +151,9 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
     }
     with pytest.raises(ConfigurationError, match="the model reads channel 'ax'"):
         from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"])
-    assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {
+    assert set(
+        from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).by_channel
+    ) == {
         "vx",
         "ay",
     }
@@ -169,7 +171,10 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
         from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(",")),
     )
     declared, named = (
-        (own.factors, {name: (one.message.name, one.signal) for name, one in own.wanted.items()})
+        (
+            own.factors,
+            {name: (one.message.name, one.signal) for name, one in own.by_channel.items()},
+        )
         for own in maps
     )
     assert declared == named

@@ -14,6 +14,8 @@ from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.not_measured import codes_of_not_measured
+from vehest.sources.surveys.tables import survey_table
 
 
 def read_back(file):
@@ -191,3 +193,105 @@ def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_pa
     slow = recording["vx"] < 1.0
     assert np.abs(recording["vy_ref"][slow]).max() == 0.0
     np.testing.assert_allclose(recording["vy_ref"][~slow], d["vy"][~slow], atol=1e-2)
+
+
+@pytest.mark.parametrize("code", [-9999.0, 1e20, 327.67, 3.4028e38])
+def test_numbers_that_loggers_write_for_nothing_are_missing_samples(tmp_path, code):
+    d = drive()
+    table = usual(d)
+    expected = np.radians(table["Gyro"].copy())
+    for first in (300, 900, 1500):
+        table.loc[first : first + 5, ["Gyro", "Speed"]] = code
+    made, recording = read_back(write(tmp_path / "lap.csv", table))
+    assert made.dataset["channels"]["yaw_rate"]["invalid"] == pytest.approx([code], rel=1e-12)
+    assert any(f"{code:.9g} in 18 samples of 'Gyro'" in note for note in made.notes)
+    assert np.abs(recording["yaw_rate"] - expected[: len(recording)]).max() < 0.02
+
+
+def test_a_value_within_the_range_of_the_others_is_no_code():
+    heading = np.linspace(0.0, 359.0, 1000)
+    heading[[100, 101]] = 327.67
+    saturated = np.minimum(np.linspace(0.0, 500.0, 1000), 327.67)
+    spike = np.r_[np.linspace(0.0, 1.0, 1000), 9999.0]
+    for samples in (heading, saturated, spike, np.zeros(100), np.full(100, np.nan)):
+        assert codes_of_not_measured(samples) == []
+    assert codes_of_not_measured(np.r_[np.linspace(0.0, 1.0, 100), -9999, -9999, 65535, 65535]) == [
+        65535.0,
+        -9999.0,
+    ]
+
+
+def exact(file, table):
+    """A table of text with all digits."""
+    table.to_csv(file, index=False)
+    return file
+
+
+def test_days_of_a_spreadsheet_are_a_clock(tmp_path):
+    d = drive()
+    table = usual(d)
+    name = table.columns[0]
+    table[name] = 45000.5 + table[name] / 86_400.0
+    made, recording = read_back(
+        exact(tmp_path / "lap.csv", table.rename(columns={name: "Timestamp"}))
+    )
+    assert made.dataset["time"] == {"column": "Timestamp", "unit": "d"}
+    assert recording.rate_hz == 50.0
+
+
+def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
+    table = usual(drive())
+    name = table.columns[0]
+    table[name] = 1e-8 * table[name]
+    log = survey_table(exact(tmp_path / "lap.csv", table.rename(columns={name: "time"})))
+    assert log.clock is None
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        (lambda v: f'"{1e3 * v:,.1f}"', "a separator of thousands, such as '"),
+        (lambda v: f"{v:.3f}".replace("-", "−"), "another minus sign, such as '−"),
+        (lambda v: f"{v:.3f} deg/s", "a unit, such as '"),
+        (lambda v: f"{v:.4E}".replace("E", "D"), "another mark of the exponent, such as '"),
+    ],
+)
+def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, said):
+    table = usual(drive())
+    lines = [",".join(table.columns)]
+    for row in table.itertuples(index=False):
+        cells = [f"{value:.5f}" for value in row]
+        at = list(table.columns).index("Gyro")
+        cells[at] = cell(100.0 + row[at]) if "thousand" in said else cell(row[at])
+        lines.append(",".join(cells))
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    (reason,) = (reason for reason in survey_table(file).skipped if "'Gyro'" in reason)
+    assert reason.startswith(f"column 'Gyro' holds numbers with {said}")
+
+
+def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path):
+    table = usual(drive())
+    file = tmp_path / "lap.txt"
+    file.write_text(table.round(4).to_string(index=False), encoding="utf-8")
+    with pytest.raises(
+        DataError, match=r"aligned by blanks; .* sed -E 's/\^ \+//; s/ \+/;/g' lap.txt"
+    ):
+        survey_table(file)
+
+
+def test_decimals_of_parquet_are_numbers(tmp_path):
+    table = usual(drive())
+    stored = pa.Table.from_pandas(table, preserve_index=False)
+    at = stored.column_names.index("Gyro")
+    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
+    file = tmp_path / "lap.parquet"
+    pq.write_table(stored.set_column(at, "Gyro", gyro), file)
+    _, recording = read_back(file)
+    np.testing.assert_allclose(recording["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+
+
+def test_minutes_and_seconds_are_times():
+    texts = pa.chunked_array([["59:59.98", "60:00.00", "60:00,02"]])
+    np.testing.assert_allclose(seconds_of_text(texts), [3599.98, 3600.0, 3600.02], atol=1e-9)
+    assert seconds_of_text(pa.chunked_array([["59:59", "60:00"]])) is None

@@ -10,7 +10,9 @@ from refusals import refusal
 
 from conftest import planar_drive
 from vehest.data.limits import Limits, use_limits
+from vehest.run.inspect_data import check
 from vehest.sources.base import open_source
+from vehest.sources.signals import MISSING
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 
@@ -177,6 +179,12 @@ def choices(text):
     return one('0|16@1+ (0.01,0) [0|300] "m/s" Car') + f"\nVAL_ 291 Speed {text} ;\n"
 
 
+def recordings(folder, **options):
+    declared = {"name": "mine", "source": "can", "files": "drive.*", "path": str(folder)}
+    declared |= {"dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": SPEED}
+    return list(open_source(declared | options).recordings())
+
+
 @pytest.mark.parametrize(
     "name",
     ["SNA", "Signal not available", "Speed_Invalid", "ERROR", "Init", "nicht verfuegbar", "n.a."],
@@ -185,9 +193,16 @@ def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, n
     log(tmp_path, choices(f'65535 "{name}"'), ramp(0, [65535] * 5))
     got = read(tmp_path, channels={"vx": {**SPEED["vx"], "max_gap": 0.1}})
     np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 100.0, atol=1e-9)
-    said = refusal(lambda: read(tmp_path, channels=SPEED))
-    assert "'Speed' of message 'Speed', for channel 'vx', 5 samples of which are marked as" in said
-    assert "has a gap of 0.06 s after 0.19 s" in said
+    parts = recordings(tmp_path)
+    expected = [(20, 0.19), (175, 1.99)]
+    assert [(len(part), float(part["vx"].max())) for part in parts] == expected
+    assert (
+        parts[0]
+        .provenance[MISSING]["vx"][0]
+        .startswith(
+            "a gap of 0.06 s after 0.19 s, 5 samples of which are marked as not measured, ends the recording"
+        )
+    )
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
@@ -202,9 +217,7 @@ def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding)
 
 def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(tmp_path):
     log(tmp_path, choices('65535 "SNA"'), ramp(0, [65535] * 50))
-    declared = {"files": "drive.*", "dbc": str(tmp_path / "car.dbc"), "rate_hz": 100}
-    declared |= {"channels": SPEED, "max_gap": 0.1, "path": str(tmp_path)}
-    parts = list(open_source({"name": "mine", "source": "can", **declared}).recordings())
+    parts = recordings(tmp_path, max_gap=0.1)
     assert [(len(part), float(part["vx"].max())) for part in parts] == [(20, 0.19), (130, 1.99)]
 
 
@@ -246,3 +259,28 @@ def test_reserved_codes_of_j1939_are_missing_samples(tmp_path, maximum, protocol
     got = read(tmp_path, channels=channels, gappy=["vx"])["vx"]
     assert np.count_nonzero(np.isnan(got)) == n_missing
     assert (3.6 * got[~np.isnan(got)] < 251.0).all() == (n_missing > 0)
+
+
+def test_data_check_names_missing_samples_and_goes_on_with_the_segments(tmp_path, monkeypatch):
+    log(tmp_path, choices('65535 "SNA"'), [*ramp(0, [65535] * 5), (2.0, 0, b"\x00\xf0" + bytes(6))])
+    text = f"""
+name: mine
+title: ""
+vehicle: mine
+licence: ""
+citation: ""
+source: can
+path: {tmp_path}
+files: drive.*
+dbc: {tmp_path}/car.dbc
+rate_hz: 100
+channels: {{vx: {{column: Speed, unit: m/s}}}}
+"""
+    (tmp_path / "conf" / "dataset").mkdir(parents=True)
+    (tmp_path / "conf" / "dataset" / "mine.yaml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    rows, _ = check("mine", [])
+    missing = [(row["recording"], row["channel"]) for row in rows if row["check"] == "missing"]
+    assert missing == [("drive_run_0", "vx")]
+    impossible = [row["recording"] for row in rows if row["check"] == "impossible"]
+    assert impossible == ["drive_run_1"]

@@ -8,6 +8,8 @@ from mdf_log import ONE, read_mdf, write_mdf
 from refusals import refusal
 
 from vehest.data.errors import ConfigurationError
+from vehest.sources.base import open_source
+from vehest.sources.signals import MISSING
 from vehest.sources.unit_spellings import plain_unit
 
 asammdf = pytest.importorskip(
@@ -182,7 +184,7 @@ def test_values_that_a_conversion_names_not_available_are_missing_samples(tmp_pa
     bridged = {"vx": {**ONE["vx"], "max_gap": 0.05}}
     expected = 0.01 * np.arange(1, 2001)
     np.testing.assert_allclose(read_mdf(file, channels=bridged)["vx"], expected, rtol=1e-12)
-    assert "a gap of 0.04 s after 0.99 s" in refused(file)
+    assert [len(part) for part in parts_of(file)] == [99, 1898]
     gear = from_dict({**names, "text_1": b"D", "default_addr": from_dict({"a": 0.01, "b": 0.0})})
     assert "holds text" in refused(one(tmp_path / "a.mf4", FAST, raw, conversion=gear))
 
@@ -236,17 +238,32 @@ def test_spellings_are_known_where_they_mean_one_thing():
     assert {text: plain_unit(text) for text in (known | unclear)} == known | unclear
 
 
-def test_a_long_gap_must_be_declared(tmp_path):
-    kept = np.delete(FAST, np.s_[500:530])
-    file = one(tmp_path / "a.mf4", kept, 3.0 * kept)
-    message = refused(file)
-    assert (
-        "group 0 'Only', for channel 'vx', has a gap of 0.31 s after 4.99 s, the longest of 1 above 0.03 s"
-        in message
-    )
-    assert "a gap of" in refused(file, channels={"vx": {**ONE["vx"], "max_gap": 0.3}})
+def parts_of(file, **options):
+    declared = {"name": "mine", "source": "mdf", "path": str(file.parent), "files": file.name}
+    return list(open_source(declared | {"rate_hz": 100, "channels": ONE} | options).recordings())
+
+
+def test_a_gap_beyond_the_channels_max_gap_ends_a_recording(tmp_path):
+    remaining = np.delete(FAST, np.s_[500:530])
+    file = one(tmp_path / "a.mf4", remaining, 3.0 * remaining)
+    for max_gap in (None, 0.3):
+        parts = parts_of(file, channels={"vx": {**ONE["vx"], "max_gap": max_gap}})
+        assert [(part.id, len(part)) for part in parts] == [("a_run_0", 500), ("a_run_1", 1471)]
+        for part in parts:
+            np.testing.assert_allclose(part["vx"], 3.0 * part.time, rtol=0, atol=1e-12)
+        assert (
+            parts[0].provenance[MISSING]["vx"][0].startswith("a gap of 0.31 s after 4.99 s, ends")
+        )
+        assert MISSING not in parts[1].provenance
     bridged = read_mdf(file, channels={"vx": {**ONE["vx"], "max_gap": 0.31}})
     np.testing.assert_allclose(bridged["vx"], 3.0 * bridged.time, rtol=0, atol=1e-12)
+
+
+def test_gaps_in_most_of_a_file_are_an_error_that_names_the_first(tmp_path):
+    times = np.concatenate([start + np.arange(20) * 0.01 for start in range(20)])
+    message = refused(one(tmp_path / "a.mf4", times, times))
+    assert "has a gap of 0.81 s after " in message
+    assert "the longest of 19 above 0.03 s; raise its max_gap" in message
 
 
 def test_a_pause_of_one_group_ends_a_recording_of_all_where_max_gap_says_so(tmp_path):
@@ -267,16 +284,19 @@ def test_a_pause_of_one_group_ends_a_recording_of_all_where_max_gap_says_so(tmp_
     for recording in (first, second):
         np.testing.assert_allclose(recording["vx"], 3.0 * recording.time, rtol=0, atol=1e-9)
         np.testing.assert_allclose(recording["yaw_rate"], 0.01 * recording.time, rtol=0, atol=1e-9)
-    assert "a gap of" in refused(file, **options | {"max_gap": None})
+    assert len(parts_of(file, **options | {"max_gap": None})) == 2
 
 
 def test_invalid_samples_are_missing_values(tmp_path):
     bits = (np.arange(2001) >= 500) & (np.arange(2001) < 520)
     values = np.where(bits, 1e6, 10.0 + FAST)  # what stands at an invalid sample must never be seen
     file = one(tmp_path / "a.mf4", FAST, values, invalidation_bits=bits)
-    assert "20 samples of which are marked as not measured, has a gap of 0.21 s after 4.99 s" in (
-        refused(file)
+    before, after = parts_of(file)
+    assert (
+        "a gap of 0.21 s after 4.99 s, 20 samples of which are marked as not measured"
+        in (before.provenance[MISSING]["vx"][0])
     )
+    np.testing.assert_allclose(np.r_[before["vx"], after["vx"]], 10.0 + FAST[~bits], rtol=1e-12)
     recording = read_mdf(file, gappy=["vx"])
     expected = np.where(bits, np.nan, 10.0 + FAST)
     np.testing.assert_allclose(recording["vx"], expected, rtol=1e-12)

@@ -1,5 +1,6 @@
 """Opening a source by name, simulated drives, and the data sets that are shipped."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +8,13 @@ import pytest
 import yaml
 from refusals import refusal
 
+from example_package import forget_source, install_source
 from vehest.alignment.checks import checks_of_recording
 from vehest.configuration.composition import compose_config, missing_keys
 from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError
 from vehest.run.ingest import plan_ingest
+from vehest.run.versions import code_of
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.simulation.sensors.levels import SensorLevels
@@ -233,3 +236,45 @@ def test_the_values_of_the_car_change_no_key_of_an_ingest(tmp_path):
 def test_shipped_data_sets_have_the_documented_wheelbase(dataset, wheelbase):
     config = compose_config("ingest", [f"dataset={dataset}", "root=elsewhere"])["dataset"]
     assert car_of(config).wheelbase == pytest.approx(wheelbase, rel=1e-9)
+
+
+@pytest.fixture
+def speeds(tmp_path, monkeypatch):
+    """A function that installs the source of another package; its name is forgotten after the test."""
+    yield partial(install_source, tmp_path / "site", monkeypatch)
+    forget_source()
+
+
+def test_a_source_of_another_package_reads_checks_and_ingests_a_data_set(
+    tmp_path, monkeypatch, speeds
+):
+    speeds()
+    assert source_names()[-1] == "speeds"
+    assert code_of("ingest", "speeds").endswith(" speeds=7")
+    (tmp_path / "conf" / "dataset").mkdir(parents=True)
+    declared = {"name": "mine", "source": "speeds", "path": str(tmp_path), "rate_hz": 5}
+    declared |= dict.fromkeys(("title", "vehicle", "licence", "citation"), "mine")
+    (tmp_path / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(declared))
+    (tmp_path / "lap.txt").write_text("\n".join(f"{10 + 0.1 * k:.1f}" for k in range(50)))
+    monkeypatch.chdir(tmp_path)
+    config = compose_config("ingest", ["dataset=mine", f"output={tmp_path}/outputs"])
+    assert plan_ingest(config).inputs.keys() == {"lap.txt"}
+    (recording,) = open_source(config["dataset"]).recordings()
+    assert (recording.id, recording.rate_hz, recording.kind) == ("lap", 5.0, "real")
+    np.testing.assert_allclose(recording["vx"], 10.0 + 0.1 * np.arange(50))
+    message = refusal(lambda: open_source(declared | {"rates": 1}), ConfigurationError)
+    assert "source 'speeds' has no option 'rates'" in message
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("raise RuntimeError('no licence')", "RuntimeError: no licence"),
+        ("SpeedSource = 3", "no class"),
+    ],
+)
+def test_a_source_of_another_package_that_cannot_be_loaded_is_named(speeds, content, said):
+    speeds(content)
+    message = refusal(lambda: open_source({"name": "x", "source": "speeds"}), ConfigurationError)
+    assert "source 'speeds' of another package" in message
+    assert said in message

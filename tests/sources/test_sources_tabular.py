@@ -14,6 +14,7 @@ from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
+from vehest.sources.base import open_source
 from vehest.sources.tabular import TabularSource
 
 TIME = {"column": "time", "unit": "s"}
@@ -283,3 +284,27 @@ def test_an_honest_packed_table_is_read_within_the_limit_and_cells_count_beside_
         assert len(read(file)) == 2000
     with use_limits(Limits(memory=beyond - 1)):
         assert f"unpacks to {taken} bytes" in refusal(lambda: read(file))
+
+
+def test_missing_samples_are_bridged_or_end_a_recording_by_max_gap(tmp_path):
+    time = np.arange(1000) / 100.0
+    speed = np.where((time >= 2.0) & (time < 2.05) | (time >= 5.0) & (time < 5.5), np.nan, time)
+    turn = 2.0 * time
+    rows = [f"{t:.2f},{v},{r}" for t, v, r in zip(time, speed, turn, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,v,r", *rows]).replace("nan", ""))
+    declared = {"name": "mine", "source": "tabular", "path": str(tmp_path)}
+    declared |= {"time": {"column": "t", "unit": "s"}}
+    declared["channels"] = {
+        "vx": {"column": "v", "unit": "m/s"},
+        "yaw_rate": {"column": "r", "unit": "rad/s"},
+    }
+    assert "max_gap of the data set ends a recording there" in (
+        refusal(lambda: list(open_source(declared).recordings()))
+    )
+    before, after = open_source(declared | {"max_gap": 0.1}).recordings()
+    assert (before.start_time, len(before), after.start_time, len(after)) == (0.0, 500, 5.5, 450)
+    for part in (before, after):
+        np.testing.assert_allclose(part["vx"], part.time, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(part["yaw_rate"], 2.0 * part.time, rtol=0, atol=1e-12)
+    gappy = open_source(declared | {"max_gap": 0.1, "gappy": ["vx", "yaw_rate"]}).recordings()
+    assert [int(np.isnan(part["vx"]).sum()) for part in gappy] == [55]

@@ -88,6 +88,21 @@ def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(t
     assert survey(tmp_path / "lap.vbo").runs == (slice(0, 400), slice(400, 750))
 
 
+def test_missing_samples_end_a_recording_where_max_gap_says_so(tmp_path):
+    write_log(tmp_path / "lap.vbo")
+    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
+    lines = rows.splitlines(keepends=True)
+    for k in [*range(200, 203), *range(400, 500)]:
+        cells = rows.splitlines()[k].split(b" ")
+        lines[k] = b" ".join([*cells[:2], *[b"nan"] * (len(cells) - 3), b"\r\n"])
+    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines]))
+    first, second = open_source(dataset(tmp_path, max_gap=0.5)).recordings()
+    assert (len(first), len(second)) == (400, 500)
+    at = np.delete(np.arange(1000), np.s_[400:500])
+    got = np.concatenate([first["vx"], second["vx"]])
+    np.testing.assert_allclose(got, drive()["vx"][at], atol=1e-4)
+
+
 def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
     known = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}

@@ -1,1 +1,3 @@
-"""A model on a vehicle's bus: signals of a DBC become samples, samples estimates, estimates frames."""
+"""A model on a vehicle's bus: signals of a DBC become samples, samples estimates, estimates
+frames.
+"""

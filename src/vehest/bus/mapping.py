@@ -11,7 +11,7 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.units import factor_to_si
 from vehest.sources.base import open_source
-from vehest.sources.can import CanSource, Wanted
+from vehest.sources.can import CanSource, ChannelSignal
 from vehest.sources.can.database import Database, read_dbc
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
@@ -28,7 +28,7 @@ class BusSignals:
     """Signals of a bus as channels."""
 
     database: Database  # messages that carry them
-    wanted: Mapping[str, Wanted]  # channel -> its message and signal
+    by_channel: Mapping[str, ChannelSignal]  # channel -> its message and signal
     factors: Mapping[
         str, float
     ]  # channel -> factor from the unit of the DBC to SI units and ISO 8855 signs
@@ -37,28 +37,29 @@ class BusSignals:
 
 def from_dataset(
     dataset: Mapping[str, Any],
-    needed: Sequence[str],
+    required: Sequence[str],
     optional: Sequence[str] = (),
     dbc: Path | None = None,
 ) -> BusSignals:
-    """Signals that a data set of the source ``can`` declares for the ``needed`` channels.
+    """Signals that a data set of the source ``can`` declares for the ``required`` channels.
 
     ``optional`` are those of them that may be missing; ``dbc`` takes the place of the data set's.
 
-    Raises `ConfigurationError`: the data set is of another source, or declares no such channel. Raises `MissingError`: there is no DBC.
-    Raises `DataError`: it cannot be used, lacks a signal, or contradicts a declared unit.
+    Raises `ConfigurationError`: the data set is of another source, or declares no such channel.
+    Raises `MissingError`: there is no DBC. Raises `DataError`: it cannot be used, lacks a signal,
+    or contradicts a declared unit.
     """
-    where = f"data set '{dataset.get('name')}'"
+    location = f"data set '{dataset.get('name')}'"
     declared = dataset.get("channels") or {}
     if dataset.get("source") != "can":
         raise ConfigurationError(
-            f"{where} is of source '{dataset.get('source')}'; a bus needs one of source 'can'"
+            f"{location} is of source '{dataset.get('source')}'; a bus needs one of source 'can'"
         )
     _require_channels(
-        needed,
+        required,
         optional,
         declared,
-        f"{where} declares none; channels that transforms make are not there online",
+        f"{location} declares none; channels that transforms make are not there online",
     )
     options = {
         name: value
@@ -66,45 +67,54 @@ def from_dataset(
         if value is not None and name not in FOR_RECORDINGS
     }
     options |= {
-        "channels": {name: declared[name] for name in declared if name in needed},
+        "channels": {name: declared[name] for name in declared if name in required},
         "rate_hz": 100.0,
     }
     source = open_source(options if dbc is None else {**options, "dbc": str(dbc)})
     assert isinstance(source, CanSource)
-    database, wanted = source.wanted()
+    database, by_channel = source.signals_of_channels()
     factors = {}
-    for name, own in wanted.items():
+    for name, signal in by_channel.items():
         column = source.channels[name]
         unit = CHANNELS[name].unit
         if dataset.get("file_units") != "ignore":
-            where = f"'{database.file}': signal '{own.signal}' for channel '{name}'"
+            location = f"'{database.file}': signal '{signal.signal}' for channel '{name}'"
             require_unit(
-                own.message.units[own.signal], column, unit, where, "give the unit that is true"
+                signal.message.units[signal.signal],
+                column,
+                unit,
+                location,
+                "give the unit that is true",
             )
         factors[name] = column.sign * column.factor * factor_to_si(column.unit, unit)
-    return BusSignals(database, wanted, factors, dataset.get("bus"))
+    return BusSignals(database, by_channel, factors, dataset.get("bus"))
 
 
 def from_names(
-    dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()
+    dbc: Path, required: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()
 ) -> BusSignals:
-    """Signals that ``words`` name, such as ``ay=-IMU.AccLat:g``, and those that are called like channels, in the units of the DBC.
+    """Signals that ``words`` name, such as ``ay=-IMU.AccLat:g``, and those that are called like
+    channels, in the units of the DBC.
 
-    Raises `ConfigurationError`: a word that cannot be understood, a unit that is not known, or a channel without a signal. Raises
-    `MissingError`: there is no DBC. Raises `DataError`: it cannot be used, or lacks a signal.
+    Raises `ConfigurationError`: a word that cannot be understood, a unit that is not known, or a
+    channel without a signal. Raises `MissingError`: there is no DBC. Raises `DataError`: it cannot
+    be used, or lacks a signal.
     """
     entries = dict(map(_entry, words))
-    if unknown := sorted(set(entries) - set(needed)):
+    if unknown := sorted(set(entries) - set(required)):
         raise ConfigurationError(
-            f"--signals names '{unknown[0]}', which the model does not read; it reads {', '.join(needed)}"
+            f"--signals names '{unknown[0]}', which the model does not read; it reads "
+            f"{', '.join(required)}"
         )
     units = {}
     for message in read_dbc(dbc):
         for signal in message.signals:
             units[signal.name] = units[f"{message.name}.{signal.name}"] = signal.unit or ""
-    entries |= {name: {"column": name} for name in needed if name in units and name not in entries}
+    entries |= {
+        name: {"column": name} for name in required if name in units and name not in entries
+    }
     _require_channels(
-        needed,
+        required,
         optional,
         entries,
         f"no signal of '{dbc}' is called so; name one: --signals CHANNEL=MESSAGE.SIGNAL",
@@ -116,27 +126,33 @@ def from_names(
         entry["unit"] = plain_unit(written)
         if entry["unit"] in (None, "another unit"):
             raise ConfigurationError(
-                f"'{written}' of signal '{column}' is no unit of '{name}'; write --signals {name}={column}:{si_unit}"
+                f"'{written}' of signal '{column}' is no unit of '{name}'; write --signals "
+                f"{name}={column}:{si_unit}"
             )
     return from_dataset(
-        {"name": "signals", "source": "can", "dbc": str(dbc), "channels": entries}, needed, optional
+        {"name": "signals", "source": "can", "dbc": str(dbc), "channels": entries},
+        required,
+        optional,
     )
 
 
 def _entry(word: str) -> tuple[str, dict[str, Any]]:
-    """Channel and declaration of ``CHANNEL=MESSAGE.SIGNAL``, with a minus before the signal and ``:UNIT`` behind it if need be."""
-    name, _, rest = word.strip().partition("=")
-    signal, _, unit = rest.removeprefix("-").partition(":")
+    """Channel and declaration of ``CHANNEL=MESSAGE.SIGNAL``, with a minus before the signal and
+    ``:UNIT`` behind it if need be.
+    """
+    name, _, target = word.strip().partition("=")
+    signal, _, unit = target.removeprefix("-").partition(":")
     if not signal:
         raise ConfigurationError(
-            f"--signals takes CHANNEL=MESSAGE.SIGNAL, for example ay=-IMU.AccLat:m/s^2, not '{word}'"
+            "--signals takes CHANNEL=MESSAGE.SIGNAL, for example ay=-IMU.AccLat:m/s^2, not "
+            f"'{word}'"
         )
-    return name, {"column": signal, "unit": unit, "sign": -1 if rest.startswith("-") else 1}
+    return name, {"column": signal, "unit": unit, "sign": -1 if target.startswith("-") else 1}
 
 
 def _require_channels(
-    needed: Sequence[str], optional: Sequence[str], there: Mapping[str, Any], fix: str
+    required: Sequence[str], optional: Sequence[str], available: Mapping[str, Any], fix: str
 ) -> None:
-    for name in needed:
-        if name not in there and name not in optional:
+    for name in required:
+        if name not in available and name not in optional:
             raise ConfigurationError(f"the model reads channel '{name}', and {fix}")

@@ -57,7 +57,8 @@ def dbc_text(first_id: int = FIRST_ID) -> str:
     """
     if not 0 < first_id <= LAST_STANDARD_ID:
         raise ConfigurationError(
-            f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not {first_id:#x}"
+            f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not "
+            f"{first_id:#x}"
         )
     return DBC.format(estimate=first_id, band=first_id + 1)
 
@@ -65,7 +66,8 @@ def dbc_text(first_id: int = FIRST_ID) -> str:
 class EstimateFrames:
     """Writes estimates as frames; the identifier of the bands is the next one after ``first_id``.
 
-    Raises `ConfigurationError`: it is no standard identifier. Raises `MissingError`: python-can or cantools is not installed.
+    Raises `ConfigurationError`: it is no standard identifier. Raises `MissingError`: python-can or
+    cantools is not installed.
     """
 
     def __init__(self, first_id: int = FIRST_ID) -> None:
@@ -81,7 +83,9 @@ class EstimateFrames:
         self._count = 0
 
     def __call__(self, values: Mapping[str, float], stamp: float) -> list[Any]:
-        """The two frames of an estimate as `vehest.trust.contract.GuardedStepper.step` returns it, stamped [s]; angles are in degrees."""
+        """The two frames of an estimate as `vehest.trust.contract.GuardedStepper.step` returns it,
+        stamped [s]; angles are in degrees.
+        """
         named = {
             "LateralVelocity": values.get("vy", math.nan),
             "SideslipAngle": math.degrees(values.get("sideslip", math.nan)),
@@ -96,10 +100,10 @@ class EstimateFrames:
         frames = []
         for message in self._messages:
             raw = {
-                own.name: counters[own.name]
-                if own.name in counters
-                else raw_value(named[own.name], own)
-                for own in message.signals
+                signal.name: counters[signal.name]
+                if signal.name in counters
+                else raw_value(named[signal.name], signal)
+                for signal in message.signals
             }
             data = message.encode(raw, scaling=False, strict=False)
             frames.append(self._frame(stamp, message.frame_id, False, data=data))
@@ -107,7 +111,10 @@ class EstimateFrames:
 
 
 def raw_value(value: float, signal: Any) -> int:
-    """The nearest raw value of a signal of cantools, cut off at what it can hold; for NaN the one that says that there is none."""
+    """The nearest raw value of a signal of cantools, cut off at what it can hold.
+
+    For NaN the one that says that there is none.
+    """
     largest = (1 << signal.length - signal.is_signed) - 1
     if math.isnan(value):
         return -largest - 1 if signal.is_signed else largest

@@ -20,7 +20,8 @@ LAST = ("band_vy", "band_sideslip", "health", "health_reason")
 
 
 def output_files(path: Path | None) -> list[Path]:
-    """Files that an output writes: a table, or a log of frames with its DBC beside it; none without a path.
+    """Files that an output writes: a table, or a log of frames with its DBC beside it; none without
+    a path.
 
     Raises `ConfigurationError`: the path ends in neither ``.csv`` nor ``.asc``.
     """
@@ -38,8 +39,9 @@ def output_files(path: Path | None) -> list[Path]:
 class Output:
     """Writes the files of ``path``.
 
-    A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and ``sampled``, the instant of the sample. A log
-    has the frames of estimates as they came off the bus. Raises `MissingError`: a file cannot be written.
+    A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and
+    ``sampled``, the instant of the sample. A log has the frames of estimates as they came off the
+    bus. Raises `MissingError`: a file cannot be written.
     """
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
@@ -65,7 +67,9 @@ class Output:
                 self._log = ASCWriter(path)
 
     def estimate(self, time: float, sampled: float, values: Mapping[str, float]) -> None:
-        """Write an estimate that holds for ``time``, of the sample at ``sampled``, on the bus's clock [s]."""
+        """Write an estimate that holds for ``time``, of the sample at ``sampled``, on the bus's
+        clock [s].
+        """
         if self._table is not None:
             cells = [number_cell(values.get(name, math.nan)) for name in self._names]
             health = [str(int(values["health"])), reason_in_words(values["health_reason"])]

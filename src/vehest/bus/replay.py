@@ -1,4 +1,5 @@
-"""Sends a log's frames onto a bus, in real time or as fast as possible; a model takes them off it and sends its estimates.
+"""Sends a log's frames onto a bus, in real time or as fast as possible; a model takes them off it
+and sends its estimates.
 
 log -> sender -> bus -> Receiver -> estimates -> bus -> sender -> Output
 """
@@ -41,14 +42,15 @@ SWITCH_SECONDS = (
 
 
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
-    """Timing of a bus from the first seconds of a log, and from further on for signals that come later.
+    """Timing of a bus from the first seconds of a log, and from further on for signals that come
+    later.
 
-    Raises `DataError`: it cannot be used, a signal never occurs, or its stamps span more samples than
-    the limits allow. Raises `ConfigurationError`: the rate is none.
+    Raises `DataError`: it cannot be used, a signal never occurs, or its stamps span more samples
+    than the limits allow. Raises `ConfigurationError`: the rate is none.
     """
-    stamps = {name: array("d") for name in signals.wanted}
+    stamps = {name: array("d") for name in signals.by_channel}
     first = math.inf
-    for frame, values in decoded(log, signals.database, signals.wanted, signals.bus):
+    for frame, values in decoded(log, signals.database, signals.by_channel, signals.bus):
         first = min(first, frame.timestamp)
         for name in values:
             stamps[name].append(frame.timestamp)
@@ -56,12 +58,13 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Ti
             len(times) > 1 for times in stamps.values()
         ):
             break
-    for name, wanted in signals.wanted.items():
+    for name, signal in signals.by_channel.items():
         if len(stamps[name]) < 2:
-            raise DataError(never_occurs(log.file, name, wanted, len(stamps[name]), signals.bus))
+            raise DataError(never_occurs(log.file, name, signal, len(stamps[name]), signals.bus))
         if (np.diff(stamps[name]) <= 0).any():
             raise DataError(
-                f"'{log.file}': stamps of message '{wanted.message.name}' repeat or go back; where two buses carry it, name one"
+                f"'{log.file}': stamps of message '{signal.message.name}' repeat or go back; "
+                "where two buses carry it, name one"
             )
     timing = timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz)
     check_samples(timing.first, log.last_stamp, timing.rate_hz, f"'{log.file}'")
@@ -70,7 +73,9 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Ti
 
 @dataclass(frozen=True)
 class Bus:
-    """An interface of python-can and its channel, and the speed: times real time, or None for as fast as possible."""
+    """An interface of python-can and its channel, and the speed: times real time, or None for as
+    fast as possible.
+    """
 
     interface: str = "virtual"
     channel: str = "vehest"
@@ -98,20 +103,25 @@ class Bus:
                 opened.append(can.Bus(**options))
                 opened.append(can.Bus(**options, can_filters=filters))
             except Exception as error:  # each interface has errors of its own
-                what = f"cannot open channel '{self.channel}' of interface '{self.interface}' ({first_line(error)[:160]})"
-                raise MissingError(f"{what}; --interface virtual needs nothing") from None
+                fault = (
+                    f"cannot open channel '{self.channel}' of interface '{self.interface}' "
+                    f"({first_line(error)[:160]})"
+                )
+                raise MissingError(f"{fault}; --interface virtual needs nothing") from None
             yield opened[0], opened[1]
         finally:
-            for one in opened:
+            for connection in opened:
                 with suppress(Exception):
-                    one.shutdown()
+                    connection.shutdown()
 
 
 class Replay:
-    """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it hears there.
+    """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it
+    hears there.
 
-    The model reads ``signals``; ``frames`` writes its estimates as frames; ``stopped`` tells whether to end early, with what was written
-    kept. Raises `ConfigurationError`: the DBC has the identifiers of the estimates.
+    The model reads ``signals``; ``frames`` writes its estimates as frames; ``stopped`` tells
+    whether to end early, with what was written kept. Raises `ConfigurationError`: the DBC has the
+    identifiers of the estimates.
     """
 
     def __init__(
@@ -124,9 +134,10 @@ class Replay:
         stopped: Callable[[], bool],
     ) -> None:
         for identifier in frames.identifiers:
-            if (identifier, False) in signals.database.taken:
+            if (identifier, False) in signals.database.identifiers:
                 raise ConfigurationError(
-                    f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id"
+                    f"'{signals.database.file}' has a message {identifier:#x}, as estimates "
+                    "would; give another --id"
                 )
         self.log = log
         self.signals = signals
@@ -137,7 +148,7 @@ class Replay:
         self.first = timing.first
         self.sampler = Sampler(timing)
         self.figures = Figures()
-        self.channels_of = channels_by_message(signals.wanted)
+        self.channels_of = channels_by_message(signals.by_channel)
         self.speed = bus.speed or 1.0
         self.begin = 0.0  # time of the clock on the wall at the first frame [s]
         self.last = self.first  # time of the last frame that was sent [s]
@@ -153,12 +164,13 @@ class Replay:
     ) -> Figures:
         """Estimate at the rate of the samples; the first stepper is for warming up.
 
-        ``make_stepper`` takes the clock that judges the stamps of frames; None in real time, where the
-        receiver's clock stamps them.
+        ``make_stepper`` takes the clock that judges the stamps of frames; None in real time, where
+        the receiver's clock stamps them.
 
-        Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
+        Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or
+        ``out`` not be written.
         """
-        names = warmed_up(make_stepper(None), self.timing.rate_hz, tuple(self.signals.wanted))
+        names = warmed_up(make_stepper(None), self.timing.rate_hz, tuple(self.signals.by_channel))
         self.stepper = make_stepper(self.clock if self.bus.speed is None else None)
         self.view = view
         horizon = self.stepper.horizon_steps / self.stepper.estimator.settings.rate_hz
@@ -182,16 +194,16 @@ class Replay:
             if self.stopped():
                 return
             self._send(frame)
-            while (heard := self.unit.recv(0)) is not None:
-                self._receive(heard, heard.timestamp)
+            while (received := self.unit.recv(0)) is not None:
+                self._receive(received, received.timestamp)
         self._advance(self.last + self.sampler.cycle)
 
     def _in_real_time(self, frames: Iterator[Any]) -> None:
         head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
-        every = chain([head] if head else [], frames)
+        all_frames = chain([head] if head else [], frames)
         thread = threading.Thread(
-            target=self._send_in_time, args=(every,), name="sender", daemon=True
+            target=self._send_in_time, args=(all_frames,), name="sender", daemon=True
         )
         thread.start()
         try:
@@ -201,9 +213,9 @@ class Replay:
                     and self._on_bus(time.time()) > self.last + self.sampler.cycle
                 )
                 wait = self.begin + (self.sampler.next_time - self.first) / self.speed - time.time()
-                heard = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
-                if heard is not None:
-                    self._receive(heard, self._on_bus(heard.timestamp))
+                received = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
+                if received is not None:
+                    self._receive(received, self._on_bus(received.timestamp))
                 elif ended:  # and nothing is left that a late receiver has not taken
                     self._advance(self.last + self.sampler.cycle)
                     break
@@ -244,16 +256,19 @@ class Replay:
 
     def _drain_sender(self) -> None:
         """Write the frames of estimates that the car hears."""
-        while (heard := self.sender.recv(0)) is not None:
-            if heard.arbitration_id in self.frames.identifiers and not heard.is_extended_id:
+        while (received := self.sender.recv(0)) is not None:
+            if received.arbitration_id in self.frames.identifiers and not received.is_extended_id:
                 if self.bus.speed is not None:
-                    heard.timestamp = self._on_bus(heard.timestamp)
-                self.output.frame(heard)
+                    received.timestamp = self._on_bus(received.timestamp)
+                self.output.frame(received)
 
     # The control unit
 
     def _receive(self, frame: Any, stamp: float) -> None:
-        """Take a frame that was stamped [s]; samples whose instant lies before are dealt with first."""
+        """Take a frame that was stamped [s].
+
+        Samples whose instant lies before are dealt with first.
+        """
         message = self.signals.database.messages.get((frame.arbitration_id, frame.is_extended_id))
         if message is None or frame.is_error_frame or frame.is_remote_frame:
             return
@@ -263,7 +278,7 @@ class Replay:
         self.figures.frames_received += 1
         try:
             values = channel_values(
-                message.decode(frame.data), self.channels_of[message.name], self.signals.wanted
+                message.decode(frame.data), self.channels_of[message.name], self.signals.by_channel
             )
         except DataError:
             self.figures.frames_too_short += 1
@@ -273,7 +288,8 @@ class Replay:
         )
 
     def _judge_clock(self, stamp: float) -> None:
-        """Take the stamp [s] of a frame of the clock's channel; samples go on where it stands still or jumps.
+        """Take the stamp [s] of a frame of the clock's channel; samples go on where it stands still
+        or jumps.
 
         Such frames come once a period, so that they count time while stamps stand still.
         """
@@ -330,7 +346,10 @@ class Replay:
 
 
 def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]) -> list[str]:
-    """Step until everything is compiled and loaded; returns the names of what the steps returned, in their order."""
+    """Step until everything is compiled and loaded.
+
+    Returns the names of what the steps returned, in their order.
+    """
     model = stepper.estimator
     names: dict[str, None] = {}
     for k in range(math.ceil((model.warm_up_steps / model.settings.rate_hz + 1.0) * rate_hz)):

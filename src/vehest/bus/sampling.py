@@ -1,8 +1,9 @@
 """Samples at even instants from frames that jitter, are lost or come late.
 
-A sample holds, of each channel, what arrived last before its instant, if that is no older than the channel's own period. Instants lie in
-the middle of the longest pause between the messages of a cycle, so that frames may jitter by half of that before they count as late, and
-follow the sender's clock, which is not the receiver's, by a phase-locked loop of first order.
+A sample holds, of each channel, what arrived last before its instant, if that is no older than the
+channel's own period. Instants lie in the middle of the longest pause between the messages of a
+cycle, so that frames may jitter by half of that before they count as late, and follow the sender's
+clock, which is not the receiver's, by a phase-locked loop of first order.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.limits import check_limit
 from vehest.sources.clocks import mean_step, plain_rate
 
-GAIN = 0.02  # share of an arrival's deviation by which the next instant moves: a time constant of 50 samples
-WHOLE = 0.05  # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
+# share of an arrival's deviation by which the next instant moves: a time constant of 50 samples
+GAIN = 0.02
+# share of a cycle by which a message's period may differ from whole cycles, for its phase to count
+MAX_PERIOD_DEVIATION = 0.05
 PLAIN = 5e-3  # relative distance to a round rate that is taken for it
 SLACK = 1e-9  # s
 
@@ -39,7 +42,8 @@ class Timing:
 
 
 def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) -> Timing:
-    """Timing of a bus from channel -> times of its frames [s], at least two each, at ``rate_hz``, by default that of the fastest channel.
+    """Timing of a bus from channel -> times of its frames [s], at least two each, at ``rate_hz``,
+    by default that of the fastest channel.
 
     Raises `ConfigurationError`: a rate that is no rate.
     """
@@ -47,7 +51,8 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     clock = min(periods, key=lambda name: periods[name])
     if not all(period > 0 for period in periods.values()):
         raise ConfigurationError(
-            "frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which"
+            "frames of the bus repeat their time stamps; where two buses carry the same "
+            "identifiers, say which"
         )
     if rate_hz is None:
         rate_hz = plain_rate(1.0 / periods[clock], PLAIN)
@@ -73,19 +78,21 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
     """Where in a cycle frames arrive [s], by their circular mean; None if anywhere."""
-    if abs(period / cycle - max(round(period / cycle), 1)) > WHOLE * max(period / cycle, 1.0):
+    if abs(period / cycle - max(round(period / cycle), 1)) > MAX_PERIOD_DEVIATION * max(
+        period / cycle, 1.0
+    ):
         return None
     mean = complex(np.exp(2j * np.pi * (times / cycle)).mean())
     return float(np.angle(mean) / (2 * np.pi) * cycle % cycle) if abs(mean) > 0.5 else None
 
 
-def check_samples(first: float, last: float, rate_hz: float, where: str) -> None:
+def check_samples(first: float, last: float, rate_hz: float, location: str) -> None:
     """Refuse, by a `DataError`, stamps [s] so far apart that too many samples lie between them."""
     n_samples = (last - first) * rate_hz
-    what = f"from {first:.12g} s to {last:.12g} s at {rate_hz:.6g} Hz"
+    fault = f"from {first:.12g} s to {last:.12g} s at {rate_hz:.6g} Hz"
     remedy = "remove a frame with a stray stamp"
     check_limit(
-        "samples", n_samples, f"{where} would give {n_samples:.0f} samples {what} ({remedy})"
+        "samples", n_samples, f"{location} would give {n_samples:.0f} samples {fault} ({remedy})"
     )
 
 
@@ -98,7 +105,10 @@ class Sample(NamedTuple):
 
 
 class Sampler:
-    """Forms samples; frames are to come in the order of their stamps. ``next_time`` is the instant of the next sample [s]."""
+    """Forms samples; frames are to come in the order of their stamps.
+
+    ``next_time`` is the instant of the next sample [s].
+    """
 
     def __init__(self, timing: Timing) -> None:
         self.timing = timing
@@ -112,7 +122,10 @@ class Sampler:
         self._deviation = 0.0
 
     def take(self, values: Mapping[str, float], stamp: float) -> None:
-        """Take what a frame carries, channel -> value [SI]; one that was stamped before the last sample counts for the next."""
+        """Take what a frame carries, channel -> value [SI].
+
+        One that was stamped before the last sample counts for the next.
+        """
         for name, value in values.items():
             self._values[name] = value
             self._stamps[name] = stamp

@@ -26,7 +26,9 @@ class Figures:
     samples_lost: int = 0  # of them, those at which a channel was missing: lost, late or invalid
     missing: dict[str, int] = field(default_factory=dict)  # channel -> at how many
     estimates: int = 0  # that were sent
-    latest_ms: float = 0.0  # longest time from a sample's instant until its estimate was sent; as fast as possible: that a sample took
+    # longest time from a sample's instant until its estimate was sent; as fast as possible: that a
+    # sample took
+    latest_ms: float = 0.0
     deadlines_missed: int = 0  # samples for which that was longer than a cycle of the bus
 
     def plain(self) -> dict[str, Any]:
@@ -45,7 +47,9 @@ class View:
         self._due = 0.0
 
     def show(self, figures: Figures, values: Mapping[str, float], seconds: float) -> None:
-        """Write an estimate's values and figures in a line, if it is time to, ``seconds`` after the first frame."""
+        """Write an estimate's values and figures in a line, if it is time to, ``seconds`` after the
+        first frame.
+        """
         if self._stream is None or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + LINE_SECONDS
@@ -60,7 +64,8 @@ class View:
         sideslip = _with_band(values, "sideslip", 180.0 / math.pi, "°", 2)
         self._stream.write(
             f"time {seconds:.1f} s, v {vy}, β {sideslip}, "
-            f"{yaw_rate}health {health}, {figures.estimates} estimates, {figures.samples} samples, {figures.samples_lost} lost, "
+            f"{yaw_rate}health {health}, {figures.estimates} estimates, {figures.samples} "
+            f"samples, {figures.samples_lost} lost, "
             f"latest {figures.latest_ms:.2f} ms, {figures.deadlines_missed} deadlines missed\n"
         )
         self._stream.flush()

@@ -65,7 +65,7 @@ def number_batches(
     """
     for name in names:
         kind = file.schema_arrow.field(name).type
-        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or has_time_unit(kind)):
+        if not (is_numeric(kind) or has_time_unit(kind)):
             raise DataError(
                 f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed"
             )
@@ -109,6 +109,13 @@ def read_numbers(
             values[name][done : done + len(column)] = numbers_of(column)
         done += batch.num_rows
     return values
+
+
+def is_numeric(kind: pa.DataType) -> bool:
+    """Whether a column holds numbers."""
+    return bool(
+        pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind)
+    )
 
 
 def has_time_unit(kind: pa.DataType) -> bool:

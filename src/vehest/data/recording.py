@@ -76,7 +76,10 @@ class Recording:
             if len(bad):
                 first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
                 what = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
-                fix = "cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
+                fix = (
+                    "cut the range out (max_gap of the data set ends a recording there), or declare "
+                    "the channel in 'gappy' if a gap means 'not measured'"
+                )
                 raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
 
     def __len__(self) -> int:

@@ -33,7 +33,7 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "Pa": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": 6894.757293168361},
     "A": {"A": 1.0},
     "m": {"m": 1.0, "mm": 1e-3},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0},
     "1": {"1": 1.0},
 }
 _UNITS = {

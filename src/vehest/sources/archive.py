@@ -41,14 +41,19 @@ _UNSOUND = (
 
 
 class _Archive(io.FileIO):
-    """File of which no more is read at once than the limit; zipfile reads the whole list of entries."""
+    """File of which no more is read at once than the limit.
+
+    Zipfile reads the whole list of entries.
+    """
 
     def read(self, size: int | None = -1, /) -> Any:
-        asked = os.fstat(self.fileno()).st_size - self.tell() if size is None or size < 0 else size
+        n_bytes = (
+            os.fstat(self.fileno()).st_size - self.tell() if size is None or size < 0 else size
+        )
         check_limit(
             "text_bytes",
-            asked,
-            f"'{os.fsdecode(str(self.name))}' holds a list of entries of {asked} bytes",
+            n_bytes,
+            f"'{os.fsdecode(str(self.name))}' holds a list of entries of {n_bytes} bytes",
         )
         return super().read(size)
 
@@ -60,21 +65,27 @@ def unpacked_limit(packed: int, most_bytes: int = MOST_BYTES) -> int:
 
 @contextmanager
 def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
-    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards; raises `DataError` or `MissingError`.
+    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards; raises
+    `DataError` or `MissingError`.
 
-    All entries are checked before anything is written: no path outside the folder, no links or special files, no more bytes or files than
-    the limits. zipfile unpacks no entry beyond its stated size, and checks its checksum. Archives inside stay packed.
+    All entries are checked before anything is written: no path outside the folder, no links or
+    special files, no more bytes or files than the limits. zipfile unpacks no entry beyond its
+    stated size, and checks its checksum. Archives inside stay packed.
     """
     with temporary_folder(file) as folder:
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
                 size = sum(entry.file_size for entry in entries)
-                most = unpacked_limit(file.stat().st_size, most_bytes)
-                if len(entries) > MOST_FILES or size > most:
-                    limits = f"more than the limit of {MOST_FILES} entries and {most / 1e9:.3g} GB; unpack it by hand"
+                max_bytes = unpacked_limit(file.stat().st_size, most_bytes)
+                if len(entries) > MOST_FILES or size > max_bytes:
+                    limits = (
+                        f"more than the limit of {MOST_FILES} entries and "
+                        f"{max_bytes / 1e9:.3g} GB; unpack it by hand"
+                    )
                     raise DataError(
-                        f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, {limits}"
+                        f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, "
+                        f"{limits}"
                     )
                 for entry in entries:
                     if entry.compress_type not in METHODS:
@@ -105,14 +116,18 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(file: Path) -> Iterator[Path]:
-    """Yield a folder to unpack a file into, which is removed afterwards; raises `MissingError` where there is no room for one."""
+    """Yield a folder to unpack a file into, which is removed afterwards.
+
+    Raises `MissingError` where there is no room for one.
+    """
     try:
-        kept = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
+        temporary = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
     except OSError as error:
         raise MissingError(
-            f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR to one"
+            f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR "
+            "to one"
         ) from None
-    with kept as name:
+    with temporary as name:
         yield Path(name)
 
 
@@ -129,6 +144,7 @@ def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
     )
     if leaves or kind not in (0, stat.S_IFREG, stat.S_IFDIR):
         raise DataError(
-            f"'{file}': entry {name!r} is no file inside the folder, but a link or elsewhere; do not trust this archive"
+            f"'{file}': entry {name!r} is no file inside the folder, but a link or elsewhere; do "
+            "not trust this archive"
         )
     return path

@@ -8,23 +8,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import vehest.sources as package
 from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, DataError, MissingError, suggestion
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable, suggestion
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
+from vehest.data.text_files import first_line
 from vehest.data.transforms import ReferenceLever, transform_from_config
 from vehest.sources.clocks import require_clock
 
+ENTRY_POINTS = "vehest.sources"
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
-DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
+# key of a recording's provenance: transforms of its data set, and where its channels were measured
+DERIVED = "derived"
 SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
@@ -35,7 +39,9 @@ def kind_of(dataset: Mapping[str, Any]) -> Kind:
 
 @dataclass(frozen=True)
 class Point:
-    """Where something was measured, from the centre of gravity [m]: ``x`` ahead, ``y`` to the left."""
+    """Where something was measured, from the centre of gravity [m]: ``x`` ahead, ``y`` to the
+    left.
+    """
 
     x: float = 0.0
     y: float = 0.0
@@ -70,7 +76,9 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 
 def origin_in_words(recording: Recording) -> list[str]:
-    """Where a recording's channels were measured and which were derived, by its data set, a line each."""
+    """Where a recording's channels were measured and which were derived, by its data set, a line
+    each.
+    """
     declared = recording.provenance.get(DERIVED) or {}
     lines = []
     if point := declared.get("reference_point"):
@@ -80,9 +88,10 @@ def origin_in_words(recording: Recording) -> list[str]:
         lines.append(f"inertial unit {_point_in_words(point)}")
     if transforms := declared.get("transforms"):
         lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in transforms)}")
-    if held := recording.provenance.get("held"):
+    if sampled := recording.provenance.get("held"):
         lines.append(
-            f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between"
+            f"{', '.join(sampled['channels'])} sampled at {sampled['rate_hz']:.4g} Hz, straight "
+            "lines in between"
         )
     return lines
 
@@ -106,9 +115,9 @@ def car_of(dataset: Mapping[str, Any]) -> CarValues:
     Parameters
     ----------
     dataset : mapping
-        Configuration of a data set. Its option ``car`` describes the car as it was recorded; a transform
-        ``scale_to_wheelbase`` scales it. Without ``car`` a simulated data set has the values of its
-        vehicle.
+        Configuration of a data set. Its option ``car`` describes the car as it was recorded; a
+        transform ``scale_to_wheelbase`` scales it. Without ``car`` a simulated data set has the
+        values of its vehicle.
 
     Returns
     -------
@@ -144,36 +153,39 @@ class Source(ABC):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
         self.name = str(dataset.get("name", "unnamed"))
-        self.where = f"data set '{self.name}'"
+        self.location = f"data set '{self.name}'"
         check_name(self.name, "data set")
         keys = {field.name for field in fields(self.options_type)}
         if unknown := sorted(set(dataset) - COMMON_KEYS - keys):
-            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'"
-            what += suggestion(unknown[0], keys | COMMON_KEYS, "dataset.") or ";"
-            what += f" it has {', '.join(sorted(keys))}"
-            raise ConfigurationError(f"{self.where}: {what}")
+            problem = f"source '{dataset.get('source')}' has no option '{unknown[0]}'"
+            problem += suggestion(unknown[0], keys | COMMON_KEYS, "dataset.") or ";"
+            problem += f" it has {', '.join(sorted(keys))}"
+            raise ConfigurationError(f"{self.location}: {problem}")
         common = self._validated(CommonOptions)
         self.reference_point = common.reference_point
         self.declared_car = common.car
         try:
             self.transforms = [transform_from_config(entry) for entry in common.transforms or ()]
         except ConfigurationError as error:
-            raise ConfigurationError(f"{self.where}: {error}") from None
+            raise ConfigurationError(f"{self.location}: {error}") from None
         if isinstance(self.reference_point, Point) and any(
             isinstance(transform, ScaleToWheelbase) for transform in self.transforms
         ):
-            what = "reference_point does not go with scale_to_wheelbase; put the transform reference_lever before it instead"
-            raise ConfigurationError(f"{self.where}: {what}")
+            problem = (
+                "reference_point does not go with scale_to_wheelbase; put the transform "
+                "reference_lever before it instead"
+            )
+            raise ConfigurationError(f"{self.location}: {problem}")
         if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
             raise ConfigurationError(
-                f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out"
+                f"{self.location}: source '{SIMULATED}' makes simulated recordings; leave kind out"
             )
         self.options = self._validated(self.options_type)
 
     def _validated(self, kind: type[Options]) -> Options:
         names = {field.name for field in fields(cast(Any, kind))}
-        own = {key: value for key, value in self.dataset.items() if key in names}
-        return validated(kind, own, self.where, error=ConfigurationError, group="dataset")
+        options = {key: value for key, value in self.dataset.items() if key in names}
+        return validated(kind, options, self.location, error=ConfigurationError, group="dataset")
 
     @property
     def car(self) -> CarValues:
@@ -201,33 +213,39 @@ class Source(ABC):
         """Names of the recordings, in order."""
 
     def read(self, recording_id: str) -> Recording:
-        """One recording, with the channels that the data set derives and its reference at the centre of gravity.
+        """One recording, with the channels that the data set derives and its reference at the
+        centre of gravity.
 
-        Raises `MissingError`: there is none of that name, or a file is missing. Raises `DataError`: its files cannot be used.
+        Raises `MissingError`: there is none of that name, or a file is missing. Raises `DataError`:
+        its files cannot be used.
         """
         return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
         """A recording of a file, or of a bag's folder, wherever it is, as `read` makes it.
 
-        Raises `ConfigurationError`: this source reads no single files. Raises `MissingError`: the file is not there. Raises `DataError`: it
-        cannot be used.
+        Raises `ConfigurationError`: this source reads no single files. Raises `MissingError`: the
+        file is not there. Raises `DataError`: it cannot be used.
         """
         return self._prepared(self.read_raw_file(file))
 
     def file_parts(self, file: Path) -> Iterator[Recording]:
-        """`read_file` in parts that follow one another, so that hours need little memory; all at once where the source knows no better."""
+        """`read_file` in parts that follow one another, so that hours need little memory.
+
+        All at once where the source knows no better.
+        """
         yield self.read_file(file)
 
     def _prepared(self, recording: Recording) -> Recording:
-        """A recording with the data set's car, after its transforms and with its reference at the centre of gravity.
+        """A recording with the data set's car, after its transforms and with its reference at the
+        centre of gravity.
 
         One that has been through the transforms is not transformed again.
         """
         if len(recording) > 1:
             require_clock(
                 recording.time,
-                f"{self.where}, recording '{recording.id}'",
+                f"{self.location}, recording '{recording.id}'",
                 "correct time or rate_hz",
             )
         recording = replace(recording, car=self.car_in_recordings)
@@ -262,7 +280,7 @@ class Source(ABC):
     def read_raw_file(self, file: Path) -> Recording:
         """A recording of a file as it is; raises as `read_file` does."""
         raise ConfigurationError(
-            f"{self.where}: source '{self.dataset.get('source')}' reads no single files"
+            f"{self.location}: source '{self.dataset.get('source')}' reads no single files"
         )
 
     def file_names(self) -> list[str]:
@@ -276,25 +294,34 @@ class Source(ABC):
 
 
 def open_source(dataset: Mapping[str, Any]) -> Source:
-    """The source that a data set's configuration names; raises `ConfigurationError` for an unknown source or option."""
+    """The source that a data set's configuration names.
+
+    Raises `ConfigurationError` for an unknown source or option.
+    """
     return source_class(dataset)(dataset)
 
 
 def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     """A recording of a file wherever it is, read as a data set describes.
 
-    Raises `ConfigurationError`: the file is of another format than the data set's, or its source reads no single files. Raises
-    `MissingError`: it is not there. Raises `DataError`: it cannot be used as it is.
+    Raises `ConfigurationError`: the file is of another format than the data set's, or its source
+    reads no single files. Raises `MissingError`: it is not there. Raises `DataError`: it cannot be
+    used as it is.
     """
     return source_of_file(dataset, file).read_file(file)
 
 
 def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
-    """The source of a data set that a file wherever it is shall be read by; raises as `read_single` does."""
+    """The source of a data set that a file wherever it is shall be read by.
+
+    Raises as `read_single` does.
+    """
     require_no_spreadsheet(file)
     if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
-        what = f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
-        raise ConfigurationError(f"'{file}' is no table; {what}")
+        remedy = (
+            f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
+        )
+        raise ConfigurationError(f"'{file}' is no table; {remedy}")
     return open_source(dataset)
 
 
@@ -305,42 +332,69 @@ def require_no_spreadsheet(file: Path) -> None:
 
 
 def source_class(dataset: Mapping[str, Any]) -> type[Source]:
-    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``; raises `ConfigurationError` without one."""
+    """The class of a data set's source.
+
+    It is ``SOURCE`` of the module ``vehest.sources.NAME``, or what another package offers by an
+    entry point NAME in the group ``vehest.sources``.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such source, or that of another package cannot be loaded.
+    """
     name = str(dataset.get("source"))
-    found: type[Source] | None = _source_of(name) if name in _modules() else None
-    if found is None:
-        raise ConfigurationError(
-            f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}"
-        )
-    return found
+    location = f"data set '{dataset.get('name')}': source '{name}'"
+    if name in _modules() and (module_class := _class_of(name)):
+        return module_class
+    for point in entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            loaded = point.load()
+        except Exception as error:  # a package may raise anything when it is imported
+            reason = f"{type(error).__name__}: {printable(first_line(error))}"
+            raise ConfigurationError(
+                f"{location} of another package cannot be loaded ({reason}); repair or remove it"
+            ) from error
+        if not (isinstance(loaded, type) and issubclass(loaded, Source)):
+            raise ConfigurationError(
+                f"{location} of another package is no class derived from Source"
+            )
+        return loaded
+    raise ConfigurationError(f"{location} is not one of: {', '.join(source_names())}")
 
 
 @cache
 def source_names() -> list[str]:
-    """Names of all sources."""
-    return sorted(name for name in _modules() if _source_of(name) is not None)
+    """Names of all sources: vehest's own, then those of other packages."""
+    names = sorted(name for name in _modules() if _class_of(name))
+    plugin_names = {point.name for point in entry_points(group=ENTRY_POINTS)}
+    return [*names, *sorted(plugin_names.difference(names))]
 
 
 def _modules() -> list[str]:
     return [module.name for module in pkgutil.iter_modules(package.__path__)]
 
 
-def _source_of(module: str) -> type[Source] | None:
+def _class_of(module: str) -> type[Source] | None:
     return getattr(importlib.import_module(f"{package.__name__}.{module}"), "SOURCE", None)
 
 
 def existing_folder(path: Any, dataset: str) -> Path:
-    """A folder of raw data; raises `MissingError` where no root was given, or the folder is not there."""
+    """A folder of raw data.
+
+    Raises `MissingError` where no root was given, or the folder is not there.
+    """
     folder = Path(str(path)).expanduser()
     has_root = bool(path) and folder.parts[:1] not in {("None",), ("null",)}
     if not (has_root and folder.is_dir()):
-        what = f"there is no folder '{folder}'" if has_root else "no data root is set"
-        raise MissingError(f"data set '{dataset}': {what}; give root=FOLDER or set VEHEST_DATA")
+        problem = f"there is no folder '{folder}'" if has_root else "no data root is set"
+        raise MissingError(f"data set '{dataset}': {problem}; give root=FOLDER or set VEHEST_DATA")
     return folder
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:
-    """Refuse files that are missing or empty (`MissingError`), and pipes, devices and folders (`DataError`)."""
+    """Refuse files that are missing or empty (`MissingError`), and pipes, devices and folders
+    (`DataError`).
+    """
     for file in files:
         try:
             size = regular_file(file).stat().st_size

@@ -14,7 +14,8 @@ MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one ano
 WRITTEN = (
     r"^\s*(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]+"
     r"|(?P<days>\d+) days?,? *)?"
-    r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"|(?P<minutes>\d{1,3}):(?P<seconds>\d{2}[.,]\d+))"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
 DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
@@ -23,28 +24,33 @@ DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times that are written as a clock's, in seconds, (N,); None for other text.
 
-    ``10:59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024 10:59:30,25``,
-    ``5/3/2024 10:59:30 AM`` and ``0 days 00:00:30.25``. With a date they count from 1970, without
-    one from midnight, and on beyond the next. The zone is not read.
+    ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024
+    10:59:30,25``, ``5/3/2024 10:59:30 AM`` and ``0 days 00:00:30.25``. With a date they count from
+    1970, without one from midnight, and on beyond the next. The zone is not read.
     """
     from pyarrow import compute
 
-    found = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
-    if not len(found) or found.null_count:
+    matched = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
+    if not len(matched) or matched.null_count:
         return None
-    seconds = compute.replace_substring_regex(found.field("second"), "[,:]", ".")
+    is_short = compute.not_equal(matched.field("minutes"), "")
+    second = compute.if_else(is_short, matched.field("seconds"), matched.field("second"))
     hours, minutes, seconds = (
         np.asarray(compute.cast(part, pa.float64()))
-        for part in (found.field("hour"), found.field("minute"), seconds)
+        for part in (
+            compute.if_else(is_short, "0", matched.field("hour")),
+            compute.if_else(is_short, matched.field("minutes"), matched.field("minute")),
+            compute.replace_substring_regex(second, "[,:]", "."),
+        )
     )
-    half = compute.utf8_lower(found.field("half"))
+    half = compute.utf8_lower(matched.field("half"))
     is_afternoon = np.asarray(compute.cast(compute.equal(half, "p"), pa.int8()))
     is_halved = np.asarray(compute.cast(compute.not_equal(half, ""), pa.int8()))
     hours = np.where(is_halved, hours % 12.0, hours) + 12.0 * is_afternoon
     times = hours * HOUR + minutes * 60.0 + seconds
-    dates = found.field("date")
+    dates = matched.field("date")
     if compute.all(compute.equal(dates, "")).as_py():
-        days = compute.if_else(compute.equal(found.field("days"), ""), "0", found.field("days"))
+        days = compute.if_else(compute.equal(matched.field("days"), ""), "0", matched.field("days"))
         counted = np.asarray(compute.cast(days, pa.float64()))
         return past_midnight(times) if not counted.any() else times + DAY * counted
     parts = compute.extract_regex(dates, pattern=DATE)
@@ -78,8 +84,8 @@ def _days(
 def past_midnight(times: FloatArray) -> FloatArray:
     """Times since midnight that go on past the next [s], (N,), of times of day.
 
-    Midnight is a step from the last hour of a day to the first of the next. Any other step back, such as that after a stray 23:59:59,
-    stays a step back.
+    Midnight is a step from the last hour of a day to the first of the next. Any other step back,
+    such as that after a stray 23:59:59, stays a step back.
     """
     is_midnight = (times[:-1] > DAY - HOUR) & (times[1:] < HOUR)
     return np.asarray(

@@ -1,6 +1,7 @@
 """Checks time stamps, finds the even clock behind them, and brings samples onto it.
 
-stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_times` -> samples on the clock's ticks
+stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_times` -> samples on
+the clock's ticks
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SLACK = 1e-6  # of a step; times that are nearer are the same
 SORT = "repair, remove or sort the rows"
 BRIDGE = "cut the range out or set dataset.clock=interpolate"
 
-FEWEST = 20  # samples behind which an even clock is looked for
+MIN_SAMPLES_OF_CLOCK = 20  # samples behind which an even clock is looked for
 BLOCK_SECONDS = 1.0
 REJECTED = 3.0  # standard deviations, taken from the median absolute residual
 MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
@@ -46,37 +47,49 @@ RATE_TOLERANCE = 5e-3
 
 
 def require_clock(
-    stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False
+    stamps: FloatArray, location: str, fix: str = SORT, *, may_repeat: bool = False
 ) -> None:
-    """Refuse time stamps that have a `clock_fault`, by a `DataError`; ``where`` names file and signal."""
+    """Refuse time stamps that have a `clock_fault`, by a `DataError`.
+
+    ``location`` names file and signal.
+    """
     if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
-        raise DataError(f"{where}: {fault}")
+        raise DataError(f"{location}: {fault}")
 
 
 def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
-    """How time stamps (T,) [s] break the rule for every recording, and what to do about it, in words; empty where the rule holds.
+    """How time stamps (T,) [s] break the rule for every recording, and what to do about it, in
+    words; empty where the rule holds.
 
-    It is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all. ``fix`` is how to repair their order; they
-    ``may_repeat`` where they have software delay.
+    It is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all. ``fix`` is how
+    to repair their order; they ``may_repeat`` where they have software delay.
     """
     if fault := _order_fault(stamps, fix, may_repeat):
         return fault
     step = float(np.median(np.diff(stamps)))
     if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
-        return f"the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); correct the unit of time"
+        return (
+            f"the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to "
+            f"{stamps[-1]:.12g} s); correct the unit of time"
+        )
     return span_fault(stamps)
 
 
 def span_fault(stamps: FloatArray) -> str:
-    """A stray one among time stamps (T,), more than 1e8 median steps from the others, in words; empty where none is."""
+    """A stray one among time stamps (T,), more than 1e8 median steps from the others, in words.
+
+    Empty where none is.
+    """
     steps = np.diff(stamps)
     step = float(np.median(steps)) or float(steps.mean())
     if not stamps[-1] - stamps[0] > MOST_STEPS * step:
         return ""
     at = int(np.argmax(steps))
     return (
-        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of {steps[at]:.6g} s between sample {at} "
-        f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, or what lies on one side"
+        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of "
+        f"{steps[at]:.6g} s between sample {at} "
+        f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, "
+        "or what lies on one side"
     )
 
 
@@ -85,12 +98,18 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
         return f"fewer than two time stamps; {fix}"
     odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
     if len(odd):
-        return f"time stamp of sample {odd[0]} is {stamps[odd[0]]:.6g} s, which is no time of a drive; {fix}"
+        return (
+            f"time stamp of sample {odd[0]} is {stamps[odd[0]]:.6g} s, which is no time of a "
+            f"drive; {fix}"
+        )
     steps = np.diff(stamps)
-    for what, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
+    for fault, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
         if bad.any():
             first = int(np.argmax(bad)) + 1
-            return f"time {what} {bad.sum()} times, first at sample {first} ({stamps[first]:.12g} s); {fix}"
+            return (
+                f"time {fault} {bad.sum()} times, first at sample {first} "
+                f"({stamps[first]:.12g} s); {fix}"
+            )
     return ""
 
 
@@ -100,7 +119,10 @@ def unevenness(stamps: FloatArray) -> str:
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
-        gaps = f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
+        gaps = (
+            f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after "
+            f"{stamps[longest]:.12g} s"
+        )
         return f"{gaps} (interval {step:.6g} s)"
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
@@ -108,37 +130,53 @@ def unevenness(stamps: FloatArray) -> str:
     away = np.abs(stamps - np.linspace(stamps[0], stamps[-1], len(stamps)))
     drift = float(away.max() / step)
     if drift > MOST_CLOCK_DRIFT:
-        return f"the clock drifts: at {stamps[np.argmax(away)]:.12g} s it is {drift:.2g} intervals away from a uniform one"
+        return (
+            f"the clock drifts: at {stamps[np.argmax(away)]:.12g} s it is {drift:.2g} "
+            "intervals away from a uniform one"
+        )
     return ""
 
 
-def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
-    """Raise `DataError` for samples, (T,), that are not finite or whose increasing times [s] lie further apart than ``longest`` [s]."""
+def require_samples(values: FloatArray, times: FloatArray, longest: float, location: str) -> None:
+    """Raise `DataError` for samples, (T,), that are not finite or whose increasing times [s] lie
+    further apart than ``longest`` [s].
+    """
     bad = np.flatnonzero(~np.isfinite(values))
     steps = np.diff(times)
     if len(bad):
-        what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
-        raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
+        fault = (
+            f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s "
+            "that are marked invalid or no finite numbers"
+        )
+        raise DataError(
+            f"{location} holds {fault}; cut the range out, or declare the channel gappy"
+        )
     at = int(np.argmax(steps))
     if steps[at] > longest:
-        what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > longest).sum()} above {longest:.6g} s"
+        fault = (
+            f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of "
+            f"{(steps > longest).sum()} above {longest:.6g} s"
+        )
         raise DataError(
-            f"{where} has {what}; raise its max_gap where values may be interpolated over that time, "
+            f"{location} has {fault}; raise its max_gap where values may be interpolated over "
+            "that time, "
             "or end the recording there: by the data set's max_gap, or by cutting the range out"
         )
 
 
 def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
-    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most ``longest`` [s] between two samples.
+    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most
+    ``longest`` [s] between two samples.
 
-    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches across.
+    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches
+    across.
     """
-    known = np.flatnonzero(np.isfinite(samples))
-    if not 0 < len(known) < len(samples):
+    measured = np.flatnonzero(np.isfinite(samples))
+    if not 0 < len(measured) < len(samples):
         return samples
     places = np.arange(len(samples))
-    before = known[np.maximum(np.searchsorted(known, places, side="right") - 1, 0)]
-    after = known[np.minimum(np.searchsorted(known, places, side="left"), len(known) - 1)]
+    before = measured[np.maximum(np.searchsorted(measured, places, side="right") - 1, 0)]
+    after = measured[np.minimum(np.searchsorted(measured, places, side="left"), len(measured) - 1)]
     longest *= 1.0 + 1e-9
     steps = np.diff(times, prepend=times[0])
     run = np.cumsum((steps < 0.0) | (steps > longest))
@@ -172,10 +210,16 @@ class Clock:
         """Times of the uniform clock [s]."""
         return self.start_time + np.arange(self.n_samples) / self.rate_hz
 
+    def part(self, rows: slice) -> Clock:
+        """The clock of some of its ticks."""
+        start_time = self.start_time + rows.start / self.rate_hz
+        return Clock(start_time, self.rate_hz, rows.stop - rows.start)
+
     def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
         """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
 
-        A gappy channel's samples go to the nearest tick instead: interpolation would lose those between two gaps.
+        A gappy channel's samples go to the nearest tick instead: interpolation would lose those
+        between two gaps.
         """
         if self.stamps is None:
             return samples
@@ -190,17 +234,19 @@ class Clock:
 
 
 def uniform_clock(
-    stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE
+    stamps: FloatArray, location: str, policy: ClockPolicy = "strict", fix: str = BRIDGE
 ) -> Clock:
-    """The uniform clock behind a file's time stamps (T,) [s]; ``where`` is the file, for messages.
+    """The uniform clock behind a file's time stamps (T,) [s]; ``location`` is the file, for
+    messages.
 
-    By ``policy``, ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the
-    rows as evenly sampled and their stamps as late, and refuses missing rows. ``fix`` is what to do where ``strict`` finds no even clock.
+    By ``policy``, ``strict`` refuses gaps, jitter above 1 % of an interval and drift,
+    ``interpolate`` bridges them, ``uniform`` takes the rows as evenly sampled and their stamps as
+    late, and refuses missing rows. ``fix`` is what to do where ``strict`` finds no even clock.
 
-    Raises `DataError`: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
-    hold more samples than the limits allow.
+    Raises `DataError`: stamps break the rule of `require_clock`, are not as even as ``policy``
+    wants them, or an even clock over them would hold more samples than the limits allow.
     """
-    require_clock(stamps, where, may_repeat=policy == "uniform")
+    require_clock(stamps, location, may_repeat=policy == "uniform")
     start = float(stamps[0])
     elapsed = float(stamps[-1] - stamps[0])
     steps = np.diff(stamps)
@@ -210,7 +256,8 @@ def uniform_clock(
         check_limit(
             "samples",
             n_samples,
-            f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples",
+            f"{location}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold "
+            f"{n_samples} samples",
         )
         return Clock(start, rate, n_samples, stamps)
     rate = len(steps) / elapsed
@@ -221,17 +268,19 @@ def uniform_clock(
         times, rate, _ = uniform_times(
             stamps,
             nominal,
-            where,
+            location,
             fix="leave rows out by drop_rows or set dataset.clock=interpolate",
         )
         start = float(times[0])
     elif uneven := unevenness(stamps):
-        raise DataError(f"{where}: {uneven}; {fix}")
+        raise DataError(f"{location}: {uneven}; {fix}")
     return Clock(start, plain_rate(rate, min(deviation / len(steps), 1e-4)), len(stamps))
 
 
 def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
-    """The `uniform_clock` of stamps (T,) that come in blocks, where these are surely strict and even; else None."""
+    """The `uniform_clock` of stamps (T,) that come in blocks, where these are surely strict and
+    even; else None.
+    """
     lines: list[tuple[int, int, float, float, float]] = []
     intervals: list[float] = []
     count = 0
@@ -240,15 +289,15 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
         if not (np.abs(block) <= LATEST_TIME).all():
             return None
         steps = np.diff(block, prepend=before)
-        own = float(block[-1] - block[0]) / max(len(block) - 1, 1)
+        block_step = float(block[-1] - block[0]) / max(len(block) - 1, 1)
         intervals += [float(steps.min(initial=math.inf)), float(steps.max(initial=0.0))]
-        most = float(
-            np.abs(block - block[0] - own * np.arange(len(block))).max()
+        deviation = float(
+            np.abs(block - block[0] - block_step * np.arange(len(block))).max()
         )  # away from the block's own line
-        lines.append((count, len(block) - 1, float(block[0]), own, most))
+        lines.append((count, len(block) - 1, float(block[0]), block_step, deviation))
         count = count + len(block)
         before = block[-1:]
-    if not FEWEST < count < MOST_STEPS:
+    if not MIN_SAMPLES_OF_CLOCK < count < MOST_STEPS:
         return None
     low = min(intervals)
     high = max(intervals)
@@ -257,8 +306,8 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
     n_steps = count - 1
     step = elapsed / n_steps
     away = max(
-        abs(first - start - at * step) + abs(own - step) * reach + most
-        for at, reach, first, own, most in lines
+        abs(first - start - at * step) + abs(block_step - step) * reach + deviation
+        for at, reach, first, block_step, deviation in lines
     )
     if (
         not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE
@@ -274,36 +323,45 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
 def uniform_times(
     stamps: FloatArray,
     rate_hz: float,
-    where: str,
+    location: str,
     tolerated: float = 0.0,
     fix: str = "cut the range out or set clock: stamps",
 ) -> tuple[FloatArray, float, float]:
-    """Times of a sensor that samples evenly (T,) [s], from time stamps with software delay, (T,) [s], which may repeat.
+    """Times of a sensor that samples evenly (T,) [s], from time stamps with software delay, (T,)
+    [s], which may repeat.
 
-    A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled computer makes
-    them, do not count. A constant latency stays in. With them the rate found [Hz], and the root mean square of stamps minus times [s].
+    A straight line through stamps over their number, by least squares; stamps beyond three standard
+    deviations, as a stalled computer makes them, do not count. A constant latency stays in. With
+    them the rate found [Hz], and the root mean square of stamps minus times [s].
 
-    The sensor's nominal rate is ``rate_hz``; wandering of the stamps about the line by ``tolerated`` [s] does not matter; ``where`` is file
-    and topic, ``fix`` what to do where samples are missing, for messages.
+    The sensor's nominal rate is ``rate_hz``; wandering of the stamps about the line by
+    ``tolerated`` [s] does not matter; ``location`` is file and topic, ``fix`` what to do where
+    samples are missing, for messages.
 
-    Raises `DataError`: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
+    Raises `DataError`: too few samples, stamps that go backwards or are no numbers, another rate,
+    or samples that are missing.
     """
-    if len(stamps) < FEWEST:
+    if len(stamps) < MIN_SAMPLES_OF_CLOCK:
         raise DataError(
-            f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed"
+            f"{location}: {len(stamps)} samples are too few to find a uniform clock; "
+            f"{MIN_SAMPLES_OF_CLOCK} are needed"
         )
     if fault := _order_fault(stamps, "repair or cut the range out", may_repeat=True):
-        raise DataError(f"{where}: {fault}")
+        raise DataError(f"{location}: {fault}")
     number = np.arange(len(stamps), dtype=np.float64)
     step, first = _robust_line(number, stamps)
-    found = 1.0 / step if step > 0 else math.inf
-    if not abs(found / rate_hz - 1.0) <= RATE_TOLERANCE:
-        what = f"samples come at {found:.6g} Hz, not at {rate_hz:g} Hz: samples are missing, or the rate is another one"
-        raise DataError(f"{where}: {what}; {fix}")
+    measured_rate_hz = 1.0 / step if step > 0 else math.inf
+    if not abs(measured_rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE:
+        fault = (
+            f"samples come at {measured_rate_hz:.6g} Hz, not at {rate_hz:g} Hz: samples are "
+            "missing, or the rate is another one"
+        )
+        raise DataError(f"{location}: {fault}; {fix}")
     times = first + step * number
     late = stamps - times
-    # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by little.
-    block = max(round(BLOCK_SECONDS * rate_hz), FEWEST // 2)
+    # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by
+    # little.
+    block = max(round(BLOCK_SECONDS * rate_hz), MIN_SAMPLES_OF_CLOCK // 2)
     edges = np.arange(0, len(late), block)
     shifts = np.array(
         [
@@ -315,49 +373,58 @@ def uniform_times(
     worst = int(np.argmax(np.abs(shifts)))
     if abs(shifts[worst]) > max(MOST_WANDERING * step, tolerated):
         raise DataError(
-            f"{where}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of {found:.6g} Hz about "
+            f"{location}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of "
+            f"{measured_rate_hz:.6g} Hz about "
             f"{stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
         )
-    return times, found, float(np.sqrt(np.mean(np.square(late))))
+    return times, measured_rate_hz, float(np.sqrt(np.mean(np.square(late))))
 
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
     """Slope and intercept, points beyond three standard deviations left out."""
     middle = number.mean()
     origin = stamps[0]
-    kept = np.ones(len(stamps), dtype=bool)
+    is_used = np.ones(len(stamps), dtype=bool)
     slope = offset = 0.0
     for _ in range(10):
-        slope, offset = np.polyfit(number[kept] - middle, stamps[kept] - origin, 1).tolist()
+        slope, offset = np.polyfit(number[is_used] - middle, stamps[is_used] - origin, 1).tolist()
         residual = np.abs(stamps - origin - offset - slope * (number - middle))
         fitting = residual <= REJECTED * 1.4826 * np.median(residual) + 1e-9
-        if (fitting == kept).all():
+        if (fitting == is_used).all():
             break
-        kept = fitting
+        is_used = fitting
     return slope, offset - slope * middle + origin
 
 
-def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
-    """Time that all spans [s] have in common; their keys name them in messages; raises `DataError` where there is none."""
+def common_span(spans: Mapping[str, tuple[float, float]], location: str) -> tuple[float, float]:
+    """Time that all spans [s] have in common; their keys name them in messages.
+
+    Raises `DataError` where there is none.
+    """
     late = max(spans, key=lambda name: spans[name][0])
     early = min(spans, key=lambda name: spans[name][1])
     begin = spans[late][0]
     end = spans[early][1]
     if begin >= end:
-        what = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
+        fault = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
         raise DataError(
-            f"{where}: {what}: nothing is common to all; leave one out, declare it gappy or take stamps of one clock"
+            f"{location}: {fault}: nothing is common to all; leave one out, declare it gappy or "
+            "take stamps of one clock"
         )
     return begin, end
 
 
-def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
-    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], (T,); `DataError` below two or above the limits."""
+def ticks_within(begin: float, end: float, rate_hz: float, location: str) -> FloatArray:
+    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], (T,).
+
+    `DataError` below two or above the limits.
+    """
     n_samples = (end - begin) * rate_hz
     check_limit(
         "samples",
         n_samples,
-        f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz",
+        f"{location} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at "
+        f"{rate_hz:g} Hz",
     )
     ticks = (
         np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1)
@@ -365,7 +432,8 @@ def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatA
     )
     if len(ticks) < 2:
         raise DataError(
-            f"{where} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz"
+            f"{location} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at "
+            f"{rate_hz:g} Hz"
         )
     return ticks
 
@@ -378,22 +446,28 @@ def at_ticks(
     hold: bool = False,
     slack: float = 0.0,
 ) -> FloatArray:
-    """Samples at other times [s]: along straight lines or, to ``hold``, the last one that is at most ``slack`` [s] later than a tick."""
+    """Samples at other times [s]: along straight lines or, to ``hold``, the last one that is at
+    most ``slack`` [s] later than a tick.
+    """
     if not hold:
         return np.interp(ticks, stamps, samples)
     return samples[np.maximum(np.searchsorted(stamps, ticks + slack, side="right") - 1, 0)]
 
 
 def on_nearest(samples: FloatArray, ticks: FloatArray, n_samples: int) -> FloatArray:
-    """Every sample that is measured on its tick, a whole number, NaN on the others, shape (n_samples,)."""
+    """Every sample that is measured on its tick, a whole number, NaN on the others, shape
+    (n_samples,).
+    """
     placed = np.full(n_samples, np.nan)
-    kept = (ticks >= 0) & (ticks < n_samples) & ~np.isnan(samples)
-    placed[ticks[kept].astype(np.int64)] = samples[kept]
+    is_inside = (ticks >= 0) & (ticks < n_samples) & ~np.isnan(samples)
+    placed[ticks[is_inside].astype(np.int64)] = samples[is_inside]
     return placed
 
 
 def mean_step(steps: FloatArray) -> float:
-    """The sampling interval behind jittering time stamps [s]: the mean, a gap counting as the samples that it lacks."""
+    """The sampling interval behind jittering time stamps [s]: the mean, a gap counting as the
+    samples that it lacks.
+    """
     step = float(np.median(steps))
     for _ in range(3 if step > 0 else 0):
         step = float(steps.sum() / np.maximum(np.rint(steps / step), 1.0).sum())
@@ -401,9 +475,11 @@ def mean_step(steps: FloatArray) -> float:
 
 
 def plain_rate(rate: float, tolerance: float) -> float:
-    """The rate [Hz] that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
+    """The rate [Hz] that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones
+    first.
 
-    A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a rational multiple of any other.
+    A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a
+    rational multiple of any other.
     """
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale

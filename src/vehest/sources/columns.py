@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from vehest.constants import FloatArray
@@ -40,27 +41,58 @@ class Column:
         return values if factor == 1.0 else values * factor
 
 
+@dataclass(frozen=True)
+class SampledColumn(Column):
+    """Declaration of a column in which some numbers mean that nothing was measured."""
+
+    invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
+
+    def measured(self, values: FloatArray) -> FloatArray:
+        """Values in the file's unit, (T,), NaN where nothing was measured."""
+        is_code = [np.isclose(values, code, rtol=1e-6, atol=0.0) for code in self.invalid]
+        return np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
+
+
+def measured_columns(
+    columns: Mapping[str, Column], values: Mapping[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Columns of a table, (T,) each, NaN where a channel's declaration says so."""
+    measured = {**values}
+    for column in columns.values():
+        if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
+            measured[column.column] = column.measured(measured[column.column])
+    return measured
+
+
 def columns_from_config(
     entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column
 ) -> dict[str, Column]:
-    """Channel -> its declaration of ``kind``, as a data set declares them; `ConfigurationError` for an unknown channel, unit or key."""
+    """Channel -> its declaration of ``kind``, as a data set declares them.
+
+    `ConfigurationError` for an unknown channel, unit or key.
+    """
     columns = {}
     for name, entry in entries.items():
-        where = f"data set '{dataset}': channel '{name}'"
+        location = f"data set '{dataset}': channel '{name}'"
         try:
-            columns[str(name)] = column_from_config(entry, where, channel(str(name)).unit, kind)
+            columns[str(name)] = column_from_config(entry, location, channel(str(name)).unit, kind)
         except DataError as error:
-            raise ConfigurationError(f"{where}: {error}") from None
+            raise ConfigurationError(f"{location}: {error}") from None
     return columns
 
 
-def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
-    """A declaration of ``kind`` whose unit is convertible to ``si_unit``; raises `ConfigurationError` for another key or quantity."""
-    column = validated(kind, entry, where, error=ConfigurationError)
+def column_from_config(
+    entry: Any, location: str, si_unit: str, kind: type[Column] = Column
+) -> Column:
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
+
+    Raises `ConfigurationError` for another key or quantity.
+    """
+    column = validated(kind, entry, location, error=ConfigurationError)
     if column.factor == 0:
-        raise ConfigurationError(f"{where}: factor must be a number other than 0")
+        raise ConfigurationError(f"{location}: factor must be a number other than 0")
     try:
         factor_to_si(column.unit, si_unit)
     except DataError as error:
-        raise ConfigurationError(f"{where}: {error}") from None
+        raise ConfigurationError(f"{location}: {error}") from None
     return column

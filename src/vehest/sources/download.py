@@ -1,7 +1,8 @@
 """Downloads the files of a data set through pooch.
 
-``download: {url: https://…, files: [a.csv], sha256: {a.csv: …}}`` -> `download_of` -> folder ``.download`` of the data set's ``path`` ->
-checksum compared, or recorded in ``checksums.txt`` (pooch's registry format) -> file
+``download: {url: https://…, files: [a.csv], sha256: {a.csv: …}}`` -> `download_of` -> folder
+``.download`` of the data set's ``path`` -> checksum compared, or recorded in ``checksums.txt``
+(pooch's registry format) -> file
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Download:
-    """Files of a data set, the folder where they belong, and the address of the folder that they come from."""
+    """Files of a data set, the folder where they belong, and the address of the folder that they
+    come from.
+    """
 
     folder: Path
     url: str
@@ -76,14 +79,19 @@ class Download:
         return f"{self.url.rstrip('/')}/{quote(name)}"
 
     def missing(self) -> list[str]:
-        """Files that are not there; those that are there are checked. Writes nothing; raises `DataError` where one is damaged."""
+        """Files that are not there; those that are there are checked. Writes nothing.
+
+        Raises `DataError` where one is damaged.
+        """
         return [name for name in self.files if self._checked(name) is None]
 
     def fetch(self, progress: Progress | None = None) -> Iterator[Outcome]:
-        """Download missing files one after another; a file takes its name once it is complete, checked and recorded.
+        """Download missing files one after another; a file takes its name once it is complete,
+        checked and recorded.
 
-        Raises `DataError`: a file that is there or that came has other bytes than recorded. Raises `MissingError`: the server cannot be
-        reached or does not have it, or the disk is full; what has arrived is kept.
+        Raises `DataError`: a file that is there or that came has other bytes than recorded. Raises
+        `MissingError`: the server cannot be reached or does not have it, or the disk is full; what
+        has arrived is kept.
         """
         under_way = self.folder / UNDER_WAY
         try:
@@ -102,10 +110,12 @@ class Download:
 
         path = self.folder / name
         recorded = name in _read_checksums(self.folder)
-        found = self._checked(name)
-        if found is not None:
-            _record(self.folder, name, found)
-            return Outcome(name, "matched" if recorded else "recorded", found, path.stat().st_size)
+        checksum = self._checked(name)
+        if checksum is not None:
+            _record(self.folder, name, checksum)
+            return Outcome(
+                name, "matched" if recorded else "recorded", checksum, path.stat().st_size
+            )
         address = self.address(name)
         under_way = self.folder / UNDER_WAY
         downloader = ResumingDownloader(under_way / f"{name}.part", progress)
@@ -116,8 +126,8 @@ class Download:
                     address, self._expected(name), name, under_way, downloader=downloader
                 )
             )
-            found = sha256_of(complete)
-            _record(self.folder, name, found)
+            checksum = sha256_of(complete)
+            _record(self.folder, name, checksum)
             os.replace(complete, path)
         except OSError as error:
             if error.errno is not None:
@@ -133,7 +143,7 @@ class Download:
             raise DataError(
                 f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})"
             ) from None
-        return Outcome(name, "fetched", found, path.stat().st_size, downloader.resumed_at)
+        return Outcome(name, "fetched", checksum, path.stat().st_size, downloader.resumed_at)
 
     def _checked(self, name: str) -> str | None:
         """Checksum of a file that is there and has the expected one; None where it is not there."""
@@ -141,25 +151,32 @@ class Download:
         expected = self._expected(name)
         if not path.is_file() or not path.stat().st_size:
             return None
-        found = sha256_of(path)
-        if expected not in (None, found):
-            what = f"'{path}' has the sha256 {found}, expected is {expected}: it was changed or is damaged"
-            raise DataError(
-                f"{what}; remove the file to fetch it again, or correct download.sha256 or {CHECKSUMS} to accept it"
+        checksum = sha256_of(path)
+        if expected not in (None, checksum):
+            fault = (
+                f"'{path}' has the sha256 {checksum}, expected is {expected}: it was changed "
+                "or is damaged"
             )
-        return found
+            raise DataError(
+                f"{fault}; remove the file to fetch it again, or correct download.sha256 or "
+                f"{CHECKSUMS} to accept it"
+            )
+        return checksum
 
     def _expected(self, name: str) -> str | None:
         return self.sha256.get(name) or _read_checksums(self.folder).get(name)
 
 
 def download_of(source: Source) -> Download:
-    """Option ``download`` of a data set; raises `ConfigurationError` where it is missing or wrong, `MissingError` without a data root."""
-    where = f"data set '{source.name}'"
+    """Option ``download`` of a data set.
+
+    Raises `ConfigurationError` where it is missing or wrong, `MissingError` without a data root.
+    """
+    location = f"data set '{source.name}'"
     options = validated(
         DownloadOptions,
         source.dataset.get("download"),
-        where,
+        location,
         error=ConfigurationError,
         group="dataset.download",
     )
@@ -168,10 +185,10 @@ def download_of(source: Source) -> Download:
             tuple(map(_file_name, source.file_names())) if options.files is None else options.files
         )
     except ValueError as error:
-        raise ConfigurationError(f"{where}: {error}") from None
+        raise ConfigurationError(f"{location}: {error}") from None
     if not files or len(set(files)) < len(files):
         raise ConfigurationError(
-            f"{where}: download.files must list the names of files, each once, not {list(files)}"
+            f"{location}: download.files must list the names of files, each once, not {list(files)}"
         )
     path = str(source.dataset.get("path") or "None")
     folder = (
@@ -188,7 +205,10 @@ def download_of(source: Source) -> Download:
 
 
 def _read_checksums(folder: Path) -> dict[str, str]:
-    """Recorded checksums by name, empty if there is no record; raises `DataError` where it is damaged."""
+    """Recorded checksums by name, empty if there is no record.
+
+    Raises `DataError` where it is damaged.
+    """
     import pooch
 
     file = folder / CHECKSUMS
@@ -200,7 +220,8 @@ def _read_checksums(folder: Path) -> dict[str, str]:
         registry.load_registry(file)
     except (OSError, ValueError) as error:
         raise DataError(
-            f"'{file}' is no record of checksums ({first_line(error)}); repair it, or remove it to record anew"
+            f"'{file}' is no record of checksums ({first_line(error)}); repair it, or remove it "
+            "to record anew"
         ) from None
     return dict(registry.registry)
 

@@ -17,7 +17,8 @@ from vehest.sources.tables import listed
 
 
 class FileSource(Source):
-    """Files that match the option ``files`` in the folder ``path``; a file's stem is the recording's name, ``STEM_run_N`` that of a run.
+    """Files that match the option ``files`` in the folder ``path``; a file's stem is the
+    recording's name, ``STEM_run_N`` that of a run.
 
     Attributes:
         gappy: channels in which NaN means "not measured".
@@ -27,31 +28,41 @@ class FileSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self._runs_of = lru_cache(None)(self._wanted_runs)
+        self._runs_of = lru_cache(None)(self._selected_runs)
 
     def ids(self) -> list[str]:
-        """Names of the recordings, in alphabetical order of the files and in that of a file's runs."""
-        return list(self._found())
+        """Names of the recordings, in alphabetical order of the files and in that of a file's
+        runs.
+        """
+        return list(self._recordings_by_name())
 
     def inputs(self) -> dict[str, str | Path]:
         """The files."""
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one recording by its name; raises `MissingError` where there is none, `DataError` where it cannot be used."""
-        found = self._found()
-        if recording_id not in found:
+        """Read one recording by its name.
+
+        Raises `MissingError` where there is none, `DataError` where it cannot be used.
+        """
+        by_name = self._recordings_by_name()
+        if recording_id not in by_name:
             raise MissingError(
-                f"{self.where} has no recording '{recording_id}' (it has {listed(list(found))})"
+                f"{self.location} has no recording '{recording_id}' (it has "
+                f"{listed(list(by_name))})"
             )
-        return self._read(*found[recording_id])
+        return self._read(*by_name[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a file wherever it is; raises `MissingError` without it, `DataError` where it cannot be used or holds several runs."""
+        """Read a file wherever it is.
+
+        Raises `MissingError` without it, `DataError` where it cannot be used or holds several runs.
+        """
         runs = list(self._runs_of(file))
         if len(runs) > 1:
             raise DataError(
-                f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}"
+                f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name "
+                f"one by +dataset.run={runs[0]}"
             )
         return self._read(file, runs[0])
 
@@ -59,7 +70,7 @@ class FileSource(Source):
         """A file, or one run of it."""
         return super().read_raw_file(file)
 
-    def _found(self) -> dict[str, tuple[Path, int | None]]:
+    def _recordings_by_name(self) -> dict[str, tuple[Path, int | None]]:
         """Name of each recording -> its file and run."""
         return {
             self._name_of(file, run): (file, run)
@@ -68,29 +79,36 @@ class FileSource(Source):
         }
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
-        """Number of each run in a file -> its rows; all rows under None where runs are not told apart."""
+        """Number of each run in a file -> its rows.
+
+        All rows under None where runs are not told apart.
+        """
         return {None: slice(None)}
 
-    def _wanted_runs(self, file: Path) -> Mapping[int | None, slice]:
-        """All runs, or the one that the option ``run`` names; a source has them in the cache ``_runs_of``."""
+    def _selected_runs(self, file: Path) -> Mapping[int | None, slice]:
+        """All runs, or the one that the option ``run`` names.
+
+        A source has them in the cache ``_runs_of``.
+        """
         runs = self._runs(file)
-        wanted = getattr(self.options, "run", None)
-        if not runs or (wanted is not None and wanted not in runs):
-            named = "between its pauses" if wanted is None else wanted
+        number = getattr(self.options, "run", None)
+        if not runs or (number is not None and number not in runs):
+            named = "between its pauses" if number is None else number
             raise DataError(f"'{file}' holds no run {named} ({listed([str(run) for run in runs])})")
-        return runs if wanted is None else {wanted: runs[wanted]}
+        return runs if number is None else {number: runs[number]}
 
     def _files(self) -> list[Path]:
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)
         if not files:
             raise MissingError(
-                f"{self.where}: no file in '{folder}' matches '{self.options.files}'"
+                f"{self.location}: no file in '{folder}' matches '{self.options.files}'"
             )
         names = [self._id_of(file) for file in files]
         if doubled := sorted({name for name in names if names.count(name) > 1}):
             raise DataError(
-                f"{self.where}: two files are called '{doubled[0]}', a recording's name must be unique"
+                f"{self.location}: two files are called '{doubled[0]}', a recording's name must "
+                "be unique"
             )
         return files
 
@@ -109,18 +127,22 @@ class FileSource(Source):
         unclear = any("**" in part and part != "**" for part in Path(pattern).parts)
         if not Path(pattern).parts or Path(pattern).is_absolute() or unclear or "\0" in pattern:
             raise ConfigurationError(
-                f"{self.where}: files must be a pattern inside path, such as '*.csv' or '**/*.csv', not '{printable(pattern)}'"
+                f"{self.location}: files must be a pattern inside path, such as '*.csv' or "
+                f"'**/*.csv', not '{printable(pattern)}'"
             )
 
     def _recording(
         self,
         recording_id: str,
-        where: str,
+        location: str,
         clock: Clock,
         channels: Mapping[str, FloatArray],
         provenance: Mapping[str, Any],
     ) -> Recording:
-        """A recording of this data set; raises `DataError` where its channels make none; ``where`` names the file."""
+        """A recording of this data set; raises `DataError` where its channels make none.
+
+        ``location`` names the file.
+        """
         try:
             return Recording(
                 id=recording_id,
@@ -133,16 +155,19 @@ class FileSource(Source):
                 provenance={"dataset": self.name, "source": self.dataset["source"], **provenance},
             )
         except DataError as error:
-            raise DataError(f"{where}: {error}") from None
+            raise DataError(f"{location}: {error}") from None
 
     def _declared(
         self, entries: Mapping[str, Any] | None, kind: type[Column] = Column
     ) -> dict[str, Any]:
-        """Channel -> its declaration, one at least; those that the option ``gappy`` names are `gappy`."""
+        """Channel -> its declaration, one at least.
+
+        Those that the option ``gappy`` names are `gappy`.
+        """
         columns = columns_from_config(entries or {}, self.name, kind)
         if not columns:
             raise ConfigurationError(
-                f"{self.where}: channels must map a channel to its column and unit"
+                f"{self.location}: channels must map a channel to its column and unit"
             )
         self.gappy = self._gappy_among(columns)
         return columns
@@ -152,6 +177,6 @@ class FileSource(Source):
         gappy = frozenset(self.options.gappy or ())
         for name in sorted(gappy - set(channels)):
             raise ConfigurationError(
-                f"{self.where}: gappy names '{name}', which is not one of its channels"
+                f"{self.location}: gappy names '{name}', which is not one of its channels"
             )
         return gappy

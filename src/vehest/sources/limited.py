@@ -1,6 +1,7 @@
 """Reads one file in a process of its own, with limits on memory and time.
 
-file and request (JSON) -> function of a reader's module, in the limited process -> arrays and a summary (Arrow) -> caller
+file and request (JSON) -> function of a reader's module, in the limited process -> arrays and a
+summary (Arrow) -> caller
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ WAITING = 8.0  # times the processor time: a busy machine, or one without limits
 MEMORY_PER_BYTE = 10.0
 NO_MEMORY = 77  # exit status
 _COMMAND = [sys.executable, "-P", "-m", "vehest.sources.limited"]
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+_SINGLE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
+)
 
 
 class Reading(NamedTuple):
@@ -45,14 +48,17 @@ class Reading(NamedTuple):
 
 
 def read_limited(reader: str, file: Path, *, packed: Path | None = None, **request: Any) -> Reading:
-    """Call ``reader(file, **request)`` in a process that may not exceed its memory and time or write a file.
+    """Call ``reader(file, **request)`` in a process that may not exceed its memory and time or
+    write a file.
 
-    Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory`` and ten times its size; where it was
-    unpacked, that of ``packed``, the file or folder that the user has. Where the system has no such limits (Windows), eight times that time
-    is all that ends it. ``reader`` is ``module:function``, which returns arrays and a summary; ``request`` what JSON holds.
+    Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory``
+    and ten times its size; where it was unpacked, that of ``packed``, the file or folder that the
+    user has. Where the system has no such limits (Windows), eight times that time is all that ends
+    it. ``reader`` is ``module:function``, which returns arrays and a summary; ``request`` what JSON
+    holds.
 
-    Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise, as the file is damaged, or asks for
-    more.
+    Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise,
+    as the file is damaged, or asks for more.
     """
     seconds = SECONDS + SECONDS_PER_BYTE * _size(file)
     memory = current_limits().memory + MEMORY_PER_BYTE * _size(packed or file)
@@ -64,7 +70,7 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
         "seconds": seconds,
         "memory": memory,
     }
-    environment = {**os.environ, **_ONE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
+    environment = {**os.environ, **_SINGLE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     with subprocess.Popen(
         _COMMAND,
@@ -94,11 +100,11 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
     return Reading(arrays, answer)
 
 
-def require_package(module: str, extra: str, what: str) -> None:
+def require_package(module: str, extra: str, purpose: str) -> None:
     """See that an optional package is installed; raises `MissingError` where it is not."""
     if find_spec(module) is None:
         raise MissingError(
-            f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'"
+            f"{purpose} needs the package {module}; install it with: pip install 'vehest[{extra}]'"
         )
 
 
@@ -111,17 +117,21 @@ def _size(file: Path) -> int:
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
         return DataError(
-            f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format"
+            f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is "
+            "damaged, or of another format"
         )
     if code == NO_MEMORY:
         return DataError(
-            f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise it: limits.memory=NUMBER"
+            f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise "
+            "it: limits.memory=NUMBER"
         )
     return DataError(f"'{file}' is damaged: reading it ends with status {code}")
 
 
 def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
-    """What the reader returns within memory and processor time, without writing a file, or the error that it raises."""
+    """What the reader returns within memory and processor time, without writing a file, or the
+    error that it raises.
+    """
     module, _, name = order["reader"].partition(":")
     file = Path(order["file"])
     read = getattr(importlib.import_module(module), name)
@@ -132,9 +142,9 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
             resource.RLIMIT_DATA: int(order["memory"]),
             resource.RLIMIT_CPU: int(order["seconds"]),
         }
-        for kind, most in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
+        for kind, limit in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
             with suppress(ValueError, OSError):
-                resource.setrlimit(kind, (most, most))
+                resource.setrlimit(kind, (limit, limit))
     try:
         with use_limits(Limits(**order["limits"])):
             return read(file, **order["request"])
@@ -143,8 +153,11 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
     except MemoryError:
         os._exit(NO_MEMORY)
     except Exception as error:
-        what = printable(str(error).partition("\n")[0][:160]) or type(error).__name__
-        return {}, {"error": "DataError", "message": f"'{file}' is damaged ({what}); make it again"}
+        reason = printable(str(error).partition("\n")[0][:160]) or type(error).__name__
+        return {}, {
+            "error": "DataError",
+            "message": f"'{file}' is damaged ({reason}); make it again",
+        }
 
 
 def _send(stream: BinaryIO, arrays: Arrays, answer: Mapping[str, Any]) -> None:

@@ -1,22 +1,24 @@
 """ASAM MDF 2, 3 and 4: signals of groups with rasters of their own, brought to one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that says otherwise is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that
+says otherwise is refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.clocks import clock_fault
+from vehest.sources.columns import SampledColumn
 from vehest.sources.limited import read_limited, require_package
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
-Wanted = Mapping[str, tuple[str, int | str | None]]
+Requests = Mapping[str, tuple[str, int | str | None]]
 """Key -> name of a signal, and number or name of its group, where the name occurs in several."""
 
 
@@ -28,7 +30,7 @@ class MdfOptions(SignalOptions):
 
 
 @dataclass(frozen=True)
-class MdfChannel(SignalChannel):
+class MdfChannel(SignalChannel, SampledColumn):
     """A channel's signal, with the number or name of its group where its name occurs in several."""
 
     group: Annotated[int | str | None, "the number or name of a group"] = None
@@ -41,10 +43,14 @@ class MdfSource(SignalSource):
     channel_type = MdfChannel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        wanted = {
+        requests = {
             name: (declared.column, declared.group) for name, declared in self.channels.items()
         }
-        signals, _, about = read_measurement(file, wanted)
+        signals, _, about = read_measurement(file, requests)
+        signals = {
+            name: replace(signal, values=self.channels[name].measured(signal.values))
+            for name, signal in signals.items()
+        }
         rates = {
             signal.origin.removeprefix("group "): round(signal.rate_hz, 3)
             for signal in signals.values()
@@ -53,15 +59,17 @@ class MdfSource(SignalSource):
 
 
 def read_measurement(
-    file: Path, wanted: Wanted | None
+    file: Path, requests: Requests | None
 ) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
-    """Signals of a measurement by their keys, what was not read and why, and ``version``, ``start`` and, by key, ``signals`` of the file.
+    """Signals of a measurement by their keys, what was not read and why, and ``version``, ``start``
+    and, by key, ``signals`` of the file.
 
-    ``wanted`` is where each signal stands; None for every signal of numbers whose group has times. Raises `MissingError` without file or
-    asammdf, `DataError` where it or a wanted signal is unusable.
+    ``requests`` is where each signal stands; None for every signal of numbers whose group has
+    times. Raises `MissingError` without file or asammdf, `DataError` where it or a wanted signal is
+    unusable.
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
-    reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)
+    reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), requests=requests)
     signals = {}
     skipped = list(reading.summary["skipped"])
     groups = {place["group"] for place in reading.summary["signals"].values()}
@@ -73,7 +81,7 @@ def read_measurement(
     }
     for key, place in reading.summary["signals"].items():
         reason = faults[place["group"]]
-        where = f"signal '{place['name']}' of group {place['title']}"
+        location = f"signal '{place['name']}' of group {place['title']}"
         if not reason:
             signals[key] = Signal(
                 f"group {place['title']}",
@@ -81,10 +89,10 @@ def read_measurement(
                 reading.arrays[key],
                 place["unit"],
             )
-        elif wanted is not None:
-            raise DataError(f"'{file}': {where}: {reason}")
+        elif requests is not None:
+            raise DataError(f"'{file}': {location}: {reason}")
         else:
-            skipped.append(f"{where}: {reason}")
+            skipped.append(f"{location}: {reason}")
     return signals, skipped, reading.summary
 
 

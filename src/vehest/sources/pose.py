@@ -32,7 +32,8 @@ class PoseOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.order < self.window or self.window % 2 == 0:
             raise ValueError(
-                f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}"
+                "window must be an odd number above order, and order at least 1, not "
+                f"{self.window} and {self.order}"
             )
 
     def references(
@@ -41,24 +42,28 @@ class PoseOptions:
         yaw: FloatArray,
         interval: float,
         turned: float = 0.0,
-        where: str = "poses",
+        location: str = "poses",
         at: tuple[FloatArray, FloatArray] | None = None,
     ) -> dict[str, FloatArray]:
-        """Reference channels: poses are differentiated by a Savitzky-Golay filter and the velocity is turned into the car's axes.
+        """Reference channels: poses are differentiated by a Savitzky-Golay filter and the velocity
+        is turned into the car's axes.
 
         Args:
-            positions: of the rigid body's origin, x and y with z up [m], evenly sampled by ``interval`` [s], shape (T, 2).
+            positions: of the rigid body's origin, x and y with z up [m], evenly sampled by
+            ``interval`` [s], shape (T, 2).
             yaw: of the rigid body, unwrapped [rad], shape (T,).
             turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
             at: times of the samples, and others [s] to which straight lines bring the velocities.
 
         Raises `DataError`: too few poses.
 
-        Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
+        Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares
+        procedures, Anal. Chem. 36 (8), 1964.
         """
         if len(yaw) < self.window:
             raise DataError(
-                f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window"
+                f"{location}: {len(yaw)} poses are fewer than the {self.window} of the filter's "
+                "window"
             )
         derivative = partial(
             scipy.signal.savgol_filter,
@@ -73,31 +78,36 @@ class PoseOptions:
         heading = scipy.signal.savgol_filter(yaw, self.window, self.order) + turned
         cosine = np.cos(heading)
         sine = np.sin(heading)
-        made = {
+        channels = {
             "vx_ref": cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
             "vy_ref": -sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,
             "yaw_rate_ref": yaw_rate,
         }
         if at is not None:
-            made = {name: np.interp(at[1], at[0], samples) for name, samples in made.items()}
-        made["sideslip_ref"] = np.arctan2(made["vy_ref"], made["vx_ref"])
-        return {name: made[name] for name in self.channels}
+            channels = {
+                name: np.interp(at[1], at[0], samples) for name, samples in channels.items()
+            }
+        channels["sideslip_ref"] = np.arctan2(channels["vy_ref"], channels["vx_ref"])
+        return {name: channels[name] for name in self.channels}
 
 
 def ground_plane(
-    positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str
+    positions: FloatArray, orientations: FloatArray, up: UpAxis, location: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions in the ground plane, (T, 2) [m], and unwrapped yaw, (T,) [rad], z up, of positions x, y, z in the world, (T, 3) [m].
+    """Positions in the ground plane, (T, 2) [m], and unwrapped yaw, (T,) [rad], z up, of positions
+    x, y, z in the world, (T, 3) [m].
 
-    Orientations are quaternions x, y, z, w from the rigid body's axes to the world's, (T, 4); ``up`` is the upward axis of both, ``y`` is
-    usual in motion capture, ``z`` in ROS. Raises `DataError`: a quaternion is not of unit length.
+    Orientations are quaternions x, y, z, w from the rigid body's axes to the world's, (T, 4);
+    ``up`` is the upward axis of both, ``y`` is usual in motion capture, ``z`` in ROS. Raises
+    `DataError`: a quaternion is not of unit length.
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(orientations, axis=1)
     off = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
     if len(off):
         raise DataError(
-            f"{where}: {len(off)} orientations are no unit quaternions, the first in message {off[0] + 1} (length {length[off[0]]:.4g}); "
+            f"{location}: {len(off)} orientations are no unit quaternions, the first in message "
+            f"{off[0] + 1} (length {length[off[0]]:.4g}); "
             f"was the body out of sight? cut the range out"
         )
     x, y, z, w = (orientations / length[:, None]).T

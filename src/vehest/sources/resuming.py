@@ -1,4 +1,6 @@
-"""Downloader for pooch that goes on where an earlier attempt broke off (RFC 9110, Sections 13.1.5 and 14)."""
+"""Downloader for pooch that goes on where an earlier attempt broke off (RFC 9110, Sections 13.1.5
+and 14).
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ Progress = Callable[
 
 
 class ResumingDownloader:
-    """Downloads one file into ``NAME.part``; ``NAME.part.version`` holds its address and its ETag or date.
+    """Downloads one file into ``NAME.part``; ``NAME.part.version`` holds its address and its ETag
+    or date.
 
     Args:
         part: where the file grows.
@@ -53,13 +56,14 @@ class ResumingDownloader:
     ) -> None:
         """Download ``url`` into ``output_file``.
 
-        Raises `MissingError`: the server refuses, or sends a web page. Raises `requests.RequestException`: it is out of reach; what has
-        arrived is kept. Raises `OSError`: the disk is full or not writable.
+        Raises `MissingError`: the server refuses, or sends a web page. Raises
+        `requests.RequestException`: it is out of reach; what has arrived is kept. Raises `OSError`:
+        the disk is full or not writable.
         """
         from requests import exceptions
 
         failures = 0
-        most = -1
+        largest_size = -1
         while True:
             try:
                 self._attempt(url)
@@ -71,7 +75,11 @@ class ResumingDownloader:
                 exceptions.Timeout,
                 exceptions.ChunkedEncodingError,
             ):
-                failures, most = (failures + 1, most) if self._size() <= most else (1, self._size())
+                failures, largest_size = (
+                    (failures + 1, largest_size)
+                    if self._size() <= largest_size
+                    else (1, self._size())
+                )
                 if failures == ATTEMPTS:
                     raise
                 time.sleep(PAUSE * 2.0 ** (failures - 1))
@@ -81,12 +89,12 @@ class ResumingDownloader:
     def _attempt(self, url: str) -> None:
         import requests
 
-        known, _, validator = (
+        address, _, validator = (
             self.version.read_text(encoding="utf-8").partition("\n")
             if self.version.is_file()
             else ("", "", "")
         )
-        have = self._size() if known == url and validator else 0
+        have = self._size() if address == url and validator else 0
         headers = {
             "Accept-Encoding": "identity",
             "User-Agent": f"vehest/{__version__}",
@@ -110,7 +118,8 @@ class ResumingDownloader:
             length = about.get("Content-Length", "")
             if not length.isdecimal() and not response.raw.chunked:
                 raise MissingError(
-                    f"cannot fetch {url}: the server does not state its length, so that a break would not show; {REMEDY}"
+                    f"cannot fetch {url}: the server does not state its length, so that a break "
+                    f"would not show; {REMEDY}"
                 )
             self.resumed_at = have = have if resumed else 0
             self.version.write_text(
@@ -132,7 +141,10 @@ class ResumingDownloader:
 
 
 def _validator(headers: Mapping[str, str]) -> str:
-    """ETag of a file, unless it is a weak one, else its date; empty where offsets are not those of the file itself."""
+    """ETag of a file, unless it is a weak one, else its date.
+
+    Empty where offsets are not those of the file itself.
+    """
     etag = headers.get("ETag", "")
     return (
         ""

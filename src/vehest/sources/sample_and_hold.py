@@ -1,4 +1,6 @@
-"""Slow channels that a table repeats from row to row until their next sample: straight lines between the samples."""
+"""Slow channels that a table repeats from row to row until their next sample: straight lines
+between the samples.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,18 @@ from vehest.sources.columns import Column
 
 @dataclass(frozen=True)
 class SampleAndHold:
-    """Channels whose values stand in every row, though they are new in few: where ``updated`` changes, or else any of their columns."""
+    """Channels whose values stand in every row, though they are new in few: where ``updated``
+    changes, or else any of their columns.
+    """
 
     channels: Annotated[tuple[str, ...], "a list of channels"]
     updated: str | int | None = (
         None  # column that changes with every new sample, such as a time stamp of the sensors' own
     )
     delay: float | dict[str, float] = (
-        0.0  # how much later than it was taken a sample first stands in a row [s], of all channels or some
+        # how much later than it was taken a sample first stands in a row [s], of all channels or
+        # some
+        0.0
     )
 
     @property
@@ -44,12 +50,14 @@ class SampleAndHold:
         columns: Mapping[str, Column],
         values: Mapping[str, FloatArray],
         clock: Clock,
-        where: str,
+        location: str,
     ) -> tuple[dict[str, FloatArray], slice, float]:
-        """Held channels on every tick of a recording's clock, along straight lines, which look ahead by up to one interval.
+        """Held channels on every tick of a recording's clock, along straight lines, which look
+        ahead by up to one interval.
 
-        NaN outside their samples. With them the ticks between two samples of every channel, and the rate of the samples [Hz]. ``columns``
-        are those of the held channels, ``values`` a table's, (T,). Raises `DataError`: there are no such samples.
+        NaN outside their samples. With them the ticks between two samples of every channel, and the
+        rate of the samples [Hz]. ``columns`` are those of the held channels, ``values`` a table's,
+        (T,). Raises `DataError`: there are no such samples.
         """
         markers = (
             {column.column for column in columns.values()}
@@ -61,18 +69,19 @@ class SampleAndHold:
         )  # the first row's sample may be older
         if len(rows) < 2:
             raise DataError(
-                f"{where}: the held channels change in {len(rows)} rows; was their sensor connected? leave the file out"
+                f"{location}: the held channels change in {len(rows)} rows; was their sensor "
+                "connected? leave the file out"
             )
         ticks = clock.ticks()
         times = (ticks if clock.stamps is None else clock.stamps)[rows]
-        found = {}
+        interpolated = {}
         for name, column in columns.items():
             samples = column.to_si(values[column.column], channel(name).unit)[rows]
-            taken = times
+            sample_times = times
             if self.updated is None:
-                samples, taken = _with_repeats(samples, times)
-            found[name] = np.interp(
-                ticks, taken - self.delays[name], samples, left=np.nan, right=np.nan
+                samples, sample_times = _with_repeats(samples, times)
+            interpolated[name] = np.interp(
+                ticks, sample_times - self.delays[name], samples, left=np.nan, right=np.nan
             )
         begin, end = (
             times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1)
@@ -80,35 +89,43 @@ class SampleAndHold:
         inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
         if not len(inside):
             raise DataError(
-                f"{where}: no row lies between two samples of every held channel; are their delays in seconds?"
+                f"{location}: no row lies between two samples of every held channel; are their "
+                "delays in seconds?"
             )
         return (
-            found,
+            interpolated,
             slice(int(inside[0]), int(inside[-1]) + 1),
             (len(rows) - 1) / float(times[-1] - times[0]),
         )
 
 
-def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndHold:
-    """A data set's declaration of held channels; raises `ConfigurationError` for an undeclared channel, or another mistake."""
-    held = validated(SampleAndHold, entry, where, error=ConfigurationError)
-    if unknown := [name for name in held.channels if name not in known]:
+def sample_and_hold_from_config(
+    entry: Any, channels: Sequence[str], location: str
+) -> SampleAndHold:
+    """A data set's declaration of held channels.
+
+    Raises `ConfigurationError` for an undeclared channel, or another mistake.
+    """
+    declared = validated(SampleAndHold, entry, location, error=ConfigurationError)
+    if unknown := [name for name in declared.channels if name not in channels]:
         raise ConfigurationError(
-            f"{where} names '{unknown[0]}', which is not one of the data set's channels"
+            f"{location} names '{unknown[0]}', which is not one of the data set's channels"
         )
     if unknown := sorted(
-        set(held.delay if isinstance(held.delay, dict) else ()) - set(held.channels)
+        set(declared.delay if isinstance(declared.delay, dict) else ()) - set(declared.channels)
     ):
         raise ConfigurationError(
-            f"{where}: delay names '{unknown[0]}', which is not one of its channels"
+            f"{location}: delay names '{unknown[0]}', which is not one of its channels"
         )
-    return held
+    return declared
 
 
 def _with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Samples and times where no column marks updates: a value that stays was sampled again, up to an interval before the next change.
+    """Samples and times where no column marks updates: a value that stays was sampled again, up to
+    an interval before the next change.
 
-    The interval is the median one between changes. Without this a straight line would be drawn through all of a standstill.
+    The interval is the median one between changes. Without this a straight line would be drawn
+    through all of a standstill.
     """
     intervals = np.diff(times)
     typical = float(np.median(intervals))

@@ -1,14 +1,17 @@
-"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to one clock.
+"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to
+one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that contradicts it is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that
+contradicts it is refused.
 
 file -> a `Signal` each channel -> ticks on which all that are not gappy have values -> channels
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,10 +37,11 @@ from vehest.sources.clocks import (
 )
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate
 from vehest.sources.file_source import FileSource
-from vehest.sources.table_rows import timed_runs
 from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
+MIN_COVERED = 0.5  # share of a file's time that its segments must cover
+MISSING = "missing_samples"  # key of a recording's provenance: channel -> texts
 FASTER = 1.05  # than the raster: the rest would fold into it
 
 
@@ -49,7 +53,8 @@ class SignalChannel(Column):
         "linear"  # hold: for values that hold until the next one
     )
     max_gap: Positive | None = (
-        None  # longest time between two samples that is interpolated [s]; None for three median intervals
+        # longest time between two samples that is interpolated [s]; None for three median intervals
+        None
     )
 
 
@@ -59,13 +64,43 @@ class Signal:
 
     origin: str  # its channel group or message, for messages: group 3 (Gateway)
     stamps: FloatArray  # times of the samples [s], strictly increasing, shape (T,)
-    values: FloatArray  # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
+    # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
+    values: FloatArray
     unit: str  # as the file writes it
 
     @property
     def rate_hz(self) -> float:
         """Rate behind the median interval [Hz]."""
         return float(1.0 / np.median(np.diff(self.stamps)))
+
+    def gaps(self, max_gap: float) -> list[tuple[float, float]]:
+        """First and last time of each gap between two samples that is longer than ``max_gap``
+        [s].
+        """
+        times = self.stamps[~np.isnan(self.values)]
+        first = np.flatnonzero(np.diff(times) > max_gap * (1.0 + SLACK))
+        return list(zip(times[first].tolist(), times[first + 1].tolist(), strict=True))
+
+    def missing(self, begin: float, end: float, max_gap: float) -> list[str]:
+        """Samples that a segment from ``begin`` to ``end`` [s] lacks, or that end it, in words."""
+        lines = []
+        unmeasured = self.stamps[np.isnan(self.values)]
+        within = unmeasured[(unmeasured > begin) & (unmeasured < end)]
+        if len(within):
+            lines.append(
+                f"{len(within)} samples that are marked as not measured, the first at "
+                f"{within[0]:.6g} s, are interpolated"
+            )
+        slack = 1.0 / self.rate_hz
+        for left, right in self.gaps(max_gap):
+            if abs(left - end) <= slack:
+                marked = int(((unmeasured > left) & (unmeasured < right)).sum())
+                cause = f", {marked} samples of which are marked as not measured" if marked else ""
+                lines.append(
+                    f"a gap of {right - left:.6g} s after {left:.6g} s{cause}, ends the recording; "
+                    "raise the channel's max_gap where values may be interpolated over that time"
+                )
+        return lines
 
 
 @dataclass(frozen=True)
@@ -84,7 +119,9 @@ class SignalOptions:
 
 
 class SignalSource(FileSource):
-    """Files of signals, a recording each, or one for each part between pauses of any signal that is not gappy."""
+    """Files of signals, a recording each, or one for each part between pauses of any signal that is
+    not gappy.
+    """
 
     options_type = SignalOptions
     options: SignalOptions
@@ -97,52 +134,94 @@ class SignalSource(FileSource):
         self.channels = self._declared(options.channels, self.channel_type)
         if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(
-                f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken"
+                f"{self.location}: give either rate_hz, or as raster the channel whose clock is "
+                "taken"
             )
         self._signals = lru_cache(1)(self._read_signals)
         if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
             raise ConfigurationError(
-                f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'"
+                f"{self.location}: raster must name one of its channels that is not gappy, not "
+                f"'{options.raster}'"
             )
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
-        """Rows of the times at which no signal pauses."""
-        require_files([file], self.name)
-        longest = self.options.max_gap
-        return (
-            super()._runs(file)
-            if longest is None
-            else timed_runs(self._covered(file, longest), longest, restarts=False)
-        )
+        """Times [s] of each segment in which no signal lacks samples for longer than its limit.
 
-    def _covered(self, file: Path, longest: float) -> FloatArray:
-        """Times of all samples [s], (T,), but for those at which one that is not gappy has no sample for longer than ``longest`` [s]."""
-        signals = self._signals(file)[0]
-        spanning = {name: one for name, one in signals.items() if name not in self.gappy} or signals
-        known = [one.stamps[~np.isnan(one.values)] for one in spanning.values()]
-        times = np.unique(np.concatenate(known))
-        for stamps in known:
-            edges = np.concatenate([[-np.inf], stamps, [np.inf]])
-            after = np.searchsorted(edges, times)
-            before = np.searchsorted(edges, times, side="right") - 1
-            times = times[edges[after] - edges[before] <= longest]
-        return times
+        One segment has the file's name. Limits by which most of the time would be left out, as of
+        signals without a period, do not count: the reading then says which gap is too long.
+        """
+        require_files([file], self.name)
+        pause = self.options.max_gap
+        try:
+            signals = self._spanning(self._signals(file)[0])
+            begin, end = self._common_span(signals, file)
+        except DataError:
+            return super()._runs(file)  # reading it gives the reason
+        if pause is None and self.gappy.issuperset(signals):
+            return super()._runs(file)
+        max_gaps = {name: self._max_gap(name, signal) for name, signal in signals.items()}
+        segments = _segments(
+            [gap for name, signal in signals.items() for gap in signal.gaps(max_gaps[name])],
+            begin,
+            end,
+            pause or max(max_gaps.values()),
+        )
+        if sum(part.stop - part.start for part in segments) < MIN_COVERED * (end - begin):
+            if pause is None:
+                return super()._runs(file)
+            gaps = [gap for signal in signals.values() for gap in signal.gaps(pause)]
+            segments = _segments(gaps, begin, end, pause)
+        if pause is None and len(segments) == 1:
+            return {None: segments[0]}
+        return {**dict(enumerate(segments))}
+
+    def _max_gap(self, name: str, signal: Signal) -> float:
+        """Longest time without a sample that is interpolated [s]."""
+        max_gap = self.channels[name].max_gap or GAP / signal.rate_hz
+        return min(max_gap, self.options.max_gap or max_gap)
+
+    def _spanning(self, signals: Mapping[str, Signal]) -> Mapping[str, Signal]:
+        """Signals that must have samples throughout a recording: all that are not gappy, if any."""
+        return {
+            name: signal for name, signal in signals.items() if name not in self.gappy
+        } or signals
+
+    def _common_span(self, signals: Mapping[str, Signal], file: Path) -> tuple[float, float]:
+        """First and last time at which all signals have samples [s]."""
+        spans = {}
+        for name, signal in signals.items():
+            valid = signal.stamps[~np.isnan(signal.values)]
+            if not len(valid):
+                raise DataError(
+                    f"{self._signal_name(name, signal, file)} holds no valid sample; leave the "
+                    "channel out"
+                )
+            spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
+        return common_span(spans, f"'{file}'")
 
     def _read(self, file: Path, run: int | None) -> Recording:
-        """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+        """Read a file of signals.
+
+        Raises `MissingError` without it, `DataError` where it or its clocks are unusable.
+        """
         (signals, provenance) = self._signals(file)
         number = {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():
-                where = self._signal_name(name, signal, file)
+                location = self._signal_name(name, signal, file)
                 require_unit(
                     signal.unit,
                     self.channels[name],
                     channel(name).unit,
-                    where,
+                    location,
                     "set file_units: ignore",
                 )
         stamps, ticks, rate_hz = self._clock(signals, file, run)
+        missing = {
+            name: lines
+            for name, signal in self._spanning(signals).items()
+            if (lines := signal.missing(ticks[0], ticks[-1], self._max_gap(name, signal)))
+        }
         channels = {}
         for name, signal in signals.items():
             values = self._at_ticks(
@@ -155,40 +234,33 @@ class SignalSource(FileSource):
             f"'{file}'",
             clock,
             channels,
-            {"file": file.name, **number, **provenance},
+            {"file": file.name, **number, **provenance, **({MISSING: missing} if missing else {})},
         )
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance."""
+        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the
+        provenance.
+        """
 
     def _clock(
         self, signals: Mapping[str, Signal], file: Path, run: int | None
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""
-        spanning = {
-            name: signal for name, signal in signals.items() if name not in self.gappy
-        } or signals
-        spans = {}
-        for name, signal in spanning.items():
-            valid = signal.stamps[~np.isnan(signal.values)]
-            if not len(valid):
-                raise DataError(
-                    f"{self._signal_name(name, signal, file)} holds no valid sample; leave the channel out"
-                )
-            spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
-        begin, end = common_span(spans, f"'{file}'")
-        if run is not None and self.options.max_gap is not None:
-            begin, *_, end = self._covered(file, self.options.max_gap)[
-                self._runs_of(file)[run]
-            ].tolist()
+        """Stamps [s] at which every signal that is not gappy has values, the even clock behind them
+        [s], and its rate [Hz].
+        """
+        begin, end = self._common_span(self._spanning(signals), file)
+        segment = self._runs_of(file)[run]
+        if segment.start is not None:
+            begin = segment.start
+            end = segment.stop
         if self.options.rate_hz is not None:
             ticks = ticks_within(begin, end, self.options.rate_hz, f"'{file}'")
             return ticks, ticks, self.options.rate_hz
         raster = signals[str(self.options.raster)]
         stamps = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
-        where = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
-        clock = uniform_clock(stamps, where, fix="give rate_hz instead of raster")
+        location = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
+        clock = uniform_clock(stamps, location, fix="give rate_hz instead of raster")
         return stamps, clock.ticks(), clock.rate_hz
 
     def _at_ticks(
@@ -198,15 +270,20 @@ class SignalSource(FileSource):
         stamps: FloatArray,
         ticks: FloatArray,
         rate_hz: float,
-        where: str,
+        location: str,
     ) -> FloatArray:
-        """A signal's values at the ticks, in the file's unit; as they are where its samples are those of the raster."""
+        """A signal's values at the ticks, in the file's unit.
+
+        As they are where its samples are those of the raster.
+        """
         if signal.rate_hz > FASTER * rate_hz and "aliasing" not in (
             self.dataset.get("accept") or []
         ):
             raise DataError(
-                f"{where} comes at {signal.rate_hz:.6g} Hz, faster than the raster of {rate_hz:.6g} Hz, into which vibrations "
-                f"would fold; take that rate here and let 'vehest downsample' filter, or accept: [aliasing]"
+                f"{location} comes at {signal.rate_hz:.6g} Hz, faster than the raster of "
+                f"{rate_hz:.6g} Hz, into which vibrations "
+                "would fold; take that rate here and let 'vehest downsample' filter, or accept: "
+                "[aliasing]"
             )
         if name in self.gappy:
             return on_nearest(
@@ -220,14 +297,29 @@ class SignalSource(FileSource):
         times = times[first : last + 1]
         values = signal.values[measured][first : last + 1]
         if n_missing := int(np.count_nonzero(~measured)):
-            where += f" {n_missing} samples of which are marked as not measured,"
+            location += f" {n_missing} samples of which are marked as not measured,"
         declared = self.channels[name]
-        require_samples(
-            values, times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where
-        )
+        require_samples(values, times, self._max_gap(name, signal) * (1.0 + SLACK), location)
         if np.array_equal(times, stamps):
             return values
         return at_ticks(values, times, ticks, hold=declared.interpolation == "hold", slack=near)
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
-        return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
+        return (
+            f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel "
+            f"'{name}',"
+        )
+
+
+def _segments(
+    gaps: Iterable[tuple[float, float]], begin: float, end: float, min_duration: float
+) -> list[slice]:
+    """Times [s] from ``begin`` to ``end`` without gaps, of segments that last ``min_duration``
+    [s].
+    """
+    segments = []
+    for left, right in sorted([*gaps, (end, math.inf)]):
+        if left <= end and left - begin >= min_duration:
+            segments.append(slice(begin, left))
+        begin = max(begin, right)
+    return segments

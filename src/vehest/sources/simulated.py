@@ -22,7 +22,7 @@ from vehest.simulation.plant.planar_car import PLANAR, planar_car_from_configura
 from vehest.simulation.plant.wear import Stint
 from vehest.sources.base import Source
 
-Whole = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
+Natural = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
 SurfaceFile = Annotated[
     str | dict[str, Any], "one of dry, wet, patchy, or a mapping such as {friction: 0.6}"
 ]
@@ -39,14 +39,17 @@ class Payload:
 
 @dataclass(frozen=True)
 class Drive:
-    """One of ``drives`` as a data set declares it, or ``count`` of them; for None the data set's own value holds."""
+    """One of ``drives`` as a data set declares it, or ``count`` of them.
+
+    For None the data set's own value holds.
+    """
 
     id: str | int
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
     count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = (
         None  # called ID_001, ID_002 and so on
     )
-    seed: Whole | None = None  # None: one that follows from the data set's and the drive's name
+    seed: Natural | None = None  # None: one that follows from the data set's and the drive's name
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None
     stability_control: bool | None = None
@@ -63,7 +66,7 @@ class SimulatedOptions:
 
     vehicles: dict[str, Any] | None = None
     drives: tuple[Drive, ...] | None = None
-    seed: Whole = 0
+    seed: Natural = 0
     rate_hz: Annotated[float, Field(ge=1.0, le=1000.0), "a number between 1 and 1000"] = 100.0
     sensors: str | dict[str, Any] | None = None
     surface: SurfaceFile | None = None
@@ -96,14 +99,20 @@ class SimulatedSource(Source):
             self.sensor_variation = SensorVariation.from_config(options.vary_sensors or {})
             for drive_id in self.drives:
                 longest = self._simulation(drive_id, ()).keywords["manoeuvre"].longest
-                what = f"drive '{drive_id}' may last {longest:g} s, {longest * rate_hz:.6g} samples at {rate_hz:g} Hz"
-                check_limit("samples", longest * rate_hz, what, ConfigurationError)
+                fault = (
+                    f"drive '{drive_id}' may last {longest:g} s, {longest * rate_hz:.6g} "
+                    f"samples at {rate_hz:g} Hz"
+                )
+                check_limit("samples", longest * rate_hz, fault, ConfigurationError)
         except ConfigurationError as error:
-            raise ConfigurationError(f"{self.where}: {error}") from None
+            raise ConfigurationError(f"{self.location}: {error}") from None
 
     @property
     def car(self) -> CarValues:
-        """Declared values, or those of the vehicles; None where drives differ by vehicle, payload or variation."""
+        """Declared values, or those of the vehicles.
+
+        None where drives differ by vehicle, payload or variation.
+        """
         if self.declared_car is not None:
             return self.declared_car
         varied = {name for entry in self.options.vary or () for name in entry["parameters"]}
@@ -118,7 +127,10 @@ class SimulatedSource(Source):
         return CarValues(**common)
 
     def inputs(self) -> dict[str, str | Path]:
-        """The multi-body plant's library and its version, where a vehicle is driven by it; there are no files."""
+        """The multi-body plant's library and its version, where a vehicle is driven by it.
+
+        There are no files.
+        """
         if all(vehicle.get("plant") == PLANAR for vehicle in self.vehicles.values()):
             return {}
         return {"commonroad-vehicle-models": metadata.version("commonroad-vehicle-models")}
@@ -131,21 +143,24 @@ class SimulatedSource(Source):
         """Simulate one drive."""
         if recording_id not in self.drives:
             raise MissingError(
-                f"{self.where} has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)"
+                f"{self.location} has no drive '{recording_id}' (it has "
+                f"{', '.join(list(self.drives)[:12])}, …)"
             )
         return self._simulation(recording_id, self.variations)()
 
     def seed_of(self, drive_id: str) -> int:
-        """Seed of a drive: its own, or one that follows from the data set's and the drive's name, whatever other drives there are."""
-        own = self.drives[drive_id].seed
+        """Seed of a drive: its own, or one that follows from the data set's and the drive's name,
+        whatever other drives there are.
+        """
+        drive_seed = self.drives[drive_id].seed
         return (
             int(
                 np.random.SeedSequence(
                     [self.options.seed, zlib.crc32(drive_id.encode())]
                 ).generate_state(1)[0]
             )
-            if own is None
-            else own
+            if drive_seed is None
+            else drive_seed
         )
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
@@ -190,49 +205,50 @@ class SimulatedSource(Source):
         )
 
     def _vehicles(self) -> dict[str, Mapping[str, Any]]:
-        one = self.dataset.get("vehicle")
+        vehicle = self.dataset.get("vehicle")
         several = self.options.vehicles
-        if isinstance(one, Mapping) and not several:
-            return {"": one}
+        if isinstance(vehicle, Mapping) and not several:
+            return {"": vehicle}
         if (
-            one is None
+            vehicle is None
             and several
             and all(isinstance(entry, Mapping) for entry in several.values())
         ):
             return several
         raise ConfigurationError(
-            f"{self.where}: a simulated data set needs a vehicle from conf/vehicle, or vehicles, a mapping of several"
+            f"{self.location}: a simulated data set needs a vehicle from conf/vehicle, or "
+            "vehicles, a mapping of several"
         )
 
     def _drives(self) -> dict[str, Drive]:
         drives: dict[str, Drive] = {}
         for entry in self.options.drives or ():
-            where = f"{self.where}: drive '{entry.id}'"
+            location = f"{self.location}: drive '{entry.id}'"
             name = str(entry.id)
             if not 0 < len(name) <= 100:
-                raise ConfigurationError(f"{where}: an id is a name of 1 to 100 characters")
-            check_name(name, f"{where}: id")
+                raise ConfigurationError(f"{location}: an id is a name of 1 to 100 characters")
+            check_name(name, f"{location}: id")
             if entry.seed is not None and entry.count is not None:
                 raise ConfigurationError(
-                    f"{where}: give seed for a single drive, or count, not both"
+                    f"{location}: give seed for a single drive, or count, not both"
                 )
             n_drives = len(drives) + (entry.count or 0)
             check_limit(
                 "jobs",
                 n_drives,
-                f"{where}: the data set would have {n_drives} drives",
+                f"{location}: the data set would have {n_drives} drives",
                 ConfigurationError,
             )
-            own = (
+            drive_ids = (
                 [name]
                 if entry.count is None
                 else [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
             )
-            if doubled := [drive_id for drive_id in own if drive_id in drives]:
+            if doubled := [drive_id for drive_id in drive_ids if drive_id in drives]:
                 raise ConfigurationError(
-                    f"{self.where}: two drives are called '{doubled[0]}', names must differ"
+                    f"{self.location}: two drives are called '{doubled[0]}', names must differ"
                 )
-            drives |= dict.fromkeys(own, entry)
+            drives |= dict.fromkeys(drive_ids, entry)
         return drives
 
 
@@ -243,7 +259,9 @@ def _simulator_of(
     drive: Drive | None = None,
     stability_control: bool = False,
 ) -> partial[Recording]:
-    """The simulator of a vehicle, varied by the seed of a drive, with the drive's payload and tyres that age."""
+    """The simulator of a vehicle, varied by the seed of a drive, with the drive's payload and tyres
+    that age.
+    """
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
     from vehest.simulation.planar_drive import simulate_planar_drive
@@ -253,24 +271,30 @@ def _simulator_of(
     if vehicle.get("plant") == PLANAR:
         if payload or tyres:
             raise ConfigurationError(
-                f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out"
+                f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant "
+                "only; leave them out"
             )
         if stability_control:
             raise ConfigurationError(
-                f"vehicle '{vehicle.get('name')}' has no stability control; leave stability_control out"
+                f"vehicle '{vehicle.get('name')}' has no stability control; leave "
+                "stability_control out"
             )
         return partial(
             simulate_planar_drive,
             car=varied_planar(planar_car_from_configuration(vehicle), variations, seed),
         )
-    own = varied(vehicle_from_configuration(vehicle), variations, seed)
+    parameters = varied(vehicle_from_configuration(vehicle), variations, seed)
     if payload:
-        own = loaded(own, payload.mass, payload.forward, payload.up)
-    return partial(simulate_drive, vehicle=own, stint=tyres, stability_control=stability_control)
+        parameters = loaded(parameters, payload.mass, payload.forward, payload.up)
+    return partial(
+        simulate_drive, vehicle=parameters, stint=tyres, stability_control=stability_control
+    )
 
 
 def _car_values(vehicle: Mapping[str, Any], varied_parameters: Set[str]) -> dict[str, float | None]:
-    """Wheelbase [m], mass [kg] and distance of the centre of gravity from the rear axle [m] of a vehicle; None where varied."""
+    """Wheelbase [m], mass [kg] and distance of the centre of gravity from the rear axle [m] of a
+    vehicle; None where varied.
+    """
     from vehest.simulation.plant.parameters import library_parameters, vehicle_from_configuration
 
     if vehicle.get("plant") == PLANAR:

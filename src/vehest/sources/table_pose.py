@@ -1,4 +1,6 @@
-"""Poses of a motion capture system in a table's columns, and the reference channels that are made of them."""
+"""Poses of a motion capture system in a table's columns, and the reference channels that are made
+of them.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +36,12 @@ class TablePose(PoseOptions):
         """Columns of ``x``, ``y`` and ``yaw``."""
         return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
-    def made_of(
-        self, values: Mapping[str, FloatArray], clock: Clock, where: str
+    def channels_of(
+        self, values: Mapping[str, FloatArray], clock: Clock, location: str
     ) -> dict[str, FloatArray]:
-        """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window; raises `DataError`."""
+        """Reference channels on the recording's clock, on which poses are differentiated: offline,
+        by half a window; raises `DataError`.
+        """
         poses = {
             name: column.to_si(values[column.column], UNITS[name])
             for name, column in self.columns.items()
@@ -45,19 +49,25 @@ class TablePose(PoseOptions):
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                what = f"pose column '{self.columns[name].column}' holds no number in {len(odd)} rows of the run, first in row {odd[0] + 1}"
-                raise DataError(f"{where}: {what}; leave them out by drop_rows")
+                fault = (
+                    f"pose column '{self.columns[name].column}' holds no number in {len(odd)} "
+                    f"rows of the run, first in row {odd[0] + 1}"
+                )
+                raise DataError(f"{location}: {fault}; leave them out by drop_rows")
         x, y, yaw = (
             clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"]))
         )
         return self.references(
-            np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where
+            np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, location
         )
 
 
-def table_pose_from_config(entry: Any, where: str) -> TablePose:
-    """A data set's declaration of poses in columns; raises `ConfigurationError` where a column or unit is missing, or one unknown."""
-    pose = validated(TablePose, entry, where, error=ConfigurationError)
+def table_pose_from_config(entry: Any, location: str) -> TablePose:
+    """A data set's declaration of poses in columns.
+
+    Raises `ConfigurationError` where a column or unit is missing, or one unknown.
+    """
+    pose = validated(TablePose, entry, location, error=ConfigurationError)
     for name, unit in UNITS.items():
-        column_from_config(entry[name], f"{where}: {name}", unit)
+        column_from_config(entry[name], f"{location}: {name}", unit)
     return pose

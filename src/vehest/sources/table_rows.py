@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.sources.clocks import bridged
 from vehest.sources.columns import Column, Positive
 
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
@@ -44,75 +46,124 @@ def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
 
 
 def dropped_rows_from_config(
-    entries: Mapping[str, Iterable[int | str]], where: str
+    entries: Mapping[str, Iterable[int | str]], location: str
 ) -> dict[str, list[slice]]:
-    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or ranges; raises `ConfigurationError`."""
+    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or
+    ranges; raises `ConfigurationError`.
+    """
     return {
-        str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows]
+        str(stem): [_rows(row, f"{location}: drop_rows of '{stem}'") for row in rows]
         for stem, rows in entries.items()
     }
 
 
-def _rows(row: int | str, where: str) -> slice:
-    found = RANGE.fullmatch(str(row).strip())
-    first, last = found.groups(default=found[1]) if found else ("", "")
+def _rows(row: int | str, location: str) -> slice:
+    match = RANGE.fullmatch(str(row).strip())
+    first, last = match.groups(default=match[1]) if match else ("", "")
     if not first or (last and int(last) < int(first)):
         raise ConfigurationError(
-            f'{where}: \'{row}\' is neither a data row, counted from 1, nor a range such as "700-750" or "700-"'
+            f"{location}: '{row}' is neither a data row, counted from 1, nor a range such as "
+            '"700-750" or "700-"'
         )
     return slice(int(first) - 1, int(last) if last else None)
 
 
-def kept_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
+def remaining_files(
+    files: Sequence[Path], exclude: Iterable[str], dropped: Iterable[str], location: str
+) -> list[Path]:
+    """Files whose stems match no pattern of ``exclude``.
+
+    Raises `MissingError` where a pattern, or a stem of ``dropped``, matches no file, or none
+    remains.
+    """
+    patterns = list(exclude)
+    for option, names in (("exclude", patterns), ("drop_rows", dropped)):
+        for name in names:
+            if not any(name == file.stem or fnmatchcase(file.stem, name) for file in files):
+                raise MissingError(f"{location}: {option} names '{name}', which no file is called")
+    remaining = [
+        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
+    ]
+    if not remaining:
+        raise MissingError(f"{location}: exclude leaves none of its files")
+    return remaining
+
+
+def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
     """Which rows count, shape (n_rows,); raises `DataError` where the table has no such row."""
-    kept = np.ones(n_rows, dtype=np.bool_)
+    is_remaining = np.ones(n_rows, dtype=np.bool_)
     for rows in dropped:
         last = rows.stop or rows.start + 1
         if last > n_rows:
             raise DataError(
-                f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another version of the file?"
+                f"'{file}' has {n_rows} data rows, and drop_rows names row {last}; is it another "
+                "version of the file?"
             )
-        kept[rows] = False
-    return kept
+        is_remaining[rows] = False
+    return is_remaining
 
 
 def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
-    """Rows of each run that a column of whole numbers counts; raises `DataError` where a number is none, or a run begins again."""
+    """Rows of each run that a column of whole numbers counts.
+
+    Raises `DataError` where a number is none, or a run begins again.
+    """
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
-        where = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
-        raise DataError(f"'{file}': {where}; runs are counted in whole numbers")
+        location = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
+        raise DataError(f"'{file}': {location}; runs are counted in whole numbers")
     runs: dict[int | None, slice] = {}
     for rows in stretches(np.diff(numbers) != 0, len(numbers)):
         run = int(numbers[rows.start])
         if run in runs:
             raise DataError(
-                f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is uninterrupted, sort the rows"
+                f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is "
+                "uninterrupted, sort the rows"
             )
         runs[run] = rows
     return runs
 
 
 def timed_runs(
-    times: FloatArray, max_gap: float | None, *, restarts: bool
+    times: FloatArray,
+    max_gap: float | None,
+    *,
+    restarts: bool,
+    columns: Iterable[FloatArray] = (),
 ) -> dict[int | None, slice]:
-    """Rows of each run, which begins where times [s], (N,), go backwards, if ``restarts``, or leave a gap longer than ``max_gap`` [s].
+    """Rows of each run of a table.
 
-    Pieces between gaps that last less than ``max_gap`` are left out.
+    Parameters
+    ----------
+    times : FloatArray
+        Times of the rows [s], shape (N,).
+    max_gap : float or None
+        Longest time without a row, or without a sample of a column, within a run [s]; runs that
+        last less are left out.
+    restarts : bool
+        Whether a run begins where times go backwards.
+    columns : iterable of FloatArray
+        Columns that must have samples throughout, NaN where there is none, shape (N,) each.
     """
-    steps = np.diff(times)
-    begins = (steps < 0) & restarts
     if max_gap is None:
-        return {**dict(enumerate(stretches(begins, len(times))))}
-    runs = stretches(begins | (steps > max_gap), len(times))
-    return {
-        **dict(
-            enumerate(rows for rows in runs if times[rows.stop - 1] - times[rows.start] >= max_gap)
-        )
-    }
+        return {**dict(enumerate(stretches((np.diff(times) < 0) & restarts, len(times))))}
+    measured = np.ones(len(times), dtype=np.bool_)
+    for column in columns:
+        measured &= np.isfinite(bridged(column, times, max_gap))
+    rows = np.flatnonzero(measured)
+    steps = np.diff(times[rows])
+    runs = [
+        slice(int(rows[run.start]), int(rows[run.stop - 1]) + 1)
+        for run in stretches(((steps < 0) & restarts) | (steps > max_gap), len(rows))
+        if run.stop > run.start
+    ]
+    lasting = [run for run in runs if times[run.stop - 1] - times[run.start] >= max_gap]
+    return {**dict(enumerate(lasting))}
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
-    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N - 1,)."""
+    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N -
+    1,).
+    """
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]

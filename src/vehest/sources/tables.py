@@ -53,7 +53,10 @@ def is_parquet(file: Path) -> bool:
 
 
 def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
-    """Names of a table's columns, in order; raises `MissingError` where there is no such file, `DataError` where it cannot be read."""
+    """Names of a table's columns, in order.
+
+    Raises `MissingError` where there is no such file, `DataError` where it cannot be read.
+    """
     if layout.names is not None:
         names = list(layout.names)
     elif is_parquet(file):
@@ -110,7 +113,10 @@ def with_names(file: Path, layout: TextLayout) -> TextLayout:
 
 
 def read_head(file: Path, size: int = BLOCK) -> bytes:
-    """First bytes of a table, unpacked; raises `MissingError` where there is no such file, `DataError` where it cannot be read."""
+    """First bytes of a table, unpacked.
+
+    Raises `MissingError` where there is no such file, `DataError` where it cannot be read.
+    """
     try:
         with table_stream(file) as stream:
             return bytes(stream.read(size))
@@ -118,40 +124,48 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
         raise _unreadable(file, error) from None
 
 
-def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> None:
+def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -> None:
     """See that a table has every wanted column once; raises `DataError` where it does not."""
-    for name in wanted:
+    for name in selected:
         count = names.count(name)
         if count > 1:
             raise DataError(
-                f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one"
+                f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all "
+                "but one"
             )
-        numbered = [one for one in names if re.fullmatch(rf"{re.escape(name)} #\d+", one)]
+        numbered = [column for column in names if re.fullmatch(rf"{re.escape(name)} #\d+", column)]
         if not count and numbered:
             raise DataError(
-                f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or remove "
+                f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or "
+                "remove "
                 f"all but one, or declare one of them: {listed(numbered)}"
             )
         if not count:
             raise DataError(
-                f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset"
+                f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in "
+                "conf/dataset"
             )
 
 
 def read_columns(
-    file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None
+    file: Path,
+    selected: Sequence[str],
+    layout: TextLayout = TextLayout(),
+    text: bytes | None = None,
 ) -> dict[str, FloatArray]:
-    """Columns of numbers, shape (T,) each, NaN where a sample is missing; ``text`` is that of the table where it is not the file's own.
+    """Columns of numbers, shape (T,) each, NaN where a sample is missing; ``text`` is that of the
+    table where it is not the file's own.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: it cannot be read, lacks a column, or holds text where numbers belong.
+    Raises `MissingError`: there is no such file. Raises `DataError`: it cannot be read, lacks a
+    column, or holds text where numbers belong.
     """
-    require_columns(file, column_names(file, layout), wanted)
+    require_columns(file, column_names(file, layout), selected)
     if is_parquet(file):
         with parquet_file(file) as parquet:
-            return read_numbers(file, parquet, wanted)
+            return read_numbers(file, parquet, selected)
     opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     layout = with_names(file, layout)
-    convert = _conversion(wanted, layout)
+    convert = _conversion(selected, layout)
     if text is None:
         require_memory(file, layout)
     try:
@@ -164,41 +178,44 @@ def read_columns(
     if not table.num_rows:
         raise DataError(f"'{file}' has {'a header and ' if layout.names is None else ''}no rows")
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
-    columns = {name: table.column(name) for name in wanted}
+    columns = {name: table.column(name) for name in selected}
     del table  # so that a column is dropped as soon as it is converted
     return {
         name: _seconds(file, name, columns.pop(name))
         if name == layout.clock
         else numbers_of(columns.pop(name))
-        for name in wanted
+        for name in selected
     }
 
 
 def column_parts(
-    file: Path, wanted: Sequence[str], layout: TextLayout, lengths: Iterable[int]
+    file: Path, selected: Sequence[str], layout: TextLayout, lengths: Iterable[int]
 ) -> Iterator[dict[str, FloatArray]]:
-    """Columns as `read_columns` gives them, so many rows at a time, at most as many as there are; raises as it does."""
-    require_columns(file, column_names(file, layout), wanted)
+    """Columns as `read_columns` gives them, so many rows at a time, at most as many as there are.
+
+    Raises as it does.
+    """
+    require_columns(file, column_names(file, layout), selected)
     try:
         with ExitStack() as opened:
             if is_parquet(file):
-                batches = number_batches(file, opened.enter_context(parquet_file(file)), wanted)
+                batches = number_batches(file, opened.enter_context(parquet_file(file)), selected)
             else:
                 layout = with_names(file, layout)
-                options = _options(layout, _conversion(wanted, layout))
+                options = _options(layout, _conversion(selected, layout))
                 stream = opened.enter_context(table_stream(file))
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
             at = 0
             for length in lengths:
-                values = {name: np.empty(length) for name in wanted}
+                values = {name: np.empty(length) for name in selected}
                 done = 0
                 while batch is not None and done < length:
-                    own = batch.slice(at, length - done)
-                    for name in wanted:
-                        values[name][done : done + own.num_rows] = numbers_of(own.column(name))
-                    at = at + own.num_rows
-                    done = done + own.num_rows
+                    rows = batch.slice(at, length - done)
+                    for name in selected:
+                        values[name][done : done + rows.num_rows] = numbers_of(rows.column(name))
+                    at = at + rows.num_rows
+                    done = done + rows.num_rows
                     if at == batch.num_rows:
                         batch = next(batches, None)
                         at = 0
@@ -210,7 +227,7 @@ def column_parts(
                     else {name: column[:done] for name, column in values.items()}
                 )
     except DAMAGE:
-        read_columns(file, wanted, layout)  # whose errors state the row
+        read_columns(file, selected, layout)  # whose errors state the row
         raise
 
 
@@ -244,19 +261,20 @@ def _options(
     }
 
 
-def _conversion(wanted: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
+def _conversion(selected: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
     return pc.ConvertOptions(
         column_types={
-            name: pa.string() if name == layout.clock else pa.float64() for name in wanted
+            name: pa.string() if name == layout.clock else pa.float64() for name in selected
         },
-        include_columns=list(wanted),
+        include_columns=list(selected),
         decimal_point=layout.decimal,
         null_values=[*pc.ConvertOptions().null_values, *layout.missing],
     )
 
 
 def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table, unpacked as it is read if it ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4``.
+    """Text of a table, unpacked as it is read if it ends in ``.gz``, ``.bz2``, ``.zst`` or
+    ``.lz4``.
 
     Raises `MissingError` where there is no such file, `DataError` for a pipe or a folder, `OSError`
     where it cannot be opened.
@@ -267,7 +285,8 @@ def table_stream(file: Path) -> pa.NativeFile:
 
 
 def require_memory(file: Path, layout: TextLayout) -> None:
-    """Refuse, by a `DataError`, a table that would take more memory as a whole than the limits allow.
+    """Refuse, by a `DataError`, a table that would take more memory as a whole than the limits
+    allow.
 
     Weighed are its unpacked text and ``BYTES_PER_CELL`` for each delimiter and each end of a line,
     counted block by block without keeping any. Text that is not packed and too short to exceed the
@@ -300,7 +319,8 @@ def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
     seconds = seconds_of_text(cells)
     if seconds is None:
         raise DataError(
-            f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or 2024-05-03T10:59:30.25"
+            f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or "
+            "2024-05-03T10:59:30.25"
         )
     return seconds
 
@@ -313,13 +333,17 @@ def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) 
     if cell is not None and layout is not None:
         name = column_names(file, layout)[int(cell[1])]
         above = layout.skip_rows + layout.rows_below_names + (layout.names is None)
-        where = f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row {int(cell[2]) - above}"
-        return DataError(f"'{file}': {where}; numbers are needed")
+        location = (
+            f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row "
+            f"{int(cell[2]) - above}"
+        )
+        return DataError(f"'{file}': {location}; numbers are needed")
     problem = (
         f"a line is longer than {BLOCK} bytes"
         if "straddl" in str(error)
         else printable(first_line(error))
     )
     return DataError(
-        f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?"
+        f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format "
+        "or encoding?"
     )

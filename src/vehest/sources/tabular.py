@@ -1,10 +1,12 @@
-"""Source of CSV and Parquet tables with a column a channel; names, units and signs are declared in conf/dataset."""
+"""Source of CSV and Parquet tables with a column a channel.
+
+Names, units and signs are declared in conf/dataset.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from dataclasses import dataclass
 from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -13,30 +15,33 @@ from pydantic import AfterValidator, Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
 from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.clocks import Clock, ClockPolicy, even_clock, uniform_clock
+from vehest.sources.clocks import Clock, ClockPolicy, bridged, even_clock, uniform_clock
 from vehest.sources.columns import (
     ChannelMap,
     ChannelNames,
     Column,
     ColumnName,
     Positive,
+    SampledColumn,
     column_from_config,
     columns_from_config,
+    measured_columns,
 )
 from vehest.sources.file_source import FileSource
-from vehest.sources.sample_and_hold import held_from_config
+from vehest.sources.sample_and_hold import sample_and_hold_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import (
     TimeColumn,
     counted_runs,
     dropped_rows_from_config,
-    kept_rows,
+    remaining_files,
+    remaining_rows,
     timed_runs,
 )
 from vehest.sources.tables import (
@@ -100,39 +105,47 @@ class TabularSource(FileSource):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         options = self.options
-        where = self.where
+        location = self.location
         self.columns = (
-            None if options.channels is None else columns_from_config(options.channels, self.name)
+            None
+            if options.channels is None
+            else columns_from_config(options.channels, self.name, SampledColumn)
         )
         self.time: TimeColumn | None = (
             None
             if options.time is None
             else cast(
                 TimeColumn,
-                column_from_config(options.time, f"{where}: time", "s", TimeColumn),
+                column_from_config(options.time, f"{location}: time", "s", TimeColumn),
             )
         )
         if self.time is None and options.rate_hz is None:
-            raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
+            raise ConfigurationError(f"{location}: without a time column, rate_hz must be given")
         self._cuts = options.time_restarts or options.max_gap is not None
         if self._cuts and (options.runs is not None or self.time is None):
             raise ConfigurationError(
-                f"{where}: time_restarts and max_gap need a time column, and no column that counts runs"
+                f"{location}: time_restarts and max_gap need a time column, and no column that "
+                "counts runs"
             )
-        self.dropped = dropped_rows_from_config(options.drop_rows or {}, where)
+        self.dropped = dropped_rows_from_config(options.drop_rows or {}, location)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
         self.held = (
             None
             if options.held is None
-            else held_from_config(options.held, list(self.columns or ()), f"{where}: held")
+            else sample_and_hold_from_config(
+                options.held, list(self.columns or ()), f"{location}: held"
+            )
         )
         self.pose = (
-            None if options.pose is None else table_pose_from_config(options.pose, f"{where}: pose")
+            None
+            if options.pose is None
+            else table_pose_from_config(options.pose, f"{location}: pose")
         )
         doubled = sorted(set(self.columns or ()) & set(self.pose.channels if self.pose else ()))
         if doubled:
             raise ConfigurationError(
-                f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out"
+                f"{location}: channel '{doubled[0]}' comes both from channels and from pose; "
+                "leave one out"
             )
         self._require_pattern()
         self.layout = TextLayout(
@@ -140,10 +153,12 @@ class TabularSource(FileSource):
         )
 
     def file_parts(self, file: Path) -> Iterator[Recording]:
-        """`read_file` in parts, of a large table whose clock is even and whose rows can be read one after another."""
+        """`read_file` in parts, of a large table whose clock is even and whose rows can be read one
+        after another.
+        """
         options = self.options
         time = self.time
-        apart = not (
+        can_be_divided = not (
             self._cuts
             or options.runs
             or self.held
@@ -156,7 +171,7 @@ class TabularSource(FileSource):
         small = not is_parquet(file) and file.stat().st_size < LARGE
         if (
             small
-            or not apart
+            or not can_be_divided
             or time is None
             or time.wraps_at
             or time.sort
@@ -166,7 +181,7 @@ class TabularSource(FileSource):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
-        wanted = list(dict.fromkeys(column.column for column in columns.values()))
+        selected = list(dict.fromkeys(column.column for column in columns.values()))
         try:
             blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
             clock = even_clock(
@@ -179,16 +194,13 @@ class TabularSource(FileSource):
             check_limit("samples", clock.n_samples, f"'{file}' has {clock.n_samples} rows")
             slices = part_slices(clock.n_samples, clock.rate_hz)
             parts = column_parts(
-                file, wanted, self.layout, (rows.stop - rows.start for rows in slices)
+                file, selected, self.layout, (rows.stop - rows.start for rows in slices)
             )
             for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
-                own = replace(
-                    clock,
-                    start_time=clock.start_time + rows.start / clock.rate_hz,
-                    n_samples=rows.stop - rows.start,
-                )
+                measured = measured_columns(self.columns or {}, values)
+                part = [number, len(slices)]
                 yield self._prepared(
-                    self._made_of(file, None, columns, values, own, [number, len(slices)])
+                    self._recording_of(file, None, columns, measured, clock.part(rows), part)
                 )
         except DataError:
             self.read_file(file)  # whose errors are of all its rows
@@ -199,21 +211,24 @@ class TabularSource(FileSource):
         if is_stored_recording(file):
             return read_recording(file)
         columns = self._columns_of(file)
-        wanted = [
+        selected = [
             column.column
             for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))
         ]
         extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
         values = self._values(
-            file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)]))
+            file,
+            list(dict.fromkeys([*selected, *(str(name) for name in extra if name is not None)])),
         )
         rows = self._runs_of(file)[run]
-        return self._made_of(
+        return self._recording_of(
             file, run, columns, {name: samples[rows] for name, samples in values.items()}
         )
 
     def _columns_of(self, file: Path) -> Mapping[str, Column]:
-        """Column of each channel: those of the data set, else those that are named like channels."""
+        """Column of each channel: those of the data set, else those that are named like
+        channels.
+        """
         names = column_names(file, self.layout)
         columns = self.columns
         if columns is None:
@@ -221,26 +236,28 @@ class TabularSource(FileSource):
                 name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS
             }
         if not columns:
-            what = f"has no column that is named like a channel (it has {listed(names)})"
+            problem = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(
-                f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME"
+                f"'{file}' {problem}; describe them by 'vehest new NAME {file.name}', then add "
+                "dataset=NAME"
             )
         return columns
 
-    def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
+    def _values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
         """Columns in the order of their times, without the rows that the data set leaves out."""
         time = self.time
         sorting = [time.column] if time is not None and time.sort else []
-        values = read_columns(file, list(dict.fromkeys([*wanted, *sorting])), self.layout)
+        values = read_columns(file, list(dict.fromkeys([*selected, *sorting])), self.layout)
         if time is not None and time.column in values:
             values = time.in_order(values)
+        values = measured_columns(self.columns or {}, values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values
-        kept = kept_rows(len(next(iter(values.values()))), dropped, file)
-        return {name: samples[kept] for name, samples in values.items()}
+        is_remaining = remaining_rows(len(next(iter(values.values()))), dropped, file)
+        return {name: samples[is_remaining] for name, samples in values.items()}
 
-    def _made_of(
+    def _recording_of(
         self,
         file: Path,
         run: int | None,
@@ -249,21 +266,28 @@ class TabularSource(FileSource):
         clock: Clock | None = None,
         part: Sequence[int] = (1, 1),
     ) -> Recording:
-        """The recording of a file's columns, or of one run of them, or of a part by its number, that of all parts and its clock."""
+        """The recording of a file's columns, or of one run of them, or of a part by its number,
+        that of all parts and its clock.
+        """
         n_rows = len(next(iter(values.values())))
-        where = f"'{file}'" if run is None else f"'{file}', run {run}"
+        location = f"'{file}'" if run is None else f"'{file}', run {run}"
+        max_gap = self.options.max_gap
+        if self.time is not None and max_gap is not None:
+            times = self.time.to_si(values[self.time.column], "s")
+            lines = {name: bridged(values[name], times, max_gap) for name in self._spanning(file)}
+            values = {**values, **lines}
         if clock is None and self.time is not None:
             clock = uniform_clock(
-                self.time.to_si(values[self.time.column], "s"), where, self.options.clock
+                self.time.to_si(values[self.time.column], "s"), location, self.options.clock
             )
         clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
-        held = () if self.held is None else self.held.channels
+        sampled_channels = () if self.held is None else self.held.channels
         channels = {
             name: clock.align(
                 column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy
             )
             for name, column in columns.items()
-            if name not in held
+            if name not in sampled_channels
         }
         provenance: dict[str, Any] = (
             {"file": file.name}
@@ -273,39 +297,22 @@ class TabularSource(FileSource):
         if file.stem in self.dropped:
             provenance["dropped_rows"] = list(self.options.drop_rows[file.stem])
         if self.pose is not None:
-            channels |= self.pose.made_of(values, clock, where)
+            channels |= self.pose.channels_of(values, clock, location)
         if self.held is not None:
-            own = {name: column for name, column in columns.items() if name in held}
-            lines, inside, rate = self.held.interpolated(own, values, clock, where)
+            sampled_columns = {
+                name: column for name, column in columns.items() if name in sampled_channels
+            }
+            lines, inside, rate = self.held.interpolated(sampled_columns, values, clock, location)
             channels = {name: samples[inside] for name, samples in {**channels, **lines}.items()}
-            clock = replace(
-                clock,
-                start_time=float(clock.ticks()[inside.start]),
-                n_samples=inside.stop - inside.start,
-                stamps=None,
-            )
+            clock = clock.part(inside)
             provenance["held"] = self.held.description(rate)
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
-        found = super()._files()
-        stems = {file.stem for file in found}
-        patterns = self.options.exclude or ()
-        for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
-            for name in named:
-                if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):
-                    raise MissingError(
-                        f"{self.where}: {option} names '{name}', which no file is called"
-                    )
-        kept = [
-            file
-            for file in found
-            if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
-        ]
-        if not kept:
-            raise MissingError(f"{self.where}: exclude leaves none of its files")
-        return kept
+        return remaining_files(
+            super()._files(), self.options.exclude or (), self.dropped, self.location
+        )
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Rows of each run without those that are left out."""
@@ -313,18 +320,31 @@ class TabularSource(FileSource):
         if counter is None or is_stored_recording(file):
             return super()._runs(file)
         require_files([file], self.name)
-        numbers = self._values(file, [counter])[counter]
         if self.time is not None and self._cuts:
+            names = self._spanning(file) if self.options.max_gap else []
+            values = self._values(file, [counter, *names])
             return timed_runs(
-                self.time.to_si(numbers, "s"),
+                self.time.to_si(values[counter], "s"),
                 self.options.max_gap,
                 restarts=self.options.time_restarts,
+                columns=(values[name] for name in names),
             )
-        return counted_runs(numbers, counter, file)
+        return counted_runs(self._values(file, [counter])[counter], counter, file)
+
+    def _spanning(self, file: Path) -> list[str]:
+        """Columns that must have samples throughout a run: of channels that are not gappy or
+        held.
+        """
+        sparse = {*self.gappy, *(self.held.channels if self.held else ())}
+        columns = self._columns_of(file)
+        return list({column.column: None for name, column in columns.items() if name not in sparse})
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:
-    """Columns that could be declared as channels; none unless the data set's source is ``tabular``; raises `MissingError`, `DataError`."""
+    """Columns that could be declared as channels; none unless the data set's source is ``tabular``.
+
+    Raises `MissingError`, `DataError`.
+    """
     source = open_source(dataset)
     if type(source) is not TabularSource:
         return []
@@ -336,8 +356,8 @@ def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list
         if source.columns is None
         else [column.column for column in source.columns.values()]
     )
-    used = {"", source.options.runs, source.time and source.time.column, *channels}
-    return [name for name in column_names(table, source.layout) if name not in used]
+    used_columns = {"", source.options.runs, source.time and source.time.column, *channels}
+    return [name for name in column_names(table, source.layout) if name not in used_columns]
 
 
 SOURCE = TabularSource

@@ -1,4 +1,5 @@
-"""Source of tables of text as loggers write them: a row of units, empty cells of slow signals, marks of missing samples, clock times.
+"""Source of tables of text as loggers write them: a row of units, empty cells of slow signals,
+marks of missing samples, clock times.
 
 Otherwise as `vehest.sources.tabular`.
 """
@@ -47,9 +48,11 @@ class TextLogSource(TabularSource):
         missing = self.options.missing or ()
         self.layout = replace(self.layout, rows_below_names=below, missing=missing, clock=clock)
 
-    def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
-        """Columns without the rows that the data set leaves out, and without gaps that are short enough."""
-        values = super()._values(file, wanted)
+    def _values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
+        """Columns without the rows that the data set leaves out, and without gaps that are short
+        enough.
+        """
+        values = super()._values(file, selected)
         longest = self.options.bridge
         if longest is None:
             return values

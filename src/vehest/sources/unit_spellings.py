@@ -8,7 +8,8 @@ from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column
 
-# without blanks, dots, stars, brackets and case, sec as s -> the spelling of vehest, or a unit of no channel; ambiguous ones are left out
+# without blanks, dots, stars, brackets and case, sec as s -> the spelling of vehest, or a unit of
+# no channel; ambiguous ones are left out
 _SPELLINGS = {
     **dict.fromkeys(("m/s", "mps", "meter/s", "meters/s", "ms-1", "ms^-1"), "m/s"),
     **dict.fromkeys(("km/h", "kmh", "kph", "km/hr", "kmph", "kmh-1", "kmh^-1"), "km/h"),
@@ -66,13 +67,19 @@ _CASES = {
 
 
 def plain_unit(text: str) -> str | None:
-    """A unit as vehest spells it, ``another unit`` for one that no channel has; None for an unknown spelling or none."""
+    """A unit as vehest spells it, ``another unit`` for one that no channel has.
+
+    None for an unknown spelling or none.
+    """
     bare = re.sub(r"[\s·*.Â()\[\]]", "", text)  # Â: UTF-8 that was read as Latin-1
     return _CASES.get(bare) or _SPELLINGS.get(bare.lower().replace("sec", "s"))
 
 
-def require_unit(written: str, column: Column, si_unit: str, where: str, fix: str) -> None:
-    """Refuse a declared unit that contradicts the file's; unknown spellings pass; raises `DataError` where the units differ."""
+def require_unit(written: str, column: Column, si_unit: str, location: str, fix: str) -> None:
+    """Refuse a declared unit that contradicts the file's; unknown spellings pass.
+
+    Raises `DataError` where the units differ.
+    """
     plain = plain_unit(written)
     if plain is None or column.factor != 1.0:
         return
@@ -82,5 +89,6 @@ def require_unit(written: str, column: Column, si_unit: str, where: str, fix: st
     except DataError:  # of another quantity
         pass
     raise DataError(
-        f"{where} is in '{written}' by the file and in '{column.unit}' by conf/dataset; correct the unit there, or {fix}"
+        f"{location} is in '{written}' by the file and in '{column.unit}' by conf/dataset; "
+        f"correct the unit there, or {fix}"
     )

@@ -1,7 +1,9 @@
-"""Logs of Racelogic VBOX (.vbo): text in Latin-1, in sections; a recording a file, or one for each part between pauses.
+"""Logs of Racelogic VBOX (.vbo): text in Latin-1, in sections; a recording a file, or one for each
+part between pauses.
 
-The format as its files have it: ``[header]`` and ``[column names]`` name the columns, ``[channel units]`` the units of the last of them,
-``[comments]`` hold the logger's settings, ``[data]`` rows of numbers, whose time is a clock time, hhmmss.ss.
+The format as its files have it: ``[header]`` and ``[column names]`` name the columns, ``[channel
+units]`` the units of the last of them, ``[comments]`` hold the logger's settings, ``[data]`` rows
+of numbers, whose time is a clock time, hhmmss.ss.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from vehest.data.files import regular_file
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
-from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive
+from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive, SampledColumn
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
@@ -41,7 +43,7 @@ JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 FASTEST_STILL = 5.0
 LEAST_TURN = 0.05  # m/s, rad/s: below, slip at two wheels says nothing
-FEWEST = 100  # samples that turn
+MIN_TURNING_SAMPLES = 100  # samples that turn
 LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
 SLIP_CHECK = "slip_offsets"
 SLIP_AT_A_POINT = re.compile(
@@ -90,28 +92,39 @@ class VboSource(FileSource):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.columns = self._declared(self.options.channels)
+        self.columns = self._declared(self.options.channels, SampledColumn)
         self._require_pattern()
         self._log = lru_cache(1)(read_log)
 
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Rows between pauses."""
         require_files([file], self.name)
-        longest = self.options.max_gap
-        return (
-            super()._runs(file)
-            if longest is None
-            else timed_runs(self._log(file).seconds, longest, restarts=False)
+        max_gap = self.options.max_gap
+        if max_gap is None:
+            return super()._runs(file)
+        log = self._log(file)
+        require_columns(
+            file, list(log.columns), [column.column for column in self.columns.values()]
         )
+        columns = (
+            column.measured(log.columns[column.column])
+            for name, column in self.columns.items()
+            if name not in self.gappy
+        )
+        return timed_runs(log.seconds, max_gap, restarts=False, columns=columns)
 
     def _read(self, file: Path, run: int | None) -> Recording:
-        """Read a log; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
+        """Read a log.
+
+        Raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or
+        offset.
+        """
         log = self._log(file)
         rows = self._runs_of(file)[run]
         number = {} if run is None else {"run": run}
-        used = [column.column for column in self.columns.values()]
-        require_columns(file, list(log.columns), used)
-        if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (
+        used_columns = [column.column for column in self.columns.values()]
+        require_columns(file, list(log.columns), used_columns)
+        if any(map(SLIP_AT_A_POINT.fullmatch, used_columns)) and SLIP_CHECK not in (
             self.dataset.get("accept") or []
         ):
             require_slip_offsets(log, f"'{file}'")
@@ -119,19 +132,24 @@ class VboSource(FileSource):
         channels = {}
         for name, column in self.columns.items():
             unit = channel(name).unit
-            where = f"'{file}': column '{column.column}', for channel '{name}',"
-            require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
-            channels[name] = clock.align(
-                column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy
+            location = f"'{file}': column '{column.column}', for channel '{name}',"
+            require_unit(
+                log.units.get(column.column, ""), column, unit, location, "declare a factor"
             )
+            samples = column.measured(log.columns[column.column][rows])
+            if self.options.max_gap is not None and name not in self.gappy:
+                samples = bridged(samples, log.seconds[rows], self.options.max_gap)
+            channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)
         provenance = {"file": file.name, **number, **log.provenance}
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
 
 def read_log(file: Path) -> Log:
-    """Everything in a log; raises `DataError` where it is no such file, damaged, or more than the limits allow.
+    """Everything in a log; raises `DataError` where it is no such file, damaged, or more than the
+    limits allow.
 
-    A last row that is cut off, or comes more than half an interval late, as loggers write when they are stopped, is left out.
+    A last row that is cut off, or comes more than half an interval late, as loggers write when they
+    are stopped, is left out.
     """
     head, mark, rows = regular_file(file).read_bytes().partition(b"[data]")
     if not mark or len(head) > LONGEST_HEAD:
@@ -154,16 +172,16 @@ def read_log(file: Path) -> Log:
     seconds = _seconds(columns.pop("time"), file)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
-        columns = {name: own[:-1] for name, own in columns.items()}
+        columns = {name: units[:-1] for name, units in columns.items()}
         seconds = seconds[:-1]
 
-    own, modules = (
+    units, modules = (
         _of_last_columns(names, sections.get(title, ""))
         for title in ("channel units", "module information")
     )
-    found = OFFSETS.findall(sections.get("comments", ""))
+    entered = OFFSETS.findall(sections.get("comments", ""))
     offsets = {
-        point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found
+        point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in entered
     }
     provenance = {
         "created": printable(" ".join(first.partition("\n")[0].split()))[:80],
@@ -174,7 +192,7 @@ def read_log(file: Path) -> Log:
     }
     return Log(
         columns,
-        {name: unit for name, unit in {**UNITS, **own}.items() if unit},
+        {name: unit for name, unit in {**UNITS, **units}.items() if unit},
         seconds,
         modules,
         offsets,
@@ -183,7 +201,10 @@ def read_log(file: Path) -> Log:
 
 
 def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
-    """The lines of a section, each of one of the last columns, by its name; an empty line for none."""
+    """The lines of a section, each of one of the last columns, by its name.
+
+    An empty line for none.
+    """
     lines = [line.strip() for line in section.splitlines()[1:]]
     while lines and not lines[-1]:
         lines.pop()
@@ -194,31 +215,35 @@ def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
     )
 
 
-def require_slip_offsets(log: Log, where: str) -> None:
+def require_slip_offsets(log: Log, location: str) -> None:
     """See that slip at two wheels of one side differs by what the yaw rate makes between the axles.
 
-    The logger computes slip at points whose offsets from the antenna were entered as {lateral, longitudinal}. Where the two change places,
-    front and rear wheel of a side have the same longitudinal offset, and the same slip, which raises `DataError`.
+    The logger computes slip at points whose offsets from the antenna were entered as {lateral,
+    longitudinal}. Where the two change places, front and rear wheel of a side have the same
+    longitudinal offset, and the same slip, which raises `DataError`.
     """
-    needed = ("Slip_FL", "Slip_RL", "YawRate", "velocity")
-    if not {"FL", "RL"} <= set(log.offsets) or not set(needed) <= set(log.columns):
+    required = ("Slip_FL", "Slip_RL", "YawRate", "velocity")
+    if not {"FL", "RL"} <= set(log.offsets) or not set(required) <= set(log.columns):
         return
-    front, rear, yaw_rate, speed = (log.columns[name] for name in needed)
+    front, rear, yaw_rate, speed = (log.columns[name] for name in required)
     yaw_rate = np.radians(yaw_rate)
     speed = speed / KMH
     turns = (speed > FASTEST_STILL) & (np.abs(yaw_rate) > LEAST_TURN)
-    if turns.sum() < FEWEST:
+    if turns.sum() < MIN_TURNING_SAMPLES:
         return
-    apart = abs(log.offsets["FL"][1] - log.offsets["RL"][1])
+    axle_distance = abs(log.offsets["FL"][1] - log.offsets["RL"][1])
     expected = float(
-        np.sqrt(np.mean(np.square(np.degrees(apart * yaw_rate[turns] / speed[turns]))))
+        np.sqrt(np.mean(np.square(np.degrees(axle_distance * yaw_rate[turns] / speed[turns]))))
     )
-    found = float(np.sqrt(np.mean(np.square(front[turns] - rear[turns]))))
-    if found < LEAST_DIFFERENCE * expected:
+    measured = float(np.sqrt(np.mean(np.square(front[turns] - rear[turns]))))
+    if measured < LEAST_DIFFERENCE * expected:
         raise DataError(
-            f"{where}: slip at the front and the rear left wheel differs by {found:.2g}° (rms) where the yaw rate makes {expected:.2g}°: "
-            "the offsets of the logger, {lateral, longitudinal}, changed places, and Slip_COG, Slip_FL … hold for other points than it "
-            f"says; take Slip_Angle or Lat._Vel., which hold at the antenna, or accept: [{SLIP_CHECK}]"
+            f"{location}: slip at the front and the rear left wheel differs by {measured:.2g}° "
+            f"(rms) where the yaw rate makes {expected:.2g}°: "
+            "the offsets of the logger, {lateral, longitudinal}, changed places, and Slip_COG, "
+            "Slip_FL … hold for other points than it "
+            "says; take Slip_Angle or Lat._Vel., which hold at the antenna, or accept: "
+            f"[{SLIP_CHECK}]"
         )
 
 

@@ -1,6 +1,7 @@
 """Logs of a CAN bus: frames decoded by a DBC, signals of different rates brought to one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset, as is the DBC; one that says otherwise is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset, as is the
+DBC; one that says otherwise is refused.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class CanChannel(SignalChannel):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ChannelSignal:
     """The signal that becomes a channel."""
 
     message: Message  # that carries it
@@ -55,7 +56,11 @@ class Wanted:
 
 
 class CanSource(SignalSource):
-    """Logs, a recording each; their frames are decoded by the data set's ``dbc``, those of one ``bus`` where a log holds several."""
+    """Logs, a recording each.
+
+    Their frames are decoded by the data set's ``dbc``, those of one ``bus`` where a log holds
+    several.
+    """
 
     options_type = CanOptions
     options: CanOptions
@@ -65,7 +70,8 @@ class CanSource(SignalSource):
         super().__init__(dataset)
         if not self.options.dbc:
             raise ConfigurationError(
-                f"{self.where}: dbc must name the DBC file that describes the bus, for example dbc: ${{root}}/car.dbc"
+                f"{self.location}: dbc must name the DBC file that describes the bus, for example "
+                f"dbc: ${{root}}/car.dbc"
             )
         self.dbc = Path(self.options.dbc).expanduser()
 
@@ -74,52 +80,64 @@ class CanSource(SignalSource):
         require_files([self.dbc], self.name)
         return {**super().inputs(), self.dbc.name: self.dbc}
 
-    def wanted(self) -> tuple[Database, dict[str, Wanted]]:
-        """The DBC, and the signal of each channel; raises `MissingError` without DBC or package, `DataError` where a signal is missing."""
+    def signals_of_channels(self) -> tuple[Database, dict[str, ChannelSignal]]:
+        """The DBC, and the signal of each channel.
+
+        Raises `MissingError` without DBC or package, `DataError` where a signal is missing.
+        """
         require_files([self.dbc], self.name)
         database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
-        found = {}
+        by_channel = {}
         for name, declared in self.channels.items():
             message, signal = database.places[declared.column]
             invalid = (declared.invalid,) if isinstance(declared.invalid, int) else declared.invalid
             declared_invalid = frozenset(message.physical(signal, raw) for raw in invalid)
-            found[name] = Wanted(
+            by_channel[name] = ChannelSignal(
                 message,
                 signal,
                 declared_invalid | message.not_measured(signal),
                 message.reserved(signal),
             )
-        return database, found
+        return database, by_channel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        database, wanted = self.wanted()
+        database, by_channel = self.signals_of_channels()
         bus = self.options.bus
-        stamps, values = ({name: array("d") for name in wanted} for _ in range(2))
-        for frame, found in decoded(read_frames(file, database.messages), database, wanted, bus):
-            for name, value in found.items():
+        stamps, values = ({name: array("d") for name in by_channel} for _ in range(2))
+        for frame, samples in decoded(
+            read_frames(file, database.messages), database, by_channel, bus
+        ):
+            for name, value in samples.items():
                 stamps[name].append(frame.timestamp)
                 values[name].append(value)
         signals = {}
         rates = {}
-        for name, one in wanted.items():
+        for name, described in by_channel.items():
             if len(stamps[name]) < 2:
-                raise DataError(never_occurs(file, name, one, len(stamps[name]), bus))
+                raise DataError(never_occurs(file, name, described, len(stamps[name]), bus))
             times = np.array(stamps[name])
-            where = f"'{file}': message '{one.message.name}', which carries '{one.signal}',"
-            require_clock(times, where, "where two buses carry it, say which by bus: …")
-            origin = f"message '{one.message.name}'"
-            signals[name] = Signal(
-                origin, times, np.array(values[name]), one.message.units[one.signal]
+            location = (
+                f"'{file}': message '{described.message.name}', which carries '{described.signal}',"
             )
-            rates[one.message.name] = round(signals[name].rate_hz, 3)
+            require_clock(times, location, "where two buses carry it, say which by bus: …")
+            origin = f"message '{described.message.name}'"
+            signals[name] = Signal(
+                origin, times, np.array(values[name]), described.message.units[described.signal]
+            )
+            rates[described.message.name] = round(signals[name].rate_hz, 3)
         return signals, {"dbc": self.dbc.name, "messages": rates}
 
 
 def decoded(
-    frames: Frames, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
+    frames: Frames,
+    database: Database,
+    by_channel: Mapping[str, ChannelSignal],
+    bus: int | str | None = None,
 ) -> Iterator[tuple[Any, dict[str, float]]]:
-    """Frames of a log with a wanted message, each with its values, channel -> value in the DBC's unit; NaN: invalid; raises `DataError`."""
-    channels_of = channels_by_message(wanted)
+    """Frames of a log with a wanted message, each with its values, channel -> value in the DBC's
+    unit; NaN: invalid; raises `DataError`.
+    """
+    channels_of = channels_by_message(by_channel)
     for frame in frames:
         message = database.messages.get((frame.arbitration_id, frame.is_extended_id))
         if message is None or not is_on(frame, bus):
@@ -128,50 +146,57 @@ def decoded(
             values = message.decode(frame.data)
         except DataError as error:
             raise DataError(
-                f"'{frames.file}', at {frame.timestamp:.6f} s: {error}; is the file truncated, or the DBC another car's?"
+                f"'{frames.file}', at {frame.timestamp:.6f} s: {error}; is the file truncated, or "
+                "the DBC another car's?"
             ) from None
-        yield frame, channel_values(values, channels_of[message.name], wanted)
+        yield frame, channel_values(values, channels_of[message.name], by_channel)
 
 
-def channels_by_message(wanted: Mapping[str, Wanted]) -> dict[str, list[str]]:
+def channels_by_message(by_channel: Mapping[str, ChannelSignal]) -> dict[str, list[str]]:
     """Message -> the channels that its signals become."""
-    found: dict[str, list[str]] = {}
-    for name, one in wanted.items():
-        found.setdefault(one.message.name, []).append(name)
-    return found
+    channels: dict[str, list[str]] = {}
+    for name, signal in by_channel.items():
+        channels.setdefault(signal.message.name, []).append(name)
+    return channels
 
 
 def channel_values(
-    values: Mapping[str, float], channels: list[str], wanted: Mapping[str, Wanted]
+    values: Mapping[str, float], channels: list[str], by_channel: Mapping[str, ChannelSignal]
 ) -> dict[str, float]:
     """Values of the channels that a frame carries; NaN where it says that nothing was measured."""
-    found = {
-        name: values[wanted[name].signal] for name in channels if wanted[name].signal in values
+    measured = {
+        name: values[by_channel[name].signal]
+        for name in channels
+        if by_channel[name].signal in values
     }
     return {
-        name: value if wanted[name].is_measured(value) else math.nan
-        for name, value in found.items()
+        name: value if by_channel[name].is_measured(value) else math.nan
+        for name, value in measured.items()
     }
 
 
 def is_on(frame: Any, bus: int | str | None) -> bool:
-    """Whether a frame was on a bus, by its name or its number, which logs count from 1 and python-can from 0."""
+    """Whether a frame was on a bus, by its name or its number, which logs count from 1 and python-
+    can from 0.
+    """
     return bus is None or frame.channel == (
         bus - 1 if isinstance(bus, int) and not isinstance(bus, bool) else bus
     )
 
 
 def never_occurs(
-    file: Path, channel: str, wanted: Wanted, count: int, bus: int | str | None
+    file: Path, channel: str, signal: ChannelSignal, count: int, bus: int | str | None
 ) -> str:
     """Error text for a signal that a log does not hold."""
-    message = wanted.message
+    message = signal.message
     often = "occurs once only" if count else "never occurs"
     on = "" if bus is None else f" on bus {bus}"
     kind = "extended identifier" if message.described.is_extended_frame else "identifier"
     return (
-        f"'{file}': signal '{wanted.signal}' for channel '{channel}' {often}{on}: message '{message.name}' carries it, with the {kind} "
-        f"{message.described.frame_id:#x}; leave the channel out, or correct dbc, bus or the map of channels"
+        f"'{file}': signal '{signal.signal}' for channel '{channel}' {often}{on}: message "
+        f"'{message.name}' carries it, with the {kind} "
+        f"{message.described.frame_id:#x}; leave the channel out, or correct dbc, bus or the map "
+        "of channels"
     )
 
 

@@ -1,6 +1,7 @@
 """Signals of a DBC file, by cantools.
 
-DBC -> lengths of messages and signals, looked at since cantools makes lists as long -> cantools -> wanted signals with their multiplexers
+DBC -> lengths of messages and signals, looked at since cantools makes lists as long -> cantools ->
+wanted signals with their multiplexers
 """
 
 from __future__ import annotations
@@ -45,13 +46,16 @@ class Message:
         return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
-        """Wanted signals that a frame carries, in the DBC's unit, without those that its multiplexer leaves out; raises `DataError`."""
+        """Wanted signals that a frame carries, in the DBC's unit, without those that its
+        multiplexer leaves out; raises `DataError`.
+        """
         length = self.described.length
         if len(data) < length:
             raise DataError(
-                f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says"
+                f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that "
+                "the DBC says"
             )
-        found: dict[str, float] = {}
+        decoded: dict[str, float] = {}
         frame = bytes(data[:length])
         for coder in self.coders:
             try:
@@ -60,8 +64,8 @@ class Message:
                 Exception
             ):  # of cantools, for a multiplexer's value that the signal does not go with
                 continue
-            found |= {name: float(value) for name, value in values.items() if name in self.units}
-        return found
+            decoded |= {name: float(value) for name, value in values.items() if name in self.units}
+        return decoded
 
     def physical(self, signal: str, raw: int) -> float:
         """A raw value of a signal in the unit of the DBC."""
@@ -114,11 +118,14 @@ class Database:
     file: Path
     messages: Mapping[tuple[int, bool], Message]  # by identifier and whether it is extended
     places: Mapping[str, tuple[Message, str]]  # wanted name -> its message and signal
-    taken: frozenset[tuple[int, bool]]  # identifiers of all messages in the file
+    identifiers: frozenset[tuple[int, bool]]  # identifiers of all messages in the file
 
 
 def read_dbc(file: Path) -> list[Any]:
-    """All messages of a DBC, as cantools holds them; raises `MissingError` without file or cantools, `DataError` where it is damaged."""
+    """All messages of a DBC, as cantools holds them.
+
+    Raises `MissingError` without file or cantools, `DataError` where it is damaged.
+    """
     size = regular_file(file).stat().st_size
     check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
     require_package("cantools", "bus", "reading CAN")
@@ -129,9 +136,10 @@ def read_dbc(file: Path) -> list[Any]:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:  # "°" and umlauts of the usual code page are no UTF-8
         text = raw.decode("cp1252", errors="replace")
-    if found := _TOO_LONG.search(text):
+    if impossible := _TOO_LONG.search(text):
         raise DataError(
-            f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}"
+            f"'{file}' declares a message or signal of impossible length: "
+            f"{printable(' '.join(impossible[0].split())[:80])}"
         )
     try:
         messages = [
@@ -148,21 +156,26 @@ def read_dbc(file: Path) -> list[Any]:
     return messages
 
 
-def read_database(file: Path, wanted: Sequence[str]) -> Database:
-    """What a DBC says of wanted signals; raises `MissingError` without file or cantools, `DataError` where a signal is unusable."""
+def read_database(file: Path, selected: Sequence[str]) -> Database:
+    """What a DBC says of wanted signals.
+
+    Raises `MissingError` without file or cantools, `DataError` where a signal is unusable.
+    """
     described = read_dbc(file)
-    known: dict[str, list[tuple[Any, str]]] = {}
+    places_of: dict[str, list[tuple[Any, str]]] = {}
     for message in described:
         for signal in message.signals:
             for name in (f"{message.name}.{signal.name}", signal.name):
-                known.setdefault(name, []).append((message, signal.name))
-    found = {name: _only_one(known, name, file) for name in wanted}
+                places_of.setdefault(name, []).append((message, signal.name))
+    chosen = {name: _only_place(places_of, name, file) for name in selected}
     messages: dict[tuple[int, bool], Message] = {}
-    for message, _ in found.values():
+    for message, _ in chosen.values():
         key = _identifier(message)
         if key not in messages:
             names = list(
-                dict.fromkeys(signal for other, signal in found.values() if other is message)
+                dict.fromkeys(
+                    signal for candidate, signal in chosen.values() if candidate is message
+                )
             )
             messages[key] = _message(message, names, file)
         elif messages[key].described is not message:
@@ -170,7 +183,7 @@ def read_database(file: Path, wanted: Sequence[str]) -> Database:
                 f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one"
             )
     places = {
-        name: (messages[_identifier(message)], signal) for name, (message, signal) in found.items()
+        name: (messages[_identifier(message)], signal) for name, (message, signal) in chosen.items()
     }
     return Database(file, messages, places, frozenset(map(_identifier, described)))
 
@@ -179,39 +192,40 @@ def _identifier(message: Any) -> tuple[int, bool]:
     return message.frame_id, message.is_extended_frame
 
 
-def _only_one(
-    known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path
+def _only_place(
+    places_of: Mapping[str, Sequence[tuple[Any, str]]], name: str, file: Path
 ) -> tuple[Any, str]:
-    found = known.get(wanted, ())
-    if len(found) > 1:
-        names = ", ".join(f"{message.name}.{signal}" for message, signal in found[:8])
+    places = places_of.get(name, ())
+    if len(places) > 1:
+        names = ", ".join(f"{message.name}.{signal}" for message, signal in places[:8])
         raise DataError(
-            f"'{file}': signal '{wanted}' stands in several messages; write one of {names}"
+            f"'{file}': signal '{name}' stands in several messages; write one of {names}"
         )
-    if not found:
-        lower = {name.lower(): name for name in list(known)[:COMPARED]}
+    if not places:
+        lower = {name.lower(): name for name in list(places_of)[:COMPARED]}
         near = ", ".join(
-            lower[close] for close in difflib.get_close_matches(wanted.lower(), lower, n=3)
+            lower[close] for close in difflib.get_close_matches(name.lower(), lower, n=3)
         )
-        raise DataError(f"'{file}' has no signal '{wanted}'{f' (near it: {near})' if near else ''}")
-    return found[0]
+        raise DataError(f"'{file}' has no signal '{name}'{f' (near it: {near})' if near else ''}")
+    return places[0]
 
 
-def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
+def _message(message: Any, selected: Sequence[str], file: Path) -> Message:
     """A message with its wanted signals and their multiplexers alone."""
     from cantools.database.can import Message as Coder
 
-    where = f"'{file}': message '{message.name}'"
+    location = f"'{file}': message '{message.name}'"
     signals = {signal.name: signal for signal in message.signals}
-    chains = [_chain(signals, name, where) for name in wanted]
+    chains = [_chain(signals, name, location) for name in selected]
     plain = [chain[0] for chain in chains if len(chain) == 1]
     coders = []
     for names in filter(None, [plain, *(chain for chain in chains if len(chain) > 1)]):
         parts = [signals[name] for name in names]
-        for one in parts:
-            if not 0.0 < abs(one.scale) < 1e30 or not abs(one.offset) < 1e30:
+        for signal in parts:
+            if not 0.0 < abs(signal.scale) < 1e30 or not abs(signal.offset) < 1e30:
                 raise DataError(
-                    f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; correct the DBC"
+                    f"{location}: signal '{signal.name}' has the scale {signal.scale} and offset "
+                    f"{signal.offset}; correct the DBC"
                 )
         try:
             coders.append(
@@ -224,18 +238,20 @@ def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
                 )
             )
         except Exception as error:  # of cantools
-            raise DataError(f"{where} cannot be decoded ({printable(first_line(error))})") from None
-    return Message(message, {name: signals[name].unit or "" for name in wanted}, coders)
+            raise DataError(
+                f"{location} cannot be decoded ({printable(first_line(error))})"
+            ) from None
+    return Message(message, {name: signals[name].unit or "" for name in selected}, coders)
 
 
-def _chain(signals: Mapping[str, Any], wanted: str, where: str) -> list[str]:
+def _chain(signals: Mapping[str, Any], signal: str, location: str) -> list[str]:
     """A signal and the multiplexers that decide whether a frame carries it, the outermost first."""
-    chain = [wanted]
+    chain = [signal]
     while signals[chain[0]].multiplexer_ids is not None:
         above = signals[chain[0]].multiplexer_signal
         if above not in signals or above in chain:
             raise DataError(
-                f"{where}: nothing says when frames carry the multiplexed signal '{chain[0]}'"
+                f"{location}: nothing says when frames carry the multiplexed signal '{chain[0]}'"
             )
         chain.insert(0, above)
     return chain

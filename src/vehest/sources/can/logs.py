@@ -17,7 +17,10 @@ SUFFIXES = (".asc", ".blf", ".log")
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a log in their order, without error frames and remote frames; iterated over as messages of python-can."""
+    """Frames of a log in their order, without error frames and remote frames.
+
+    Iterated over as messages of python-can.
+    """
 
     file: Path
     arrays: Arrays  # as `vehest.sources.readers.can_logs.read_frames` returns them
@@ -51,13 +54,16 @@ class Frames:
         return float(self.arrays["time"].max())
 
 
-def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) -> Frames:
-    """Read the frames of a log whose (identifier, extended) is wanted; None for all; raises `MissingError` or `DataError`."""
+def read_frames(file: Path, selected: Collection[tuple[int, bool]] | None = None) -> Frames:
+    """Read the frames of a log whose (identifier, extended) is wanted; None for all.
+
+    Raises `MissingError` or `DataError`.
+    """
     if regular_file(file).suffix.lower() not in SUFFIXES:
         raise DataError(
             f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}"
         )
     require_package("can", "bus", "reading CAN")
-    request = None if wanted is None else [list(one) for one in wanted]
-    reading = read_limited("vehest.sources.readers.can_logs:read_frames", file, wanted=request)
+    request = None if selected is None else [list(identifier) for identifier in selected]
+    reading = read_limited("vehest.sources.readers.can_logs:read_frames", file, selected=request)
     return Frames(file, reading.arrays, reading.summary["buses"])

@@ -1,1 +1,4 @@
-"""Readers of formats by their libraries; every function here runs in the limited process of `vehest.sources.limited`."""
+"""Readers of formats by their libraries.
+
+Every function here runs in the limited process of `vehest.sources.limited`.
+"""

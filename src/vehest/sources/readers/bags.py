@@ -44,11 +44,13 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 def read_topics(
     bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All messages of topics, in the order in which the bag received them; raises `ConfigurationError` or `DataError`.
+    """All messages of topics, in the order in which the bag received them; raises
+    `ConfigurationError` or `DataError`.
 
-    Of each topic are given name, message type and paths of numeric fields; ``layouts`` are definitions of types that ROS 2 Humble does not
-    ship. Arrays are ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, and ``TOPIC.FIELD``; the
-    summary has the start of the bag.
+    Of each topic are given name, message type and paths of numeric fields; ``layouts`` are
+    definitions of types that ROS 2 Humble does not ship. Arrays are ``TOPIC@received`` [ns of unix
+    time], ``TOPIC@stamped`` [ns] where messages have headers, and ``TOPIC.FIELD``; the summary has
+    the start of the bag.
     """
     types = _types(layouts)
     with _opened(bag) as reader:
@@ -56,7 +58,8 @@ def read_topics(
             arrays = _read(bag, reader, types, topics)
         except KeyError as error:  # of rosbags' types
             raise ConfigurationError(
-                f"message type {error} is neither a standard one nor declared; give its layout in messages"
+                f"message type {error} is neither a standard one nor declared; give its layout in "
+                "messages"
             ) from None
         if not 0 <= reader.start_time < LATEST:
             raise DataError(
@@ -71,7 +74,7 @@ def survey_topics(
     """All topics whose messages are of ROS's own types, with their plain numbers."""
     types = _types({})
     arrays = Arrays()
-    found = []
+    surveyed = []
     skipped = []
     with _opened(bag) as reader:
         topics = {
@@ -89,15 +92,16 @@ def survey_topics(
             ]
             if not 0 < len(fields) <= most_fields:
                 skipped.append(
-                    f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own of plain numbers"
+                    f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own "
+                    "of plain numbers"
                 )
                 continue
             try:
                 arrays |= _read(bag, reader, types, [(name, kind, fields)])
-                found.append([name, kind, fields])
+                surveyed.append([name, kind, fields])
             except DataError as error:
                 skipped.append(str(error).removeprefix(f"'{bag}': "))
-    return arrays, {"topics": found, "skipped": skipped}
+    return arrays, {"topics": surveyed, "skipped": skipped}
 
 
 class _UriPath(type(Path())):  # type: ignore[misc]
@@ -125,7 +129,9 @@ def _opened(bag: Path) -> Reader:
 
 
 def _types(layouts: Mapping[str, str]) -> Any:
-    """Standard message types and the declared ones: rosbags makes code of these, never of a bag's own definitions."""
+    """Standard message types and the declared ones: rosbags makes code of these, never of a bag's
+    own definitions.
+    """
     types = get_typestore(Stores.ROS2_HUMBLE)
     declared = {}
     for name, text in layouts.items():
@@ -133,7 +139,8 @@ def _types(layouts: Mapping[str, str]) -> Any:
             declared.update(get_types_from_msg(text, name))
         except Exception as error:  # of rosbags' parser, of any kind
             raise ConfigurationError(
-                f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}"
+                f"the layout of message type '{name}' cannot be read: "
+                f"{' '.join(str(error).split())[:160]}"
             ) from None
     try:
         types.register(declared)
@@ -169,7 +176,8 @@ def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any
             inner = {part: detail[0]}
         if part not in inner:
             raise ConfigurationError(
-                f"topic '{topic}': '{kind}' has no field '{path}': '{part}' is none of: {', '.join(inner)}"
+                f"topic '{topic}': '{kind}' has no field '{path}': '{part}' is none of: "
+                f"{', '.join(inner)}"
             )
         node, detail = inner[part]
     if node != Nodetype.BASE or detail[0] in TEXTS:
@@ -184,7 +192,7 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
     takers: dict[str, list[tuple[Callable[[Any], None], Callable[[Any], Any]]]] = {}
     counts = {}
     keys = {}
-    wanted = []
+    selected = []
     for name, kind, paths in topics:
         getters = {f"{name}.{path}": _getter(types, name, kind, path) for path in paths}
         if dict(types.fielddefs[kind][1]).get("header") == (Nodetype.NAME, "std_msgs/msg/Header"):
@@ -197,13 +205,13 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
             for key in keys[name]
         }
         takers[name] = [(columns[key].append, getter) for key, getter in getters.items()]
-        held = _connections(bag, reader, types, name, kind)
-        counts[name] = sum(connection.msgcount for connection in held)
+        connections = _connections(bag, reader, types, name, kind)
+        counts[name] = sum(connection.msgcount for connection in connections)
         check_limit(
             "samples", counts[name], f"'{bag}': topic '{name}' holds {counts[name]} messages"
         )
-        wanted += held
-    for connection, time, raw in reader.messages(wanted):
+        selected += connections
+    for connection, time, raw in reader.messages(selected):
         message: Any = types.deserialize_cdr(raw, connection.msgtype)
         columns[f"{connection.topic}@received"].append(time)
         for take, getter in takers[connection.topic]:
@@ -213,11 +221,13 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
         received = arrays[f"{name}@received"]
         if len(received) != count:
             raise DataError(
-                f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {count}; it is truncated"
+                f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {count}; "
+                "it is truncated"
             )
         if received.min() < 0 or received.max() >= LATEST:
             raise DataError(
-                f"'{bag}': topic '{name}': a message was received at no time there is; the bag is damaged"
+                f"'{bag}': topic '{name}': a message was received at no time there is; the bag is "
+                "damaged"
             )
         order = np.argsort(received, kind="stable")
         arrays |= {key: arrays[key][order] for key in keys[name]}
@@ -226,8 +236,8 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
 
 def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
     """What the bag holds of a topic; its type and layout are those that are declared."""
-    held = [connection for connection in reader.connections if connection.topic == name]
-    if not any(connection.msgcount for connection in held):
+    connections = [connection for connection in reader.connections if connection.topic == name]
+    if not any(connection.msgcount for connection in connections):
         topics = printable(
             ", ".join(
                 sorted(
@@ -236,22 +246,25 @@ def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) ->
             )
         )
         raise DataError(
-            f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics in the configuration"
+            f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics "
+            "in the configuration"
         )
-    for connection in held:
+    for connection in connections:
         if connection.msgtype != kind:
             raise DataError(
-                f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared"
+                f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' "
+                "as declared"
             )
-        for found, (_, fields) in _definitions(connection).items():
-            declared = types.fielddefs.get(found, ((), fields))[1]
+        for message_type, (_, fields) in _definitions(connection).items():
+            declared = types.fielddefs.get(message_type, ((), fields))[1]
             if [(field.lower(), node) for field, node in fields] != [
                 (field.lower(), node) for field, node in declared
             ]:
                 raise DataError(
-                    f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages"
+                    f"'{bag}': topic '{name}': the bag's own layout of '{message_type}' is not "
+                    "the declared one; correct messages"
                 )
-    return held
+    return connections
 
 
 def _definitions(connection: Connection) -> Mapping[str, Any]:

@@ -20,18 +20,24 @@ LATEST = 1e11  # s
 
 
 def read_frames(
-    file: Path, wanted: Collection[Sequence[Any]] | None
+    file: Path, selected: Collection[Sequence[Any]] | None
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Frames of a log in their order, without error frames and remote frames; raises `DataError` where there is none, or too many.
+    """Frames of a log in their order, without error frames and remote frames; raises `DataError`
+    where there is none, or too many.
 
-    Returns:
-        ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length`` [bytes] and ``bus`` (number in
-        ``buses`` of the summary) of each frame, and ``data``, the bytes of all.
+    Returns
+    -------
+    arrays : dict
+        ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length``
+        [bytes] and ``bus`` (number in ``buses`` of the summary) of each frame, and ``data``, the
+        bytes of all.
+    summary : dict
+        ``buses``, their names or numbers.
     """
-    kept = (
+    identifiers_read = (
         None
-        if wanted is None
-        else {(int(identifier), bool(extended)) for identifier, extended in wanted}
+        if selected is None
+        else {(int(identifier), bool(extended)) for identifier, extended in selected}
     )
     times = array("d")
     identifiers = array("L")
@@ -43,7 +49,8 @@ def read_frames(
     with _opened(file) as reader:
         if isinstance(reader, BLFReader) and reader.file_size > file.stat().st_size:
             raise DataError(
-                f"'{file}' is truncated: it says that it is {reader.file_size} bytes long; fetch it again"
+                f"'{file}' is truncated: it says that it is {reader.file_size} bytes long; fetch "
+                "it again"
             )
         for frame in reader:
             count += 1
@@ -52,9 +59,13 @@ def read_frames(
                 continue
             if not abs(frame.timestamp) < LATEST:
                 raise DataError(
-                    f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is damaged"
+                    f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is "
+                    "damaged"
                 )
-            if kept is not None and (frame.arbitration_id, frame.is_extended_id) not in kept:
+            if (
+                identifiers_read is not None
+                and (frame.arbitration_id, frame.is_extended_id) not in identifiers_read
+            ):
                 continue
             times.append(frame.timestamp)
             identifiers.append(frame.arbitration_id)

@@ -1,4 +1,5 @@
-"""Signals of ASAM MDF 2, 3 and 4 by asammdf. A file that holds a formula is refused before any sample is read.
+"""Signals of ASAM MDF 2, 3 and 4 by asammdf. A file that holds a formula is refused before any
+sample is read.
 
 file -> groups and channels -> conversions checked -> raw samples -> physical values and times
 """
@@ -36,7 +37,9 @@ EVALUATED = {
     },
     v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_ALG},
 }
-"""Conversions that refuse a file: formulas, and those of version 3 that readers compute in contradicting ways."""
+"""Conversions that refuse a file: formulas, and those of version 3 that readers compute in
+contradicting ways.
+"""
 RANGES = {
     v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_TABX, v3.CONVERSION_TYPE_RTABX},
     v4_blocks.ChannelConversion: {
@@ -45,27 +48,32 @@ RANGES = {
         v4.CONVERSION_TYPE_RTABX,
     },
 }
-"""Conversions for which whole numbers differ from real ones: they belong to both ends of a range."""
+"""Conversions for which whole numbers differ from real ones: they belong to both ends of a range.
+"""
 OPTIONS: Any = {"process_bus_logging": False}  # which would read databases that are attached
 COMPARED = 10_000  # names that a misspelt one is compared with
 BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 
 
 def read(
-    file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None
+    file: Path, requests: Mapping[str, tuple[str, int | str | None]] | None
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Signals with the times of their groups; raises `DataError` for a formula, too much, or a wanted signal that cannot be read.
+    """Signals with the times of their groups; raises `DataError` for a formula, too much, or a
+    wanted signal that cannot be read.
 
-    ``wanted``: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal of numbers
-    whose group has times. Arrays are ``KEY`` (physical values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; the
-    summary has ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped`` (reasons).
+    ``requests``: key -> name of a signal, and number or name of its group where the name occurs in
+    several; None for every signal of numbers whose group has times. Arrays are ``KEY`` (physical
+    values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; the summary has
+    ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped``
+    (reasons).
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
         head = stream.read(64)
         if not head.startswith((FINISHED, UNFINISHED)):
             raise DataError(
-                f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?"
+                f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another "
+                "format, or compressed?"
             )
         stream.seek(0)
         content = (
@@ -80,12 +88,12 @@ def read(
             ) from None
         _refuse_formulas(measurement, file)
         places = (
-            _located(measurement, wanted, file)
-            if wanted is not None
+            _located(measurement, requests, file)
+            if requests is not None
             else _numbered(measurement, file)
         )
         arrays: Arrays = {}
-        skipped: list[str] | None = [] if wanted is None else None
+        skipped: list[str] | None = [] if requests is None else None
         for group in dict.fromkeys(group for group, _ in places.values()):
             with _or_skip(skipped, file):
                 arrays |= _group_of(
@@ -120,9 +128,11 @@ def with_signals(
     seconds: list[float],
     signals: list[tuple[str, list[float], str, str, dict[str, str]]],
 ) -> tuple[Arrays, dict[str, Any]]:
-    """``content``: bytes of a measurement of version 4 with a group of signals more; raises `DataError` where it is of another version.
+    """``content``: bytes of a measurement of version 4 with a group of signals more; raises
+    `DataError` where it is of another version.
 
-    ``seconds`` are times of the new group [s], ``signals`` name, values, unit, comment and, where values are codes, the text of each.
+    ``seconds`` are times of the new group [s], ``signals`` name, values, unit, comment and, where
+    values are codes, the text of each.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -130,14 +140,15 @@ def with_signals(
         new = io.BytesIO()
         if measurement.version < "4":
             raise DataError(
-                f"'{file}' is of MDF {measurement.version}, which gets no channels; write a .mat file, or save the log as MDF 4"
+                f"'{file}' is of MDF {measurement.version}, which gets no channels; write a .mat "
+                "file, or save the log as MDF 4"
             )
         group = []
         for name, values, unit, comment, texts in signals:
             table: dict[str, object] = {
-                key: own
+                key: entry
                 for k, (code, text) in enumerate(texts.items())
-                for key, own in ((f"val_{k}", int(code)), (f"text_{k}", text))
+                for key, entry in ((f"val_{k}", int(code)), (f"text_{k}", text))
             }
             samples = np.array(values, dtype=np.int32 if texts else np.float64)
             group.append(
@@ -160,7 +171,9 @@ def _or_skip(skipped: list[str] | None, file: Path) -> Iterator[None]:
 
 
 def forbid_evaluation() -> None:
-    """Replace the evaluators of formulas: rational conversions then take asammdf's plain arithmetic, formulas end in an error."""
+    """Replace the evaluators of formulas: rational conversions then take asammdf's plain
+    arithmetic, formulas end in an error.
+    """
 
     def refuse_evaluation(*_: Any, **__: Any) -> NoReturn:
         raise TypeError("formulas are not evaluated")
@@ -178,20 +191,21 @@ def _refuse_formulas(measurement: Any, file: Path) -> None:
             for conversion in _conversions(channel.conversion):
                 if conversion.conversion_type in EVALUATED[type(conversion)]:
                     raise DataError(
-                        f"'{file}': signal '{_shown(channel.name)}' has a conversion by a formula, which is not evaluated; "
+                        f"'{file}': signal '{_short_name(channel.name)}' has a conversion by a "
+                        "formula, which is not evaluated; "
                         f"export it as plain numbers, or with a linear conversion"
                     )
 
 
 def _conversions(conversion: Any) -> Iterator[Any]:
     waiting = [conversion]
-    seen = set()
+    visited = set()
     while waiting:
-        found = waiting.pop()
-        if type(found) in EVALUATED and id(found) not in seen:
-            seen.add(id(found))
-            yield found
-            waiting += (found.referenced_blocks or {}).values()
+        block = waiting.pop()
+        if type(block) in EVALUATED and id(block) not in visited:
+            visited.add(id(block))
+            yield block
+            waiting += (block.referenced_blocks or {}).values()
 
 
 def _numbered(measurement: Any, file: Path) -> dict[str, tuple[int, int]]:
@@ -214,7 +228,7 @@ def _channels(measurement: Any) -> Iterator[tuple[int, int, Any]]:
 
 
 def _located(
-    measurement: Any, wanted: Mapping[str, tuple[str, int | str | None]], file: Path
+    measurement: Any, requests: Mapping[str, tuple[str, int | str | None]], file: Path
 ) -> dict[str, tuple[int, int]]:
     places: dict[str, list[tuple[int, int]]] = {}
     for g, index, channel in _channels(measurement):
@@ -223,70 +237,78 @@ def _located(
         ):
             places.setdefault(name, []).append((g, index))
     return {
-        key: _located_one(measurement, places, name, group, file)
-        for key, (name, group) in wanted.items()
+        key: _place_of(measurement, places, name, group, file)
+        for key, (name, group) in requests.items()
     }
 
 
-def _located_one(
+def _place_of(
     measurement: Any,
     places: Mapping[str, list[tuple[int, int]]],
     name: str,
     group: int | str | None,
     file: Path,
 ) -> tuple[int, int]:
-    found = places.get(name, [])
-    if not found:
+    candidates = places.get(name, [])
+    if not candidates:
         raise DataError(
-            f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in conf/dataset"
+            f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in "
+            "conf/dataset"
         )
-    kept = [
+    matching = [
         place
-        for place in found
+        for place in candidates
         if group is None or group in (place[0], _group_name(measurement, place[0]))
     ]
-    titles = list(dict.fromkeys(_title(measurement, g) for g, _ in kept or found))
+    titles = list(dict.fromkeys(_title(measurement, g) for g, _ in matching or candidates))
     groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
-    if not kept:
+    if not matching:
         raise DataError(
             f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group"
         )
-    if len(kept) > 1:
+    if len(matching) > 1:
         advice = (
             "say which by number or name with group: …" if len(titles) > 1 else "rename all but one"
         )
         raise DataError(
-            f"'{file}': signal '{name}' stands {len(kept)} times, in group {groups}; {advice}"
+            f"'{file}': signal '{name}' stands {len(matching)} times, in group {groups}; {advice}"
         )
-    return kept[0]
+    return matching[0]
 
 
 def _near(places: Mapping[str, object], name: str) -> str:
-    names = {known: known.lower() for known in list(places)[:COMPARED] if len(known) < 200}
+    names = {name: name.lower() for name in list(places)[:COMPARED] if len(name) < 200}
     close = difflib.get_close_matches(name.lower(), list(names.values()), n=3, cutoff=0.6)
     if close:
         return "near it: " + ", ".join(
-            _shown(known) for known, lower in names.items() if lower in close
+            _short_name(name) for name, lower in names.items() if lower in close
         )
-    if any(known.startswith(BUS_FRAMES) for known in names):
-        return "it holds undecoded frames of a bus: decode them with their description, for example by asammdf's extract_bus_logging"
+    if any(name.startswith(BUS_FRAMES) for name in names):
+        return (
+            "it holds undecoded frames of a bus: decode them with their description, for "
+            "example by asammdf's extract_bus_logging"
+        )
     return f"it has {len(places)} signals"
 
 
 def _group_of(
-    measurement: Any, group: int, own: Mapping[str, int], file: Path, skipped: list[str] | None
+    measurement: Any, group: int, indices: Mapping[str, int], file: Path, skipped: list[str] | None
 ) -> Arrays:
-    """Times of a group and its signals; a signal that cannot be read is an error, or a line in ``skipped``."""
+    """Times of a group and its signals.
+
+    A signal that cannot be read is an error, or a line in ``skipped``.
+    """
     title = _title(measurement, group)
     described = measurement.groups[group]
-    first = _shown(described.channels[next(iter(own.values()))].name)
+    first = _short_name(described.channels[next(iter(indices.values()))].name)
     clock = measurement.masters_db.get(group)
     if (
         clock is None
         or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME
     ):
         raise DataError(
-            f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no master channel of time"
+            f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no "
+            "master channel of time"
         )
     count = described.channel_group.cycles_nr
     check_limit("samples", count, f"'{file}': group {title} says that it holds {count} samples")
@@ -298,42 +320,42 @@ def _group_of(
         for block in described.get_data_blocks()
     )
     if present < count * record:
-        held = f"holds {present // record} samples, its header says {count}"
+        fault = f"holds {present // record} samples, its header says {count}"
         raise DataError(
-            f"'{file}': signal '{first}' of group {title} {held}; the file is truncated or damaged"
+            f"'{file}': signal '{first}' of group {title} {fault}; the file is truncated or damaged"
         )
     read: dict[str, int] = {}
-    where = {
-        key: f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}"
-        for key, index in {"": clock, **own}.items()
+    location_of = {
+        key: f"'{file}': signal '{_short_name(described.channels[index].name)}' of group {title}"
+        for key, index in {"": clock, **indices}.items()
     }
-    for key, index in {"": clock, **own}.items():
+    for key, index in {"": clock, **indices}.items():
         with _or_skip(skipped if key else None, file):
-            _require_number(measurement, group, index, where[key])
+            _require_number(measurement, group, index, location_of[key])
             read[key] = index
     arrays = {}
-    found = measurement.select(
+    samples = measurement.select(
         [(None, group, index) for index in read.values()], raw=True, copy_master=False
     )
-    for (key, index), raw in zip(read.items(), found, strict=True):
+    for (key, index), raw in zip(read.items(), samples, strict=True):
         with _or_skip(skipped if key else None, file):
             conversion = described.channels[index].conversion
             arrays[key or f"stamps {group}"] = _physical(
-                raw.samples, raw.invalidation_bits, conversion, where[key]
+                raw.samples, raw.invalidation_bits, conversion, location_of[key]
             )
     return arrays
 
 
-def _require_number(measurement: Any, group: int, index: int, where: str) -> None:
+def _require_number(measurement: Any, group: int, index: int, location: str) -> None:
     described = measurement.groups[group]
     channel = described.channels[index]
     dependencies = described.channel_dependencies[index]
     if dependencies:
         raise DataError(
-            f"{where} holds an array or structure; numbers are needed: name another signal"
+            f"{location} holds an array or structure; numbers are needed: name another signal"
         )
     if channel.conversion_addr and channel.conversion is None:  # asammdf would give the raw numbers
-        raise DataError(f"{where} has a conversion that cannot be read; the file is damaged")
+        raise DataError(f"{location} has a conversion that cannot be read; the file is damaged")
     if measurement.version >= "4":
         virtual = channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER)
         end = 0 if virtual else 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
@@ -346,43 +368,44 @@ def _require_number(measurement: Any, group: int, index: int, where: str) -> Non
     marked = getattr(channel, "flags", 0) & v4.FLAG_CN_INVALIDATION_PRESENT
     outside = marked and channel.pos_invalidation_bit >= 8 * _invalidation_bytes(described)
     if outside or end > 8 * described.channel_group.samples_byte_nr:
-        raise DataError(f"{where} stands outside of its group's records; the file is damaged")
+        raise DataError(f"{location} stands outside of its group's records; the file is damaged")
 
 
 def _invalidation_bytes(group: Any) -> int:
     return int(getattr(group.channel_group, "invalidation_bytes_nr", 0))
 
 
-def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> FloatArray:
+def _physical(raw: np.ndarray, invalid: Any, conversion: Any, location: str) -> FloatArray:
     """Physical values, float64; invalid samples become NaN and meet no conversion."""
     if raw.dtype.kind not in "biuf" or raw.ndim != 1:
         kind = "text" if raw.dtype.kind in "SU" else "an array or structure"
-        raise DataError(f"{where} holds {kind}; numbers are needed: name another signal")
+        raise DataError(f"{location} holds {kind}; numbers are needed: name another signal")
     valid = slice(None) if invalid is None else ~np.asarray(invalid, dtype=bool)
-    found = raw[valid]
+    physical = raw[valid]
     if conversion is None or conversion.conversion_type not in RANGES[type(conversion)]:
-        found = found.astype(np.float64)
-    if conversion is not None and len(found):
+        physical = physical.astype(np.float64)
+    if conversion is not None and len(physical):
         with np.errstate(all="ignore"):
             ranges = (
                 type(conversion) is v4_blocks.ChannelConversion
                 and conversion.conversion_type == v4.CONVERSION_TYPE_RTAB
             )
-            found = (
-                _of_ranges(found, conversion)
+            physical = (
+                _of_ranges(physical, conversion)
                 if ranges
-                else conversion.convert(found, as_object=True)
+                else conversion.convert(physical, as_object=True)
             )
-    if found.dtype.kind == "O":  # numbers with texts among them, as a conversion gives them
-        found = np.array([_measured(value) for value in found], dtype=object)
-    if found.dtype.kind in "SU" or (
-        found.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in found)
+    if physical.dtype.kind == "O":  # numbers with texts among them, as a conversion gives them
+        physical = np.array([_measured(value) for value in physical], dtype=object)
+    if physical.dtype.kind in "SU" or (
+        physical.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in physical)
     ):
         raise DataError(
-            f"{where} holds text; numbers are needed: name another signal, or one without a conversion to text"
+            f"{location} holds text; numbers are needed: name another signal, or one without a "
+            "conversion to text"
         )
     values = np.full(len(raw), np.nan)
-    values[valid] = found
+    values[valid] = physical
     return values
 
 
@@ -393,7 +416,9 @@ def _measured(value: Any) -> Any:
 
 
 def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
-    """Values of ranges: whole numbers belong to both ends of one, which asammdf gets wrong, real numbers not to the upper."""
+    """Values of ranges: whole numbers belong to both ends of one, which asammdf gets wrong, real
+    numbers not to the upper.
+    """
     count = (conversion.val_param_nr - 1) // 3
     rows = np.array(
         sorted(
@@ -416,8 +441,8 @@ def _group_name(measurement: Any, group: int) -> str:
 
 def _title(measurement: Any, group: int) -> str:
     name = _group_name(measurement, group)
-    return f"{group} '{_shown(name)}'" if name else str(group)
+    return f"{group} '{_short_name(name)}'" if name else str(group)
 
 
-def _shown(name: str) -> str:
+def _short_name(name: str) -> str:
     return printable(name if len(name) <= 120 else name[:120] + "…")

@@ -1,7 +1,7 @@
 """Revs Vehicle Dynamics Database (Kegelman & Gerdes, Stanford Digital Repository).
 
-Layouts: ``csv``, the official one, a file a recording; ``text``, a folder a recording and a text file a channel, as re-laid
-by Leanza, Reina & Blanco-Claraco 2021.
+Layouts: ``csv``, the official one, a file a recording; ``text``, a folder a recording and a text
+file a channel, as re-laid by Leanza, Reina & Blanco-Claraco 2021.
 """
 
 from __future__ import annotations
@@ -54,27 +54,31 @@ class RevsSource(FileSource):
         super().__init__(dataset)
         options = self.options
         self.columns = self._declared(options.channels)
-        self.time = column_from_config(options.time, f"{self.where}: time", "s")
+        self.time = column_from_config(options.time, f"{self.location}: time", "s")
         strict = {column.column for name, column in self.columns.items() if name not in self.gappy}
         self.column_names = list(dict.fromkeys(column.column for column in self.columns.values()))
         self.gappy_columns = set(self.column_names) - strict
 
     def ids(self) -> list[str]:
-        """Recordings that the data set names, or else those whose files match ``files``, in alphabetical order; raises `MissingError`."""
+        """Recordings that the data set names, or else those whose files match ``files``, in
+        alphabetical order; raises `MissingError`.
+        """
         suffix = SUFFIXES[self.options.layout]
         if self.options.recordings is not None:
             return [name.removesuffix(suffix) for name in self.options.recordings]
         pattern = f"{self.options.files or '*'}{suffix}"
-        found = [
+        paths = [
             path for path in sorted(self._folder().glob(pattern)) if path.is_dir() == (not suffix)
         ]
         names = [
             path.name.removesuffix(suffix)
-            for path in found
+            for path in paths
             if path.name != self.options.vehicle_parameters
         ]
         if not names:
-            raise MissingError(f"{self.where}: nothing in '{self._folder()}' matches '{pattern}'")
+            raise MissingError(
+                f"{self.location}: nothing in '{self._folder()}' matches '{pattern}'"
+            )
         return names
 
     def inputs(self) -> dict[str, str | Path]:
@@ -89,7 +93,9 @@ class RevsSource(FileSource):
         return dict(files) if parameters is None else {**files, parameters.name: parameters}
 
     def file_names(self) -> list[str]:
-        """Files of the named recordings in the official layout, and the table of vehicle parameters."""
+        """Files of the named recordings in the official layout, and the table of vehicle
+        parameters.
+        """
         suffix = SUFFIXES[self.options.layout]
         if not suffix or self.options.recordings is None:
             return []
@@ -103,14 +109,15 @@ class RevsSource(FileSource):
         files = self._files_of(recording_id)
         path = self._path(recording_id)
         options = self.options
-        own, origin = (
+        samples, origin = (
             self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
         )
         clock = uniform_clock(
-            self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock
+            self.time.to_si(samples[self.time.column], "s"), f"'{path}'", options.clock
         )
         values = {
-            name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names
+            name: clock.align(samples[name], name in self.gappy_columns)
+            for name in self.column_names
         }
         channels = {
             name: column.to_si(values[column.column], channel(name).unit)
@@ -129,9 +136,13 @@ class RevsSource(FileSource):
         )
         if self.options.units_row == "check":
             for name, column in self.columns.items():
-                where = f"'{file}': column '{column.column}'"
+                location = f"'{file}': column '{column.column}'"
                 require_unit(
-                    units[column.column], column, channel(name).unit, where, "set units_row: ignore"
+                    units[column.column],
+                    column,
+                    channel(name).unit,
+                    location,
+                    "set units_row: ignore",
                 )
         return values, about
 
@@ -145,7 +156,8 @@ class RevsSource(FileSource):
         for name, samples in values.items():
             if len(samples) != n_stamps:
                 raise DataError(
-                    f"'{files[name]}' holds {len(samples)} samples, the time file {n_stamps}; the copy is incomplete"
+                    f"'{files[name]}' holds {len(samples)} samples, the time file {n_stamps}; the "
+                    "copy is incomplete"
                 )
         return values
 

@@ -1,8 +1,10 @@
-"""The official CSV files of Revs: lines about the drive, names, units, then a row a millisecond with blank heads of slow columns.
+"""The official CSV files of Revs: lines about the drive, names, units, then a row a millisecond
+with blank heads of slow columns.
 
 Tables of vehicle parameters have a line of names, one of units, then values, a column a parameter.
 
-Only the lines above the rows hold anything but ASCII. They alone are decoded here: transcoding the rows takes as long as reading them.
+Only the lines above the rows hold anything but ASCII. They alone are decoded here: transcoding the
+rows takes as long as reading them.
 """
 
 from __future__ import annotations
@@ -26,10 +28,12 @@ LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but br
 def read_csv(
     file: Path, columns: Sequence[str], gappy: Collection[str], preamble_lines: int
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, Any]]:
-    """Columns, the one of time first, from the first row on in which all but the ``gappy`` ones hold a value, (T,) each.
+    """Columns, the one of time first, from the first row on in which all but the ``gappy`` ones
+    hold a value, (T,) each.
 
-    In the units of the file, with these units and the provenance: lines about the drive, of which there are ``preamble_lines`` above the
-    names, and rows dropped at the head. Raises `DataError`: a column or cell cannot be read.
+    In the units of the file, with these units and the provenance: lines about the drive, of which
+    there are ``preamble_lines`` above the names, and rows dropped at the head. Raises `DataError`:
+    a column or cell cannot be read.
     """
     time = columns[0]
     head = read_head(file).split(b"\n")[: preamble_lines + 2]
@@ -39,14 +43,18 @@ def read_csv(
         for line in lines[preamble_lines : preamble_lines + 2]
     )
     if time not in names:
-        problem = f"line {preamble_lines + 1} should name the columns and has no '{time}' (it has {listed(names)})"
+        problem = (
+            f"line {preamble_lines + 1} should name the columns and has no '{time}' (it has "
+            f"{listed(names)})"
+        )
         raise DataError(
             f"'{file}': {problem}; correct preamble_lines, or is it no official Revs file?"
         )
     require_columns(file, names, columns)
     if len(units) != len(names) or any(_number(unit) is not None for unit in units):
         raise DataError(
-            f"'{file}': line {preamble_lines + 2} should hold units of the {len(names)} columns; was it removed?"
+            f"'{file}': line {preamble_lines + 2} should hold units of the {len(names)} columns; "
+            "was it removed?"
         )
     values = read_columns(
         file, columns, TextLayout(skip_rows=preamble_lines + 2, names=tuple(names))
@@ -57,9 +65,13 @@ def read_csv(
     slowest = max(starts, key=lambda name: starts[name], default=time)
     first = starts.get(slowest, 0)
     if first > LONGEST_HEAD * len(values[time]):
-        what = f"column '{slowest}' is blank until {values[time][first]:.12g} s, more than {100 * LONGEST_HEAD:g} % of the rows"
+        fault = (
+            f"column '{slowest}' is blank until {values[time][first]:.12g} s, more than "
+            f"{100 * LONGEST_HEAD:g} % of the rows"
+        )
         raise DataError(
-            f"'{file}': {what}; leave its channel out of the map in conf/dataset, or declare it in 'gappy'"
+            f"'{file}': {fault}; leave its channel out of the map in conf/dataset, or declare it "
+            "in 'gappy'"
         )
     preamble = [text for line in lines[:preamble_lines] if (text := line.rstrip(",").strip())]
     about = {"file": file.name, "preamble": preamble, "rows_dropped_at_the_head": first}
@@ -71,10 +83,12 @@ def read_csv(
 
 
 def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
-    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``; raises `DataError` where it is no such table.
+    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``; raises `DataError`
+    where it is no such table.
 
-    A parameter with several values (a curve, such as road-wheel angles over the angle of the steering wheel) has a list of them.
-    Cells below a column's last value are blank; text is kept as text.
+    A parameter with several values (a curve, such as road-wheel angles over the angle of the
+    steering wheel) has a list of them. Cells below a column's last value are blank; text is kept as
+    text.
     """
     text = _decoded(read_head(file))
     try:
@@ -89,35 +103,38 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
         ) from None
     if len(rows) < 3 or "\0" in text:
         raise DataError(
-            f"'{file}' is no table of vehicle parameters: a line of names, one of units, and values below"
+            f"'{file}' is no table of vehicle parameters: a line of names, one of units, and "
+            "values below"
         )
-    found: dict[str, dict[str, Any]] = {}
+    parameters: dict[str, dict[str, Any]] = {}
     for name, unit, *values in filter(any, zip_longest(*rows, fillvalue="")):
-        if not name or name in found:
+        if not name or name in parameters:
             raise DataError(
-                f"'{file}': line 1 should name every column once, column {len(found) + 1} is called '{printable(name[:40])}'"
+                f"'{file}': line 1 should name every column once, column {len(parameters) + 1} is "
+                f"called '{printable(name[:40])}'"
             )
         if _number(unit) is not None:
             raise DataError(
-                f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?"
+                f"'{file}': line 2 should hold units and holds numbers; was the line of units "
+                "removed?"
             )
-        found[name] = {
+        parameters[name] = {
             "value": _value(values, f"'{file}': parameter '{printable(name[:40])}'"),
             "unit": unit,
         }
-    return found
+    return parameters
 
 
-def _value(cells: list[str], where: str) -> Any:
+def _value(cells: list[str], location: str) -> Any:
     while cells and not cells[-1]:
         cells.pop()
     if len(cells) == 1:
         return cells[0] if _number(cells[0]) is None else _number(cells[0])
     numbers = [_number(cell) for cell in cells]
-    for line, (cell, found) in enumerate(zip(cells, numbers, strict=True), start=3):
-        if found is None:
+    for line, (cell, number) in enumerate(zip(cells, numbers, strict=True), start=3):
+        if number is None:
             raise DataError(
-                f"{where} holds '{printable(cell[:40])}' in line {line}; numbers are needed"
+                f"{location} holds '{printable(cell[:40])}' in line {line}; numbers are needed"
             )
     return numbers or None
 

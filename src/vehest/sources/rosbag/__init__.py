@@ -1,6 +1,8 @@
-"""ROS 2 bags: topics of several rates brought to one clock, and a reference made of a motion capture system's poses.
+"""ROS 2 bags: topics of several rates brought to one clock, and a reference made of a motion
+capture system's poses.
 
-bag -> messages of the declared topics -> times of each topic's samples -> ticks common to all -> recording
+bag -> messages of the declared topics -> times of each topic's samples -> ticks common to all ->
+recording
 """
 
 from __future__ import annotations
@@ -63,19 +65,27 @@ class RosbagSource(FileSource):
             self._require_pattern()
         self.channels = self.options.channels or {}
         entries = {
-            name: {"column": one.field, "unit": one.unit, "sign": one.sign, "factor": one.factor}
-            for name, one in self.channels.items()
+            name: {
+                "column": declared_channel.field,
+                "unit": declared_channel.unit,
+                "sign": declared_channel.sign,
+                "factor": declared_channel.factor,
+            }
+            for name, declared_channel in self.channels.items()
         }
         self.columns = columns_from_config(entries, self.name)
-        wanted = [(one.topic, one.field) for one in self.channels.values()]
+        fields = [
+            (declared_channel.topic, declared_channel.field)
+            for declared_channel in self.channels.values()
+        ]
         if pose := self.options.pose:
-            wanted += [(pose.topic, f"{pose.field}.{part}") for part in POSE_FIELDS]
+            fields += [(pose.topic, f"{pose.field}.{part}") for part in POSE_FIELDS]
         declared = self.options.topics or {}
         self.topics = {
-            name: declared[name] for name in declared if any(topic == name for topic, _ in wanted)
+            name: declared[name] for name in declared if any(topic == name for topic, _ in fields)
         }
         self.fields = {
-            name: list(dict.fromkeys(field for topic, field in wanted if topic == name))
+            name: list(dict.fromkeys(field for topic, field in fields if topic == name))
             for name in self.topics
         }
 
@@ -88,38 +98,45 @@ class RosbagSource(FileSource):
         }
 
     def _read(self, file: Path, run: int | None) -> Recording:
-        """Read a bag, a file or a folder; raises as `read_bag` does, and `DataError` for topics of no recording."""
-        wanted = [
+        """Read a bag, a file or a folder.
+
+        Raises as `read_bag` does, and `DataError` for topics of no recording.
+        """
+        requests = [
             [topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()
         ]
         most_bytes = int(1e9 * self.options.unpacked_limit)
         layouts = self.options.messages or {}
-        reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)
+        reading = read_bag(file, "read_topics", most_bytes, topics=requests, layouts=layouts)
         series = {
             name: self._series(topic, self.fields[name], reading, file)
             for name, topic in self.topics.items()
         }
         spans = {
-            f"topic '{one.topic.topic}'": (float(one.times[0]), float(one.times[-1]))
-            for one in series.values()
+            f"topic '{declared.topic.topic}'": (float(declared.times[0]), float(declared.times[-1]))
+            for declared in series.values()
         }
         grid = ticks_within(*common_span(spans, f"'{file}'"), self.options.rate_hz, f"'{file}'")
         channels = {}
-        for name, one in self.channels.items():
-            held = series[one.topic]
-            values = series[one.topic].fields[one.field]
+        for name, declared in self.channels.items():
+            topic_series = series[declared.topic]
+            values = series[declared.topic].fields[declared.field]
             values = self.columns[name].to_si(
-                values - one.offset if one.offset else values, channel(name).unit
+                values - declared.offset if declared.offset else values, channel(name).unit
             )
             channels[name] = at_ticks(
-                values, held.times, grid, hold=held.topic.interpolation == "hold", slack=1e-9
+                values,
+                topic_series.times,
+                grid,
+                hold=topic_series.topic.interpolation == "hold",
+                slack=1e-9,
             )
         if self.options.pose is not None:
             channels |= self._reference(
                 self.options.pose, series[self.options.pose.topic], grid, file
             )
         clock = Clock(float(grid[0]), self.options.rate_hz, len(grid))
-        topics = {one.topic.topic: one.about for one in series.values()}
+        topics = {declared.topic.topic: declared.about for declared in series.values()}
         provenance = {"file": file.name, "bag_start_ns": reading.summary["start"], "topics": topics}
         return self._recording(self._id_of(file), f"'{file}'", clock, channels, provenance)
 
@@ -135,7 +152,7 @@ class RosbagSource(FileSource):
         bags = [folder / name for name in files]
         for bag in bags:
             if not bag.exists():
-                raise MissingError(f"{self.where}: there is no bag '{bag}'")
+                raise MissingError(f"{self.location}: there is no bag '{bag}'")
         return bags
 
     def _id_of(self, file: Path) -> str:
@@ -143,37 +160,38 @@ class RosbagSource(FileSource):
 
     def _series(self, topic: Topic, fields: Iterable[str], reading: Reading, path: Path) -> Series:
         """One topic's samples with their times, in seconds after the bag's first message."""
-        where = f"'{path}': topic '{topic.topic}'"
+        location = f"'{path}': topic '{topic.topic}'"
         name = topic.topic
         received = reading.arrays[f"{name}@received"]
         stamped = reading.arrays.get(f"{name}@stamped")
         if topic.stamps == "header" and stamped is None:
             raise ConfigurationError(
-                f"{where}: messages of type '{topic.type}' have no header; set stamps: received"
+                f"{location}: messages of type '{topic.type}' have no header; set stamps: received"
             )
         nanoseconds = received if stamped is None or topic.stamps == "received" else stamped
         stamps = (nanoseconds - reading.summary["start"]) * 1e-9
         start = -math.inf if self.options.start is None else self.options.start
         stop = math.inf if self.options.stop is None else self.options.stop
-        kept = (stamps >= start) & (stamps < stop)
-        if kept.sum() < 2:
+        is_within = (stamps >= start) & (stamps < stop)
+        if is_within.sum() < 2:
             raise DataError(
-                f"{where}: fewer than two messages between start {start:g} s and stop {stop:g} s after the bag's first message"
+                f"{location}: fewer than two messages between start {start:g} s and stop {stop:g} "
+                "s after the bag's first message"
             )
-        times = stamps = stamps[kept]
-        values = {field: reading.arrays[f"{name}.{field}"][kept] for field in fields}
+        times = stamps = stamps[is_within]
+        values = {field: reading.arrays[f"{name}.{field}"][is_within] for field in fields}
         for field, measured in values.items():
             samples = values[field] = bridged(measured, stamps, topic.max_gap)
-            require_samples(samples, stamps, topic.max_gap, f"{where}: field '{field}'")
+            require_samples(samples, stamps, topic.max_gap, f"{location}: field '{field}'")
         rate_hz = None
         if topic.clock == "uniform":
             times, rate_hz, jitter = uniform_times(
-                stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.options.rate_hz
+                stamps, topic.rate_hz or 0.0, location, MOST_WANDERING / self.options.rate_hz
             )
         else:
             require_clock(
                 stamps,
-                where,
+                location,
                 "repair or cut the range out, or take clock: uniform if samples come in batches",
             )
             jitter = float(np.diff(stamps).std())
@@ -182,7 +200,7 @@ class RosbagSource(FileSource):
             lost = len(kernel) // 2
             if len(times) <= 2 * lost:
                 raise DataError(
-                    f"{where}: {len(times)} samples are fewer than its moving average needs"
+                    f"{location}: {len(times)} samples are fewer than its moving average needs"
                 )
             times = times[lost : len(times) - lost]
             values = {
@@ -200,26 +218,29 @@ class RosbagSource(FileSource):
         if stamped is not None:
             late = (received - stamped) * 1e-9
             about["latency_ms"] = [
-                round(1e3 * float(one), 3) for one in (np.median(late), late.max())
+                round(1e3 * float(latency), 3) for latency in (np.median(late), late.max())
             ]
         return Series(topic, times - topic.delay, rate_hz, values, about)
 
     def _reference(
         self, pose: Pose, series: Series, grid: FloatArray, path: Path
     ) -> dict[str, FloatArray]:
-        where = f"'{path}': topic '{series.topic.topic}'"
+        location = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
-        plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, where)
+        plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, location)
         times = series.times
         rate_hz = series.rate_hz
         if rate_hz is None:
             plane = np.stack([np.interp(grid, times, plane[:, axis]) for axis in (0, 1)], axis=1)
             times, yaw, rate_hz = grid, np.interp(grid, times, yaw), self.options.rate_hz
-        return pose.references(plane, yaw, 1.0 / rate_hz, pose.yaw, where, at=(times, grid))
+        return pose.references(plane, yaw, 1.0 / rate_hz, pose.yaw, location, at=(times, grid))
 
 
 def _averaging(width: int) -> FloatArray:
-    """Weights of a centred moving average over samples; of an even width the outermost two weigh half."""
+    """Weights of a centred moving average over samples.
+
+    Of an even width the outermost two weigh half.
+    """
     if width % 2:
         return np.full(width, 1.0 / width)
     kernel = np.full(width + 1, 1.0 / width)

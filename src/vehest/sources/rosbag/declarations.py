@@ -1,4 +1,6 @@
-"""What a data set declares of ROS 2 bags: topics and their clocks, fields and their units, poses."""
+"""What a data set declares of ROS 2 bags: topics and their clocks, fields and their units,
+poses.
+"""
 
 from __future__ import annotations
 

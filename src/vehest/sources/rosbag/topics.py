@@ -1,4 +1,6 @@
-"""A ROS 2 bag's topics: its files, unpacked where they are packed, then read by rosbags in a limited process."""
+"""A ROS 2 bag's topics: its files, unpacked where they are packed, then read by rosbags in a
+limited process.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,14 @@ PACKED = ".zstd"  # a file that ROS has compressed as a whole
 
 
 def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request: Any) -> Reading:
-    """Topics of a bag; raises `MissingError` without rosbags or bag, `ConfigurationError` for a bad layout, `DataError` for a damaged bag.
+    """Topics of a bag; raises `MissingError` without rosbags or bag, `ConfigurationError` for a bad
+    layout, `DataError` for a damaged bag.
 
     Args:
-        path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds one bag.
-        function: ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which describe ``request`` and the result.
+        path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds
+        one bag.
+        function: ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which
+        describe ``request`` and the result.
         most_bytes: limit of what is unpacked [bytes].
     """
     require_package("rosbags", "ros", "reading ROS 2 bags")
@@ -39,7 +44,10 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The files that a bag is made of: the archive or file itself, or what its folder holds; raises `MissingError` where there are none."""
+    """The files that a bag is made of: the archive or file itself, or what its folder holds.
+
+    Raises `MissingError` where there are none.
+    """
     if not path.is_dir():
         return [regular_file(path)]
     try:
@@ -53,9 +61,10 @@ def bag_files(path: Path) -> list[Path]:
             f"cannot read '{path}' ({error.strerror}); check its permissions"
         ) from None
     if not files:
-        found = f"neither {METADATA} nor a file ending in {' or '.join(STORAGES)}"
+        contents = f"neither {METADATA} nor a file ending in {' or '.join(STORAGES)}"
         raise MissingError(
-            f"'{path}' holds no bag: {found}; of other logs name the files, such as {path / '*.csv'}"
+            f"'{path}' holds no bag: {contents}; of other logs name the files, such as "
+            f"{path / '*.csv'}"
         )
     return files
 
@@ -70,13 +79,15 @@ def _unpacked_bag(path: Path, most_bytes: int) -> Iterator[Path]:
             bags = [file.parent for file in folder.rglob(METADATA)]
             if len(bags) != 1:
                 raise DataError(
-                    f"'{path}' holds {len(bags) or 'no'} bags (folders with a {METADATA}); one is needed"
+                    f"'{path}' holds {len(bags) or 'no'} bags (folders with a {METADATA}); one is "
+                    "needed"
                 )
             bag = bags[0]
         if bag.is_dir():
             if not (bag / METADATA).is_file():
                 raise DataError(
-                    f"'{path}' has no {METADATA}, without which a folder is no bag; make one with 'ros2 bag reindex'"
+                    f"'{path}' has no {METADATA}, without which a folder is no bag; make one with "
+                    "'ros2 bag reindex'"
                 )
             if packed := sorted(bag.glob(f"*{PACKED}")):
                 folder = stack.enter_context(temporary_folder(path))
@@ -93,24 +104,28 @@ def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: in
         from compression import zstd
     else:
         from backports import zstd
-    most = unpacked_limit(sum(file.stat().st_size for file in packed), most_bytes)
+    max_unpacked = unpacked_limit(sum(file.stat().st_size for file in packed), most_bytes)
     n_bytes = 0
     for file in packed:
         try:
             with zstd.open(file) as stream, open(folder / file.name, "xb") as plain:
                 while block := stream.read(1 << 20):
                     n_bytes += len(block)
-                    if n_bytes > most:
+                    if n_bytes > max_unpacked:
                         remedy = (
-                            "raise unpacked_limit" if most == most_bytes else "unpack it by hand"
+                            "raise unpacked_limit"
+                            if max_unpacked == most_bytes
+                            else "unpack it by hand"
                         )
                         raise DataError(
-                            f"'{path}' would unpack to more than the limit of {most / 1e9:.3g} GB; {remedy}"
+                            f"'{path}' would unpack to more than the limit of "
+                            f"{max_unpacked / 1e9:.3g} GB; {remedy}"
                         )
                     plain.write(block)
         except (zstd.ZstdError, EOFError) as error:
             raise DataError(
-                f"'{path}': '{file.name}' is truncated or damaged ({first_line(error)}); fetch it again"
+                f"'{path}': '{file.name}' is truncated or damaged ({first_line(error)}); fetch it "
+                "again"
             ) from None
         except OSError as error:
             raise writing_error(folder, error) from None

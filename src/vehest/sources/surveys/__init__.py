@@ -1,4 +1,5 @@
-"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column that looks like a clock.
+"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column
+that looks like a clock.
 
 Nothing is made a channel here; ``vehest.alignment.proposals`` finds which column is which channel.
 """
@@ -11,11 +12,12 @@ from typing import Literal
 
 import numpy as np
 
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import DataError, MissingError, printable
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.mdf import read_measurement
+from vehest.sources.not_measured import codes_of_not_measured
 from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
@@ -45,11 +47,14 @@ UNITS = {  # of ROS's own types, REP 103
 
 
 def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder; raises `MissingError` without file or package, `DataError` where it cannot be read."""
+    """Columns of one file, or of a bag's folder.
+
+    Raises `MissingError` without file or package, `DataError` where it cannot be read.
+    """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)
-    log = _survey(path)
+    log = _without_codes(_survey(path))
     for run in log.runs:
         if (
             log.seconds is not None
@@ -58,19 +63,41 @@ def survey(path: Path) -> Log:
         ):
             raise DataError(f"'{path}': {fault}")
     faults = {
-        one.name: clock_fault(one.stamps, may_repeat=True)
-        for one in log.columns
-        if one.stamps is not None
+        column.name: clock_fault(column.stamps, may_repeat=True)
+        for column in log.columns
+        if column.stamps is not None
     }
     skipped = log.skipped + tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
     log = replace(
-        log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=skipped
+        log,
+        columns=tuple(column for column in log.columns if not faults.get(column.name)),
+        skipped=skipped,
     )
     if not log.columns:
         raise DataError(
             f"'{path}' holds no column of numbers ({'; '.join(skipped[:3]) or 'it is empty'})"
         )
     return log
+
+
+def _without_codes(log: Log) -> Log:
+    """A log of which numbers that stand for a missing sample, such as -9999, are NaN."""
+    columns = []
+    skipped = list(log.skipped)
+    for column in log.columns if log.source != "rosbag" else ():
+        codes = codes_of_not_measured(column.values)
+        if codes:
+            is_code = np.isin(column.values, codes)
+            place = {**column.place, "invalid": codes}
+            values = np.where(is_code, np.nan, column.values)
+            column = replace(column, values=values, place=place)
+            texts = " and ".join(f"{code:.9g}" for code in codes)
+            skipped.append(
+                f"{texts} in {is_code.sum()} samples of '{printable(column.name)}', "
+                "which loggers write where nothing was measured"
+            )
+        columns.append(column)
+    return replace(log, columns=tuple(columns) or log.columns, skipped=tuple(skipped))
 
 
 def _survey(path: Path) -> Log:
@@ -82,11 +109,13 @@ def _survey(path: Path) -> Log:
         )
     if ending in CAN:
         raise DataError(
-            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare them (docs/sources/can.md)"
+            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare "
+            "them (docs/sources/can.md)"
         )
     if ending == ".bag":
         raise DataError(
-            f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'"
+            f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst "
+            f"{path.stem}'"
         )
     if path.is_dir() or ending in BAGS:
         return _survey_bag(path)
@@ -98,7 +127,8 @@ def _survey(path: Path) -> Log:
         return _survey_vbo(path)
     if is_stored_recording(path):
         raise DataError(
-            f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'"
+            f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data "
+            f"usable {path}'"
         )
     return survey_table(path)
 
@@ -113,7 +143,7 @@ def _survey_bag(path: Path) -> Log:
         name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
         for name, *_ in topics
     }
-    start = min((own[0] for own in times.values() if len(own) > 1), default=0.0)
+    start = min((stamps[0] for stamps in times.values() if len(stamps) > 1), default=0.0)
     for topic, kind, fields in topics:
         clock = "header" if f"{topic}@stamped" in arrays else "received"
         for field in fields if len(times[topic]) > 1 else ():
@@ -150,9 +180,9 @@ def _survey_vbo(file: Path) -> Log:
     skipped: tuple[str, ...] = ()
     try:
         require_slip_offsets(log, "Slip_COG, Slip_FL …")
-        wanted = log.columns
+        selected = log.columns
     except DataError as error:
-        wanted = {
+        selected = {
             name: samples
             for name, samples in log.columns.items()
             if not SLIP_AT_A_POINT.fullmatch(name)
@@ -161,11 +191,11 @@ def _survey_vbo(file: Path) -> Log:
     devices: dict[str, Literal["car", "reference"]] = {}
     if any("CAN" in module for module in log.modules.values()):
         devices = {
-            name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in wanted
+            name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in selected
         }
     columns = tuple(
         RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, ""))
-        for name, samples in wanted.items()
+        for name, samples in selected.items()
     )
     clock = Stamps("time", "s", "clock time of the format")
     seconds = log.seconds - log.seconds[0]

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.sources.clocks import span_fault
+from vehest.data.recording import HIGHEST_RATE
+from vehest.sources.clocks import RATE_TOLERANCE, span_fault
 from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
@@ -19,14 +20,16 @@ NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
 COUNTER = re.compile(
-    r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$"
+    r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( "
+    r"?(id|nr|no|number|index))?$"
 )
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 SPELLINGS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+    **dict.fromkeys(("d", "day", "days"), "d"),
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
@@ -38,16 +41,19 @@ MODULI = (  # of counters, also as fractions of a second, and of seconds of a da
     *(days * 86_400.0 * factor for days in (1, 7) for factor in (1.0, 1e3, 1e6)),
 )
 REGULAR = 0.8  # share of the steps within half a median step
-GROWING = 0.9  # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
+# share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
+GROWING = 0.9
 MOST_RESTARTS = 0.01  # of the rows
 
 
 def find_clock(
     columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
-    """The column, (N,), that grows evenly, by name or unit before another, or one that is named so and grows; None where none does.
+    """The column, (N,), that grows evenly, by name or unit before another, or one that is named so
+    and grows; None where none does.
 
-    With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's options by which runs begin.
+    With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's
+    options by which runs begin.
     """
     best = None
     likely = -1
@@ -58,14 +64,16 @@ def find_clock(
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
-        own = _step(values, named=named)
-        counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
-        stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
-        if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
+        column_step = _step(values, named=named)
+        counts_rows = column_step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
+        stamps = (
+            None if column_step is None or counts_rows else _stamps(name, column_step, unit, named)
+        )
+        if column_step is not None and stamps is not None and 2 * bool(unit) + named > likely:
             best = replace(stamps, repair=repair)
             repaired = {name: values}
             likely = 2 * bool(unit) + named
-            step = own
+            step = column_step
     n_rows = len(next(iter(columns.values())))
     if best is None:
         return None, None, (slice(0, n_rows),), {}
@@ -105,7 +113,9 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
-    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option ``max_gap``, if they pause."""
+    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option
+    ``max_gap``, if they pause.
+    """
     steps = np.diff(seconds)
     longest = float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
     runs = stretches(steps < 0, len(seconds))
@@ -121,12 +131,14 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
 
 def plain_name(name: str) -> str:
     """In lower case, without marks, words apart."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return re.sub(r"[\W_]+", " ", apart).strip().lower()
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return re.sub(r"[\W_]+", " ", words).strip().lower()
 
 
 def _step(values: FloatArray, *, named: bool) -> float | None:
-    """Median step of a column that grows evenly, or that is named as time and repeats seldom, but for restarts; None of another."""
+    """Median step of a column that grows evenly, or that is named as time and repeats seldom, but
+    for restarts; None of another.
+    """
     if len(values) < 10 or not np.isfinite(values).all():
         return None
     steps = np.diff(values)
@@ -145,27 +157,32 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
 
 
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
-    """A column of time in the unit in which a step makes a rate that loggers have; None where no unit does."""
+    """A column of time in the unit in which a step makes a rate that loggers have.
+
+    None where no unit does.
+    """
     fitting = [
-        own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
+        name for name, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
     ]
     chosen = unit if unit in fitting or not fitting else fitting[0]
     chosen = chosen or ("s" if named else "")
-    if not chosen:
+    if not chosen or step * UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None
     rate = 1.0 / (step * UNITS[chosen])
-    how = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    evidence = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
     if unit == chosen:
-        how = f"unit in the header, {rate:.6g} Hz"
+        evidence = f"unit in the header, {rate:.6g} Hz"
     elif unit:
-        how += f", {1.0 / (step * UNITS[unit]):.6g} Hz in {unit}, as the header says"
-    return Stamps(name, chosen, how, asked=chosen not in fitting or unit not in ("", chosen))
+        evidence += f", {1.0 / (step * UNITS[unit]):.6g} Hz in {unit}, as the header says"
+    return Stamps(name, chosen, evidence, asked=chosen not in fitting or unit not in ("", chosen))
 
 
 def _run_starts(
     columns: Mapping[str, FloatArray], clock: str, steps: FloatArray, step: float
 ) -> tuple[NDArray[np.bool_], str]:
-    """Where runs begin with the next row, (N - 1,), and the column that counts them, if one does."""
+    """Where runs begin with the next row, (N - 1,), and the column that counts them, if one
+    does.
+    """
     for name, starts in _counters(
         columns, [name for name in columns if name != clock and COUNTER.match(plain_name(name))]
     ):
@@ -181,7 +198,9 @@ def _run_starts(
 def _counters(
     columns: Mapping[str, FloatArray], names: Iterable[str]
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Columns of whole numbers that never take a value again, each with where it changes, (N - 1,)."""
+    """Columns of whole numbers that never take a value again, each with where it changes, (N -
+    1,).
+    """
     for name in names:
         values = columns[name]
         if np.isfinite(values).all() and (values == np.rint(values)).all():

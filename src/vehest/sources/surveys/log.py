@@ -23,7 +23,8 @@ class RawColumn:
     stamps: FloatArray | None = (
         None  # its own times [s], (N,); None where the log has one clock for all
     )
-    # whether the file says that the car measured it, on its bus, or the reference did; empty where it does not
+    # whether the file says that the car measured it, on its bus, or the reference did; empty where
+    # it does not
     device: Literal["", "car", "reference"] = ""
 
 
@@ -49,14 +50,18 @@ class Log:
         default_factory=dict
     )  # of the source, such as delimiter and decimal mark
     clock: Stamps | None = (
-        None  # column of its times; None where there is none, or where the format has times of its own
+        # column of its times; None where there is none, or where the format has times of its own
+        None
     )
     seconds: FloatArray | None = (
-        None  # times of the rows [s], (N,), from the clock; None where columns have their own or there is no clock
+        # times of the rows [s], (N,), from the clock; None where columns have their own or there is
+        # no clock
+        None
     )
     runs: tuple[
         slice, ...
-    ] = ()  # rows of each uninterrupted run, the longest first; one of all where times never restart
+        # rows of each uninterrupted run, the longest first; one of all where times never restart
+    ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
     repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
 

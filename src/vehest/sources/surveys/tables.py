@@ -1,6 +1,8 @@
-"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of units below them.
+"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of
+units below them.
 
-file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers and clock times -> `Log`
+file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers
+and clock times -> `Log`
 """
 
 from __future__ import annotations
@@ -24,7 +26,14 @@ import pyarrow.csv as pc
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
-from vehest.data.parquet import DAMAGE, has_time_unit, numbers_of, parquet_file, read_numbers
+from vehest.data.parquet import (
+    DAMAGE,
+    has_time_unit,
+    is_numeric,
+    numbers_of,
+    parquet_file,
+    read_numbers,
+)
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
@@ -48,6 +57,7 @@ HEAD = 1 << 18  # bytes that are looked at
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # of its numbers
+MIN_SHARE_OF_KIND = 0.1  # of texts that name a kind of number
 MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
@@ -64,6 +74,13 @@ VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
 )
 """Names that end in ms for metres a second, as those of delays and ages do not."""
+DISGUISED = {
+    "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
+    "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
+    "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
+    "a separator of thousands": "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$",
+}
+"""Kinds of texts that are numbers for people: the pattern of each."""
 ABBREVIATED = {
     "radps": "rad/s",
     "degps": "deg/s",
@@ -84,11 +101,16 @@ class Shape:
     units: Mapping[str, str] = field(
         default_factory=dict
     )  # name -> unit in the row below the names, if there is one
-    score: float = 0.0  # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row
+    # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no
+    # such row
+    score: float = 0.0
 
 
 def survey_table(file: Path) -> Log:
-    """What a table holds; raises `DataError` where it is no table, has no names, or holds no numbers."""
+    """What a table holds.
+
+    Raises `DataError` where it is no table, has no names, or holds no numbers.
+    """
     clocks: dict[str, FloatArray] = {}
     options: dict[str, Any] = {}
     skipped: list[str] = []
@@ -103,7 +125,7 @@ def survey_table(file: Path) -> Log:
             names = [
                 field.name
                 for field in table.schema_arrow
-                if field.name in units or _is_numeric(field.type)
+                if field.name in units or is_numeric(field.type)
             ]
             skipped = [
                 f"column '{printable(field.name)}' holds {field.type}"
@@ -178,21 +200,24 @@ def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
     back = int((steps < 0).sum())
-    same = int((steps == 0).sum())
-    what = (
+    n_repeats = int((steps == 0).sum())
+    fault = (
         f"goes backwards {back} times"
         if back
-        else f"repeats {same} times"
-        if same
+        else f"repeats {n_repeats} times"
+        if n_repeats
         else "does not grow evenly"
     )
-    return f"column '{printable(name)}' as the time: it {what}" + (
+    return f"column '{printable(name)}' as the time: it {fault}" + (
         "; sort the rows" if back > 1 else ""
     )
 
 
 def unit_in_name(name: str) -> str:
-    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``; empty where there is none."""
+    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``.
+
+    Empty where there is none.
+    """
     bracketed = BRACKETED.match(name.strip())
     if bracketed:
         return bracketed["unit"].strip()
@@ -204,7 +229,10 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """Layout of a table of text, by its beginning; raises `DataError` where it is none, or has one column or no line of names."""
+    """Layout of a table of text, by its beginning.
+
+    Raises `DataError` where it is none, or has one column or no line of names.
+    """
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [
@@ -223,9 +251,14 @@ def shape_of(file: Path) -> Shape:
         (_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score
     )
     if not best.score:
-        raise DataError(
-            f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?"
-        )
+        cells = [
+            cell for row in [*tables[";"].values(), *tables[","].values()][-40:] for cell in row
+        ]
+        kind = _kind_of_text(pa.chunked_array([cells], pa.string()))
+        why = "is it a table of text, with names in a line above the numbers?"
+        if kind != "text":
+            why = f"it holds {kind}"
+        raise DataError(f"'{file}' holds no rows of two numbers or more; {why}")
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
@@ -239,7 +272,9 @@ def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
 
 
 def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding: str) -> Shape:
-    """The table that a decimal mark makes of rows: names and units stand right above the first two rows of numbers."""
+    """The table that a decimal mark makes of rows: names and units stand right above the first two
+    rows of numbers.
+    """
     lengths = [len(row) for row in rows.values()][len(rows) // 2 :]
     n_columns = max(set(lengths), key=lengths.count, default=0)
     shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns > 1}
@@ -300,7 +335,9 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a row below the names holds units: some that are known, or brackets, and no longer words."""
+    """Whether a row below the names holds units: some that are known, or brackets, and no longer
+    words.
+    """
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     if not filled:
         return any(cell.strip() for cell in cells)
@@ -357,7 +394,9 @@ def _without_names(table: pa.Table, names: Sequence[str]) -> tuple[pa.Table, tup
 def _columns(
     file: Path, shape: Shape, table: pa.Table
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
-    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not read, and why."""
+    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not
+    read, and why.
+    """
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     values: dict[str, FloatArray] = {}
     clocks: dict[str, FloatArray] = {}
@@ -369,8 +408,8 @@ def _columns(
         elif not name:
             skipped.append(f"column {place} has no name")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
-            values[name], found, odd = numbers
-            marks |= found
+            values[name], column_marks, odd = numbers
+            marks |= column_marks
             skipped += [
                 f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
                 for text, row in odd.items()
@@ -378,12 +417,25 @@ def _columns(
         elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
             clocks[name] = seconds
         else:
-            skipped.append(f"column '{printable(name)}' holds text")
+            skipped.append(f"column '{printable(name)}' holds {_kind_of_text(column)}")
     return values, clocks, marks, skipped
 
 
+def _kind_of_text(column: pa.ChunkedArray) -> str:
+    """What the texts of a column are, and the way out where they are numbers in disguise."""
+    texts = column.cast(pa.string(), safe=False).drop_null()
+    for kind, pattern in DISGUISED.items():
+        example = texts.filter(compute.match_substring_regex(texts, pattern))
+        if len(example) > MIN_SHARE_OF_KIND * len(texts):
+            text = printable(example[0].as_py().strip())
+            return f"numbers with {kind}, such as '{text}'; export it without"
+    return "text"
+
+
 def _table(file: Path, shape: Shape) -> pa.Table:
-    """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as they stand."""
+    """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as
+    they stand.
+    """
     inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
     text = pc.ConvertOptions(
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
@@ -408,19 +460,15 @@ def _numbers(
     Few odd cells among numbers count as marks. None where the column holds anything else.
     """
     if not pa.types.is_string(column.type):
-        return (numbers_of(column), set(), {}) if _is_numeric(column.type) else None
+        return (numbers_of(column), set(), {}) if is_numeric(column.type) else None
     plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
     is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
     is_other = compute.fill_null(compute.invert(is_number), False)
-    others = compute.unique(column.filter(is_other)).to_pylist()
-    odd = [text for text in others if text.strip() and not marks_not_measured(text)]
+    other_texts = compute.unique(column.filter(is_other)).to_pylist()
+    odd = [text for text in other_texts if text.strip() and not marks_not_measured(text)]
     rows = {text: compute.index(column, text).as_py() + 1 for text in odd[:MAX_ODD_CELLS]}
     n_odd = compute.sum(compute.is_in(column, pa.array(odd, pa.string()))).as_py() or 0
     if len(odd) > MAX_ODD_CELLS or n_odd > MAX_ODD_SHARE * (compute.sum(is_number).as_py() or 0):
         return None
     column = compute.if_else(is_other, pa.scalar(None, pa.string()), plain)
-    return numbers_of(column), {text for text in others if text.strip()}, rows
-
-
-def _is_numeric(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+    return numbers_of(column), {text for text in other_texts if text.strip()}, rows

@@ -10,6 +10,7 @@ from pathlib import Path
 from vehest.data.errors import DataError, printable
 
 _CANDUMP = re.compile(r"\s*\(\d+(\.\d+)?\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
+_ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
 _NAMES_SIGNAL = re.compile(
     r"(signal|channel|sensor|kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
     r"topic|tag|key)(_?(name|id))?|\w*_name|name",
@@ -46,11 +47,16 @@ def require_columns_of_signals(
             f"'{file}' holds raw frames of a CAN bus as candump writes them; "
             "declare it with the bus's DBC (docs/sources/can.md), or save its decoded signals"
         )
+    if filled and sum(map(bool, map(_ALIGNED.fullmatch, filled))) > 0.9 * len(filled):
+        raise DataError(
+            f"'{file}' has columns that are aligned by blanks; put one mark between them, "
+            f"for example by: sed -E 's/^ +//; s/ +/;/g' {file.name} > {file.stem}.csv"
+        )
     for delimiter, rows in tables.items():
         table = [row for row in rows.values() if len(row) > 1]
         if table:
             _require_no_frames(file, table)
-            _require_one_row_a_time(file, table)
+            _require_wide_format(file, table)
         quoted = [row for row in rows.values() if len(row) == 1 and row[0].count(delimiter) > 1]
         if delimiter in ";\t," and len(quoted) > 0.9 * len(rows) and filled[-1].startswith('"'):
             raise DataError(
@@ -75,7 +81,7 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
             )
 
 
-def _require_one_row_a_time(file: Path, table: Sequence[Sequence[str]]) -> None:
+def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
     for at, header in enumerate(table[:20]):
         rows = [row for row in table[at + 1 :] if len(row) == len(header)]
         of_signal = [k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip())]
