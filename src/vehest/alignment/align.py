@@ -132,13 +132,24 @@ def in_words(name: str, value: float) -> str:
 
 
 def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
-    """Estimate the quantities that are asked for; the recording stays as it is.
+    """Estimate the quantities that are requested; the recording stays as it is.
 
-    The steering ratio is estimated last, on the drive as the other transforms would correct it. It needs ``handwheel`` or ``steer``,
-    ``vx``, ``yaw_rate`` and ``ay``; all others ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``).
+    The steering ratio is estimated last, on the drive as the other transforms would correct it.
 
-    Raises `DataError`: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
-    drive cannot tell the parameters apart. Raises `ConfigurationError`: the cut-off is too high for the recording's rate.
+    Parameters
+    ----------
+    recording : Recording
+        With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio; with
+        ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
+    settings : AlignmentSettings
+
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, the recording is too short, sensor and reference have
+        nothing in common, or the parameters cannot be separated in this drive.
+    ConfigurationError
+        The cut-off is too high for the recording's rate.
     """
     parameters: list[Parameter] = []
     transforms: list[dict[str, Any]] = []

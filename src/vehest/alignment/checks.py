@@ -59,9 +59,14 @@ MIN_TURN = 0.03  # m/s, rad/s; between them the signs of ay and steering say whi
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
-    """All checks of a recording's samples, the gravest findings first; of a long drive part by part (`merged_findings`).
+    """Check the samples of a recording; a long drive part by part.
 
     Of a part of a drive in which the car stands throughout only impossible values count.
+
+    Returns
+    -------
+    list of Finding
+        Errors first, then warnings, then notes; merged over the parts by `merged_findings`.
     """
     slices = part_slices(len(recording), recording.rate_hz)
     is_undivided = len(slices) == 1 and PART not in recording.provenance
@@ -92,7 +97,21 @@ def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
 
 
 def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> list[Finding]:
-    """What `checks_of_recording` finds; raises `DataError`, beginning with ``place``, where one that is not accepted is an error."""
+    """Findings of a recording, of which none may be an error.
+
+    Parameters
+    ----------
+    recording : Recording
+    accepted : collection of str
+        Checks whose errors are accepted.
+    place : str
+        Beginning of an error's message.
+
+    Raises
+    ------
+    DataError
+        A finding of a check that is not accepted is an error.
+    """
     findings = checks_of_recording(recording)
     for finding in findings:
         if finding.level == "error" and finding.check not in accepted:

@@ -44,8 +44,11 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
     velocity shrinks neither. Bins have the weight that the residual leaves them. Channels are shifted and fitted again until
     next to nothing is left, since turning the phase of a segment does not shift its ends.
 
-    Returns:
-        None where a channel is missing, the drive is too short, or d(vy)/dt does not explain ay without vx·yaw_rate.
+    Returns
+    -------
+    tuple of Measured, or None
+        τ₁, τ₂ and their difference [s]; None where a channel is missing, the drive is too short, or
+        d(vy)/dt does not explain ay without vx·yaw_rate.
     """
     if (
         not motion.velocity

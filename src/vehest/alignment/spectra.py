@@ -70,7 +70,21 @@ class CrossSpectra:
 def cross_spectra(
     signals: Mapping[str, FloatArray], rate_hz: float, selected: BoolArray | None = None
 ) -> CrossSpectra | None:
-    """Welch's cross-spectra in the band, from segments of ``used`` samples, (T,) as signals, under a Hann window; None where too short."""
+    """Estimate cross-spectra in the band by Welch's method under a Hann window.
+
+    Parameters
+    ----------
+    signals : mapping of str to (T,)
+    rate_hz : float
+        Sampling rate.
+    selected : (T,) of bool, optional
+        Only segments whose samples are all selected count.
+
+    Returns
+    -------
+    CrossSpectra or None
+        None where the drive is too short or too slowly sampled.
+    """
     duration = len(next(iter(signals.values()), ())) / rate_hz
     if duration < MIN_DRIVE_SECONDS or rate_hz < MIN_RATE_HZ:
         return None
@@ -171,7 +185,18 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not the mean phase. Each bin has the
     weight of maximum likelihood, coherence² / (1 - coherence²) (Hannan & Thomson, Biometrika 60 (3), 1973).
 
-    ``low_pass`` says whether T is fitted too. None where a signal is missing, or the two are hardly coherent.
+    Parameters
+    ----------
+    spectra : CrossSpectra
+    source, follower : str
+        Names of the signals.
+    low_pass : bool
+        Whether T is fitted, else 0.
+
+    Returns
+    -------
+    Lag or None
+        None where a signal is missing, or the coherence is too low.
     """
     if not {source, follower} <= set(spectra.names):
         return None

@@ -90,7 +90,20 @@ class Angle(NamedTuple):
 
 
 def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ...]]:
-    """The assignment with most evidence in all, and notes of columns that are left out."""
+    """Assign ax, a steering angle, and a lateral velocity or sideslip angle.
+
+    Parameters
+    ----------
+    search : Search
+        Columns that get a channel are removed from ``search.free``.
+
+    Returns
+    -------
+    channels : dict of str to Proposal
+        The assignment of columns to channels with most evidence in all.
+    notes : tuple of str
+        Columns that are left out, with the reason.
+    """
     columns = list(search.free)
     offers = [
         [offer(search, column) for column in columns]
@@ -364,7 +377,7 @@ def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
 
 
 def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -> Agreement:
-    """A column as ``ax`` in the unit whose scale agrees best, of those given or all."""
+    """Agreement of a column with d(vx)/dt, in the unit (of ``units``, or all) with a gain near 1."""
     agreements = (
         agreement(motion, column, "ax", unit, "ax") for unit in units or column.units("ax")
     )
@@ -374,7 +387,26 @@ def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -
 def agreement(
     motion: Motion, column: Candidate, channel: str, unit: str, left: str, *, offset: float = 0.0
 ) -> Agreement:
-    """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
+    """Compare a column, as a channel, with a motion.
+
+    Parameters
+    ----------
+    motion : Motion
+        Speed, yaw rate and, where known, lateral acceleration.
+    column : Candidate
+        With values (T,).
+    channel, unit : str
+        What the column is assumed to be.
+    left : str
+        Left side of the relation that is evaluated (`vehest.alignment.signs.relations_of`).
+    offset : float
+        Value of the column at zero, in ``unit``.
+
+    Returns
+    -------
+    Agreement
+        With strength 0 where the drive does not show the relation.
+    """
     samples = (column.values - offset) * si_factor(unit, channel)
     if channel == "sideslip_ref":
         samples = np.where(np.abs(motion.vx) < CRAWL_SHARE * largest(motion.vx), 0.0, samples)
@@ -399,7 +431,11 @@ def agreement(
 
 
 def angles(motion: Motion, column: Candidate) -> list[Angle]:
-    """Road wheel or steering wheel in each unit that range and slow corners allow, by angle = length·yaw_rate/vx + K·ay + offset."""
+    """Road-wheel or steering-wheel angles, in each unit that range and slow corners allow.
+
+    The length in angle = length·yaw_rate/vx + K·ay + offset is the wheelbase, or that times the
+    steering ratio.
+    """
     ay = motion.channels.get("ay", motion.turning)
     driven = _driven(motion)
     calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
@@ -439,7 +475,10 @@ def _driven(motion: Motion) -> BoolArray:
 def _regressed(
     motion: Motion, column: Candidate, selected: BoolArray, *regressors: FloatArray
 ) -> tuple[float, float]:
-    """Change of a column by yaw_rate/vx [its unit · m], and its value straight ahead; further regressors are fitted beside them."""
+    """Change of a column by yaw_rate/vx [its unit · m], and its value straight ahead.
+
+    Further ``regressors`` (T,) are fitted together with them.
+    """
     rows = [
         motion["yaw_rate"][selected] / motion.vx[selected],
         *(samples[selected] for samples in regressors),

@@ -96,7 +96,18 @@ class Search:
 
 
 def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
-    """Triples that may be speed, yaw rate and lateral acceleration, the best first."""
+    """Find triples that may be speed, yaw rate and lateral acceleration, by ay ≈ vx·yaw_rate.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        With signals (S,) below 1 Hz, on one clock.
+
+    Returns
+    -------
+    list of Turning
+        At most `MAX_TURNINGS` with a score of `MIN_SCORE` or more, the best first.
+    """
     speeds, rates, accelerations = (_pool(columns, channel) for channel in RANGES)
     if not (speeds and rates and accelerations):
         return []
@@ -128,7 +139,7 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, where no lateral acceleration ties them together; None without one of them."""
+    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing."""
     columns_by_channel = {}
     units = {}
     for channel in ("vx", "yaw_rate"):
@@ -205,7 +216,10 @@ def _is_forward(slow: FloatArray) -> bool:
 
 
 def is_evident(ay: Candidate, scale: float) -> bool:
-    """Whether a unit, a clear name or a scale near 1 over vx·yaw_rate indicates a lateral acceleration; a velocity follows a turn alike."""
+    """Whether a unit, a clear name or a gain near 1 to vx·yaw_rate indicates an acceleration.
+
+    A lateral velocity follows a turn alike.
+    """
     return (
         bool(ay.unit) or ay.hints.get("ay") == STRONG or abs(math.log(scale)) < MAX_EVIDENT_MISMATCH
     )
@@ -222,8 +236,10 @@ def _scored(
     correlation_with_ay: float,
     file_gain: float,
 ) -> Turning:
-    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, others than by the header only where these
-    are far from it, and the score of all evidence."""
+    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all evidence.
+
+    Units other than the header's are chosen only where these are far from the gain.
+    """
     ranked = []
     tried = [
         {*column.units(channel), *(() if column.is_wheel_mean else UNITS[channel])}
@@ -301,7 +317,18 @@ class Repeat(NamedTuple):
 
 
 def repeated(search: Search) -> Iterator[Proposal]:
-    """Proposals for speeds, yaw rates and lateral accelerations that are measured twice, those of the motion among them."""
+    """Propose channels for speeds, yaw rates and lateral accelerations that are measured twice.
+
+    Parameters
+    ----------
+    search : Search
+        Columns that repeat one of its motion are removed from ``search.free``.
+
+    Yields
+    ------
+    Proposal
+        The car's own and the reference's, also for the column of the motion itself.
+    """
     for channel in MIN_NAMED_REPEAT_CORRELATION:
         first = Repeat(
             search.turning.columns[channel],
@@ -347,7 +374,10 @@ def repeated(search: Search) -> Iterator[Proposal]:
 
 
 def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
-    """With a speed that is named as a reference, or like the lateral velocity, as the reference's, where wheels can give the car's own."""
+    """With the speed as vx_ref where it is named as a reference, or like the lateral velocity.
+
+    Wheels supply the car's own speed.
+    """
     speed = channels.get("vx")
     lateral = channels.get("vy_ref")
     if speed is None or lateral is None or "vx_ref" in channels:
@@ -387,7 +417,10 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
 
 
 def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[Proposal]:
-    """The car's own speed in counts, and the reference's by which it is scaled; the first one's unit may be ``decided`` by the motion."""
+    """The car's own speed in counts, and the reference's by which it is scaled.
+
+    ``decided``: whether the motion decides the unit of ``first``.
+    """
     if column.is_reference and not (first.column.is_reference or first.column.unit or decided):
         column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
@@ -408,7 +441,7 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
 
 
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
-    """The car's own and the reference's of columns that measure the same; more than these two are left out."""
+    """The car's own and the reference's of columns that measure the same; others are left out."""
     plain = [repeat for repeat in family if not is_filtered(repeat.column.name)] or list(family)
     of_car = [repeat for repeat in plain if repeat.column.is_of_bus] or [
         repeat for repeat in plain if not repeat.column.is_reference

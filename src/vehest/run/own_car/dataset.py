@@ -83,7 +83,13 @@ class Draft:
 
 
 def draft(examined: Examined) -> Draft:
-    """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
+    """Make a data set of the proposals, and read it as an ingest does.
+
+    Raises
+    ------
+    VehestError
+        It cannot be read.
+    """
     complete = [
         proposal
         for proposal in examined.proposals.channels

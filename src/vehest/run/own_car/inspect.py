@@ -98,9 +98,27 @@ def inspect(
     *,
     force: bool = False,
 ) -> Examined:
-    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column.
+    """Read logs and propose a channel, unit and sign for each column.
 
-    Raises `ConfigurationError` for a taken name or several formats or folders, `MissingError` without a file, `DataError` for a bad one.
+    Parameters
+    ----------
+    name : str
+        Of the data set.
+    files : sequence of Path
+        Of one format, with the same columns.
+    vehicle : mapping of str to float or None, optional
+        Values of `VEHICLE`.
+    force : bool
+        Whether the files of the data set may exist.
+
+    Raises
+    ------
+    ConfigurationError
+        The name is taken, or the files are of several formats or folders.
+    MissingError
+        A file does not exist.
+    DataError
+        A file cannot be read.
     """
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]

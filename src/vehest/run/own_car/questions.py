@@ -54,7 +54,28 @@ ORIGIN = Question(
 def ask(
     examined: Examined, answers: Sequence[str] = (), *, interactive: bool
 ) -> tuple[Examined, tuple[Question, ...]]:
-    """Answer logs' open questions, by ``KEY=ANSWER`` or at the terminal; returns logs and questions left; raises `ConfigurationError`."""
+    """Answer the open questions of logs.
+
+    Parameters
+    ----------
+    examined : Examined
+    answers : sequence of str
+        ``KEY=ANSWER`` each.
+    interactive : bool
+        Whether other questions are asked at the terminal; else the proposals are accepted.
+
+    Returns
+    -------
+    examined : Examined
+        With the answers.
+    questions : tuple of Question
+        Those that were answered as proposed.
+
+    Raises
+    ------
+    ConfigurationError
+        An answer is invalid, or no channel remains.
+    """
     questions = list(questions_of(examined))
     keys = [*(question.key for question in questions), ORIGIN.key]
     answers_by_key: dict[str, str] = {}

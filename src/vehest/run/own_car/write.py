@@ -126,9 +126,31 @@ def write(
     *,
     dry_run: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines.
+    """Write data set, split and pipeline, all or none; the data set alone if nothing can be trained.
 
-    Raises `MissingError` where the disk is full or a folder cannot be written to, `VehestError` where the data set cannot be read.
+    Parameters
+    ----------
+    examined : Examined
+    left : sequence of Question
+        Questions that were answered as proposed.
+    added : sequence of str
+        Estimators that are compared besides the default ones.
+    dry_run : bool
+        Whether nothing is written.
+
+    Returns
+    -------
+    plain : dict
+        The outcome, for JSON.
+    lines : list of str
+        The outcome, for a terminal.
+
+    Raises
+    ------
+    MissingError
+        The disk is full, or a folder cannot be written to.
+    VehestError
+        The data set cannot be read.
     """
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
