@@ -164,9 +164,11 @@ def test_json_says_all_of_it_to_a_script(log):
         ["left_right", "kind"],
         True,
     )
-    assert said["lacking"]["data_sheet"] == "the car's wheelbase"
+    assert said["lacking"]["data_sheet"] == "requires the car's wheelbase (--wheelbase)"
     assert not any(Path(file).exists() for file in FILES)
-    assert json.loads(log.new("lap.csv", "--json", "--answer", "left_right=no")[0])["open"] == []
+    answers = ("--answer", "left_right=no", "--answer", "kind=simulated")
+    assert json.loads(log.new("lap.csv", "--json", *answers)[0])["open"] == []
+    assert held(0)["kind"] == "simulated"
     before = [Path(file).read_text() for file in FILES]
     out, err = log.new("lap.csv", "--json", "--dry-run", "--answer", "gear=3", code=2)
     assert err == f"error: {json.loads(out)['stopped']}\n", "a stop gives what was found"
