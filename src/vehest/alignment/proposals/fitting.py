@@ -124,7 +124,7 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
     second_offers = [
         offer for offer in rivals[2] if references and offer.proposal.channel not in references
     ]
-    second = max(second_offers, key=lambda column: column.score, default=None)
+    second = max(second_offers, key=lambda offer: offer.score, default=None)
     if second is None or second.score < MIN_SECOND_SCORE:
         return proposals, ()
     search.free.remove(second.column)
@@ -289,25 +289,21 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
         for unit in column.units(channel)
     ]
     agreements = sorted(
-        (candidate for candidate in agreements if _is_plausible(motion, column, candidate)),
-        key=lambda candidate: 0.3 * candidate.mismatch - 2.0 * candidate.strength,
+        (fit for fit in agreements if _is_plausible(motion, column, fit)),
+        key=lambda fit: 0.3 * fit.mismatch - 2.0 * fit.strength,
     )
     if not agreements:
         return None
     hints = {channel: column.hints.get(channel, 0.0) for channel in REFERENCES}
     best = max(
         agreements,
-        key=lambda candidate: (
-            4.0 * candidate.strength - 0.6 * min(candidate.mismatch, 5.0) + hints[candidate.channel]
-        ),
+        key=lambda fit: 4.0 * fit.strength - 0.6 * min(fit.mismatch, 5.0) + hints[fit.channel],
     )
     hint = hints[best.channel]
     rivals = [
-        candidate
-        for candidate in agreements
-        if candidate.channel != best.channel
-        and candidate.strength > best.strength - 0.05
-        and not hint
+        fit
+        for fit in agreements
+        if fit.channel != best.channel and fit.strength > best.strength - 0.05 and not hint
     ]
     is_clear = best.strength >= CLEAR_LATERAL_CORRELATION or (
         best.strength >= MIN_STRENGTH and hint > 0.0
@@ -325,13 +321,7 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
         question = "its values contradict its name"
     evidence = (best.text or "name only", *_name_evidence(column, *REFERENCES))
     alternatives = (
-        tuple(
-            dict.fromkeys(
-                f"{candidate.channel} {candidate.unit}"
-                for candidate in agreements
-                if candidate is not best
-            )
-        )
+        tuple(dict.fromkeys(f"{fit.channel} {fit.unit}" for fit in agreements if fit is not best))
         if question
         else ()
     )
@@ -356,14 +346,12 @@ def _score(strength: float, min_strength: float, hint: float) -> float:
     return 8.0 * (strength - min_strength) / (1.0 - min_strength) + hint if strength else hint - 1.0
 
 
-def _is_plausible(motion: Motion, column: Candidate, candidate: Agreement) -> bool:
+def _is_plausible(motion: Motion, column: Candidate, fit: Agreement) -> bool:
     """Whether a car can slide like that, within a factor of what is rare."""
-    size = float(np.quantile(np.abs(column.values), 0.9)) * si_factor(
-        candidate.unit, candidate.channel
-    )
+    size = float(np.quantile(np.abs(column.values), 0.9)) * si_factor(fit.unit, fit.channel)
     return (
         size < 1.5 * float(np.quantile(motion.vx, 0.9))
-        if candidate.channel == "vy_ref"
+        if fit.channel == "vy_ref"
         else 5e-4 < size < 1.6
     )
 
@@ -381,7 +369,7 @@ def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -
     agreements = (
         agreement(motion, column, "ax", unit, "ax") for unit in units or column.units("ax")
     )
-    return min(agreements, key=lambda candidate: candidate.mismatch)
+    return min(agreements, key=lambda fit: fit.mismatch)
 
 
 def agreement(

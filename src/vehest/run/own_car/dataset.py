@@ -515,18 +515,20 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
     channels = [
-        (CHANNELS[name], samples) for item in recordings for name, samples in item.channels.items()
+        (CHANNELS[name], samples)
+        for recording in recordings
+        for name, samples in recording.channels.items()
     ]
     if not any(
-        0.0 < ((samples < item.low) | (samples > item.high)).mean() <= MOST_BRIDGED
-        for item, samples in channels
+        0.0 < ((samples < limits.low) | (samples > limits.high)).mean() <= MOST_BRIDGED
+        for limits, samples in channels
     ):
         return []
     assigned = {proposal.column for proposal in examined.proposals.channels}
     rates = [
-        rate_of(item.stamps)
-        for item in examined.log.columns
-        if item.stamps is not None and item.name in assigned
+        rate_of(column.stamps)
+        for column in examined.log.columns
+        if column.stamps is not None and column.name in assigned
     ]
     return [
         {

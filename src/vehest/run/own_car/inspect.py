@@ -302,9 +302,9 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
 
 def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     """Folder of the files, pattern that they match, and stems of further files that match."""
-    folder, *more_folders = sorted({file.resolve().parent for file in files})
-    if more_folders:
-        listed = ", ".join(map(str, (folder, *more_folders)))
+    folder, *other_folders = sorted({file.resolve().parent for file in files})
+    if other_folders:
+        listed = ", ".join(map(str, (folder, *other_folders)))
         raise ConfigurationError(
             f"the files are in several folders ({listed}); put them into one, or create a data set for each folder"
         )
@@ -327,12 +327,14 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     unlisted = sorted(
         file.name for file in folder.iterdir() if file.is_file() and file.name not in names
     )
-    strangers = [Path(name).stem for name in matching(unlisted, pattern)]
-    if strangers and source not in TABLES:
+    unlisted_matches = [Path(name).stem for name in matching(unlisted, pattern)]
+    if unlisted_matches and source not in TABLES:
         raise ConfigurationError(
-            f"'{folder}' contains other files of that name ('{strangers[0]}'); use a folder with the files of the data set only"
+            f"'{folder}' contains other files of that name ('{unlisted_matches[0]}'); use a folder with the files of the data set only"
         )
-    return {"path": path, "files": pattern} | ({"exclude": strangers} if strangers else {})
+    return {"path": path, "files": pattern} | (
+        {"exclude": unlisted_matches} if unlisted_matches else {}
+    )
 
 
 def _evidence(

@@ -165,7 +165,11 @@ def write(
         else Plan()
     )
     plan.lacking.update(
-        {name_: "these recordings allow no comparison" for name_ in added if not plan.sweeps}
+        {
+            added_name: "these recordings allow no comparison"
+            for added_name in added
+            if not plan.sweeps
+        }
     )
     texts = [_dataset_text(drafted, left)]
     if plan.sweeps:
@@ -373,20 +377,20 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
     vehicle = drafted.examined.vehicle
     plan = Plan()
     values = _car(vehicle)
-    slowest = min(own.rate_hz for own in contents)
+    slowest = min(recording.rate_hz for recording in contents)
     cut = _divisible(drafted)
     shares = (
-        [0.2 * drafted.durations[own] for own in cut]
+        [0.2 * drafted.durations[recording] for recording in cut]
         if cut
-        else [drafted.durations[own] for own in _long_enough(drafted)]
+        else [drafted.durations[recording] for recording in _long_enough(drafted)]
     )
     seconds = min(
         shares, default=0.0
     )  # the shortest of the longest range for training and all those for validation
-    own = [(ADDED, name) for name in added if not estimator_class(name).trials]
+    added_trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
     trials = sorted(
         [
-            *own,
+            *added_trials,
             *(
                 (trial, name)
                 for name, family in estimator_classes().items()
