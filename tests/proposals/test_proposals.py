@@ -642,7 +642,7 @@ def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossibl
     remarks = draft(
         in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))
     ).remarks
-    assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
+    assert any("in 'lap_2', ay vs. vx·yaw_rate: gain 3.6" in one for one in remarks)
     marked = in_two_files(
         tmp_path,
         lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))),
