@@ -687,7 +687,7 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
         (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
     with pytest.raises(
         DataError,
-        match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike",
+        match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; use the same unit in both",
     ):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
     write(tmp_path / "lap_1.csv", usual(drive(90.0)))
