@@ -425,7 +425,9 @@ def test_stated_limits_of_checks_are_those_of_the_code():
         f"lies below -{checks.REVERSE_SPEED:g} m/s for {checks.REVERSE_SECONDS:g} s or more" in text
     )
     low, high = checks.KINEMATIC_BAND_HZ
-    assert f"correlation below {checks.SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
+    assert (
+        f"correlation below {checks.MIN_SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
+    )
 
 
 def test_stated_parameter_counts_of_recurrent_networks_and_the_ksnn():

@@ -154,9 +154,7 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, ref
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=reference_rate)
     found = align(recording, AlignmentSettings(IMU))
     assert_recovered(found, PLANTED, tuple(PLANTED))
-    assert any(
-        re.search(r"3\.[567] % of it in ax and 5\.[789] % in ay", note) for note in found.notes
-    )
+    assert any(re.search(r"3\.[567] % in ax and 5\.[789] % in ay", note) for note in found.notes)
     for residual in found.residuals[:2]:
         assert (
             residual.rms["rest"] < 0.045 < residual.rms["after"]
@@ -175,7 +173,7 @@ def test_measured_roll_and_pitch_take_gravity_off_and_a_sensor_mounted_crosswise
     found = align(recording, AlignmentSettings(IMU))
     assert_recovered(found, PLANTED, tuple(PLANTED))
     assert found["offset_ax"].value == pytest.approx(0.15, abs=0.003)  # without the mean pitch
-    assert any(re.search(r"shows -?0\.[01] % of it in ax", note) for note in found.notes)
+    assert any(re.search(r"acceleration: -?0\.[01] % in ax", note) for note in found.notes)
     truth = PLANTED | {"yaw": math.radians(-90.0)}
     found = align(recorded(motion, truth, reference_rate=True), AlignmentSettings(IMU))
     assert_recovered(found, truth, tuple(PLANTED))
@@ -222,7 +220,7 @@ def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion):
         *QUANTITIES["lever_arm"],
         *QUANTITIES["offsets"],
     }
-    assert "Not asked for and taken as zero: mounting, delay." in found.notes
+    assert "Not requested and assumed to be zero: mounting, delay." in found.notes
 
 
 RATE = 50.0
@@ -322,13 +320,13 @@ def test_unmeasured_tilt_adds_to_the_uncertainty():
 def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
     circle = weaving(0, turning=False, varying=False, noise=0.02)
     with pytest.raises(
-        DataError, match=r"cannot tell lever_y and offset_ay apart \(condition number"
+        DataError, match=r"lever_y and offset_ay cannot be separated .*\(condition number"
     ):
         align(circle, AlignmentSettings(("lever_arm", "offsets")))
     constant = weaving(0, varying=False)
     constant = constant.select([name for name in constant.channels if name != "yaw_rate_ref"])
     with pytest.raises(
-        DataError, match=r"cannot tell offset_ay and offset_yaw_rate apart \(condition number"
+        DataError, match=r"offset_ay and offset_yaw_rate cannot be separated .*\(condition"
     ):
         align(constant, AlignmentSettings(("offsets",)))
     still = replace(
@@ -342,7 +340,7 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
     ours = weaving(0)
     other = weaving(1)
     mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
-    with pytest.raises(DataError, match=r"correlate by .* at most"):
+    with pytest.raises(DataError, match=r"has a correlation of at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
     with pytest.raises(DataError, match="raise max_delay"):
         align(
@@ -384,7 +382,7 @@ def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion
         recording.select([name for name in recording.channels if name != "vx_ref"]),
         AlignmentSettings(("offsets", "mounting")),
     )
-    assert any("no vx_ref" in note for note in found.notes)
+    assert any("No vx_ref" in note for note in found.notes)
 
 
 def test_gaps_short_recordings_and_slow_ones_are_refused():
@@ -404,7 +402,7 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
     [
         (
             {"estimate": ()},
-            "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
         ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
@@ -579,7 +577,7 @@ def test_a_ratio_lies_within_two_deviations_on_every_recording_of_known_ratio(
 def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused():
     road = single_track(15.5, 0.0)
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
-    with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
+    with pytest.raises(DataError, match=r"only .* s with vx ≥ 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
     with pytest.raises(ConfigurationError, match="needs the wheelbase"):
         align(road, replace(settings, wheelbase=None))
@@ -727,7 +725,7 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert "simulated" in lines[0]
-    assert "nothing is applied" in lines[0]
+    assert "no correction is applied" in lines[0]
     assert lines[1].split() == [
         "quantity",
         "estimate",
@@ -742,7 +740,7 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     assert any(line.startswith("delay ") and "ms" in line for line in lines)
     assert any(line.startswith("yaw ") and "deg" in line for line in lines)
     assert any(line.startswith("ay ") for line in lines)
-    assert lines[-1].startswith("to correct it: 'downsample.transforms=[{name: delay_correction, ")
+    assert lines[-1].startswith("to apply the corrections: 'downsample.transforms=[{name: delay_")
     assert files() == before
     code, out, _ = called(*ASKED, "--json")
     assert code == 0
@@ -761,7 +759,7 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
 
 def test_printed_override_is_one_that_downsample_takes(called):
     _, out, _ = called(*ASKED)
-    override = out.splitlines()[-1].removeprefix("to correct it: ").strip("'")
+    override = out.splitlines()[-1].removeprefix("to apply the corrections: ").strip("'")
     composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override])[
         "downsample"
     ]
@@ -793,14 +791,14 @@ def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     assert [row["name"] for row in rows] == list(PLANTED)
     assert {row["kind"] for row in rows} == {"simulated"}
     report = (folder / "alignment.md").read_text(encoding="utf-8")
-    assert "nothing is applied" in report
+    assert "no correction is applied" in report
     assert "| delay |" in report
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
     before = files()
     code, _, err = called(*ASKED, "-o", "found")
     assert (code, err) == (
         2,
-        "error: folder 'found' holds other files ('notes.txt'); name a new one\n",
+        "error: folder 'found' contains other files ('notes.txt'); name a new one\n",
     )
     assert files() == before
 
@@ -823,7 +821,7 @@ def test_steering_alone_is_written_too(called):
         (
             ("weave.parquet",),
             2,
-            "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
         ),
         (
             ("sim_quickstart", "-e", "delay"),
@@ -834,7 +832,7 @@ def test_steering_alone_is_written_too(called):
         (
             ("weave.parquet", "-e", "delay", "-r", "other"),
             2,
-            "holds the recording 'weave', not 'other'",
+            "contains the recording 'weave', not 'other'",
         ),
         (("weave.parquet", "-e", "delay", "-o", "weave.parquet"), 2, "is not a folder"),
     ],

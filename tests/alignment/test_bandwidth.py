@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from broadband_drive import Wave, broadband_drive, without
 
-from vehest.alignment.bandwidth import held_rate
+from vehest.alignment.bandwidth import update_rate_hz
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.spectra import cross_spectra, lag_of
 from vehest.configuration.composition import compose_config
@@ -55,27 +55,27 @@ def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do_a
     alone = ("ay", "yaw_rate_ref", "vy_ref", "sideslip_ref")
     assert not found_by("bandwidth", without(broadband_drive(), *alone))
     found = found_by("bandwidth", without(broadband_drive(slow_yaw_rate=0.5), *alone))
-    assert "more than the 0.3 s that cars take" in found["yaw_rate"].message
+    assert "more than the 0.3 s usual for cars" in found["yaw_rate"].message
 
 
 @pytest.mark.parametrize("step", [2, 5, 10, 33])
 def test_a_held_channel_changes_at_its_own_rate(step):
     samples = np.repeat(np.random.default_rng(0).standard_normal(4000 // step + 1), step)[:4000]
-    assert held_rate(samples, 100.0) == pytest.approx(100.0 / step)
+    assert update_rate_hz(samples, 100.0) == pytest.approx(100.0 / step)
 
 
 def test_held_rates_are_those_of_a_sensors_own_clock_and_none_of_noise_or_slow_steps():
     newest = (np.arange(4000) * 0.4).astype(int)
-    assert held_rate(
+    assert update_rate_hz(
         np.random.default_rng(0).standard_normal(2000)[newest], 100.0
     ) == pytest.approx(45.0, abs=6.0)
     time = np.arange(6000) / 100.0
     for resolution in (0.05, 0.2):
-        assert held_rate(np.round(np.sin(0.3 * time) / resolution) * resolution, 100.0) is None
-    assert held_rate(np.random.default_rng(0).standard_normal(1000), 100.0) is None
-    assert held_rate(np.ones(1000), 100.0) is None
-    assert held_rate(np.full(1000, np.nan), 100.0) is None
-    assert held_rate(np.ones(0), 100.0) is None
+        assert update_rate_hz(np.round(np.sin(0.3 * time) / resolution) * resolution, 100.0) is None
+    assert update_rate_hz(np.random.default_rng(0).standard_normal(1000), 100.0) is None
+    assert update_rate_hz(np.ones(1000), 100.0) is None
+    assert update_rate_hz(np.full(1000, np.nan), 100.0) is None
+    assert update_rate_hz(np.ones(0), 100.0) is None
 
 
 def test_channels_held_together_are_told_of_together_by_what_it_delays():
@@ -90,7 +90,7 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays():
     (slow,) = found_by("held", held(10)).values()
     assert (slow.level, slow.channel) == ("warning", "ax")
     assert (
-        "changes about 10 times a second at 100 Hz and is held in between, which delays it by 50 ms on average, and so do ay"
+        "updated at only 10 Hz and held in between (also ay), in a recording at 100 Hz, which delays it by 50 ms on average"
         in slow.message
     )
     (fast,) = found_by("held", held(2)).values()

@@ -87,24 +87,24 @@ def test_a_clean_drive_is_noted_to_follow_the_kinematics_and_a_bias_is_the_accel
     notes = [finding for finding in checks_of_recording(clean_drive()) if finding.level == "note"]
     assert [(note.check, note.channel) for note in notes] == [("kinematics", "vy_ref")]
     note = checks_of_recording(changed(clean_drive(noise=0.0), ay=lambda ay: ay + 0.25))[0]
-    assert "mean bias -0.250 m/s²" in note.message
+    assert "mean difference -0.250 m/s²" in note.message
 
 
 def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
     found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
     assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
     assert "1 samples" in found.message
-    assert "500 m/s² at 22.34 s" in found.message
+    assert "500 m/s² at t = 22.34 s" in found.message
     found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
     assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
-    assert "degrees" in found[0].message
+    assert "if the column is in degrees, set its unit" in found[0].message
 
 
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
     found = only_complaint(changed(clean_drive(), ay=np.negative, yaw_rate=np.negative))
     assert (found.level, found.check, found.channel) == ("warning", "sign", "")
     assert (
-        "either ay and yaw_rate together or sideslip_ref, steer and vy_ref together point the other way"
+        "set sign: -1 for ay and yaw_rate together or sideslip_ref, steer and vy_ref together"
         in found.message
     )
 
@@ -132,10 +132,10 @@ def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_
 def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held_ones_are_not():
     found = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
     assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
-    assert "stays at 1.5 m/s² for 2.5 s from 30 s" in found.message
+    assert "constant at 1.5 m/s² for 2.5 s from t = 30 s" in found.message
     found = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
     assert (found.check, found.channel) == ("stuck", "steer")
-    assert "never changes: 0.02 rad" in found.message
+    assert "constant at 0.02 rad throughout" in found.message
     assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
     assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [
         ("warning", "held", "steer")
@@ -164,12 +164,12 @@ def test_stuck_channels_are_told_from_standstill():
         if one.check == "stuck"
     ]
     assert [finding.channel for finding in found] == ["vx"]
-    assert "stays at 0 m/s for 10 s from 30 s" in found[0].message
+    assert "constant at 0 m/s for 10 s from t = 30 s" in found[0].message
     found = only_complaint(
         changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200))
     )
     assert (found.check, found.channel) == ("stuck", "steer")
-    assert "0.03 rad for 2 s from 50 s" in found.message
+    assert "0.03 rad for 2 s from t = 50 s" in found.message
 
 
 @pytest.mark.parametrize(
@@ -243,20 +243,20 @@ def reversing(recording):
 def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
     (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
     assert (found.level, found.channel) == ("note", "vx")
-    assert "goes backwards 2 times" in found.message
-    assert "the longest for 2.5 s from 40 s, lowest -2 m/s" in found.message
-    assert "start and stop of a split" in found.message
+    assert "reversing in 2 segments" in found.message
+    assert "the longest for 2.5 s from t = 40 s, minimum -2 m/s" in found.message
+    assert "start and stop in the split" in found.message
     assert "sign: -1" in found.message
     (found,) = reversing(changed(clean_drive(), vx=np.negative))
-    assert "goes backwards 1 times" in found.message
-    assert "for 60 s from 10 s" in found.message
+    assert "reversing in 1 segment (" in found.message
+    assert "for 60 s from t = 10 s" in found.message
 
 
 def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed():
     drive = backwards(clean_drive(), (1000, 1150))
     forwards = changed(drive, vx=np.abs)
     assert [
-        (found.level, "has no sign: the car goes backwards 1 times" in found.message)
+        (found.level, "unsigned: positive while the car reverses in 1 segment" in found.message)
         for found in reversing(forwards)
     ] == [("warning", True)]
     without = replace(
@@ -287,7 +287,9 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
     drive = replace(drive, channels={**drive.channels, "handwheel": handwheel})
     found = [one for one in checks_of_recording(drive) if one.check == "spike"]
     assert [one.channel for one in found] == ["handwheel"] * is_found
-    assert all("jumps once" in one.message and "7.3 rad at 40 s" in one.message for one in found)
+    assert all(
+        "1 spike of" in one.message and "7.3 rad at t = 40 s" in one.message for one in found
+    )
 
 
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():

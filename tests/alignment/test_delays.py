@@ -144,7 +144,7 @@ def test_slipping_wheels_are_not_reported_and_late_ones_once():
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
     wheels = {f"wheel_speed_{wheel}": late for wheel in ("fl", "fr", "rl", "rr")}
     (found,) = reported(replace(drive, channels={**drive.channels, **wheels})).values()
-    assert "with the other wheels, 59 ms" in found.message
+    assert "like the other wheels, by 59 ms" in found.message
 
 
 @pytest.fixture

@@ -69,22 +69,17 @@ def test_several_reversed_channels_are_all_named_with_the_products_that_contradi
     assert signs(turned(broadband_drive(), "ax", "ay")) == ["ax", "ay"]
     (found,) = warned(turned(without(broadband_drive(), *REFERENCES), "ay"))
     assert found.channel == "ay"
-    assert found.message.startswith("ay and vx·yaw_rate disagree in sign (correlation -")
-    assert "steer and yaw_rate" in found.message.split("agree: ")[0].split(";")[1]
-    assert (
-        "ay points the other way, unless steer and yaw_rate together do; set sign: -1"
-        in found.message
-    )
+    assert found.message.startswith("sign reversed (ay vs. vx·yaw_rate: correlation -")
+    assert "consistent: steer vs. yaw_rate" in found.message
+    assert "set sign: -1 for ay, or instead steer and yaw_rate together" in found.message
 
 
 @pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
 def test_without_steering_and_heading_no_channel_is_named(channel):
     (found,) = warned(turned(without(broadband_drive(), *REFERENCES, "steer"), channel))
     assert (found.check, found.channel) == ("sign", "")
-    assert (
-        "either ay or yaw_rate point the other way, which a steering angle or yaw_rate_ref would decide"
-        in found.message
-    )
+    assert "set sign: -1 for ay or yaw_rate; a steering angle or yaw_rate_ref" in found.message
+    assert set(found.suspects) == {"ay", "yaw_rate"}
 
 
 def test_without_a_channel_that_decides_none_is_named():
@@ -93,7 +88,7 @@ def test_without_a_channel_that_decides_none_is_named():
         turned(without(broadband_drive(), "sideslip_ref", "yaw_rate_ref", "steer"), "yaw_rate")
     )
     assert found.channel == ""
-    assert "either yaw_rate or ay and vy_ref together point the other way" in found.message
+    assert "set sign: -1 for yaw_rate or ay and vy_ref together" in found.message
 
 
 def test_steering_may_be_the_angle_of_the_steering_wheel():
@@ -118,25 +113,25 @@ def test_counter_steering_and_late_yaw_rates_are_not_taken_for_reversed_channels
 
 
 @pytest.mark.parametrize(
-    ("channel", "factor", "unit", "level"),
+    ("channel", "factor", "units", "level"),
     [
-        ("vy_ref", 3.6, "km/h", "warning"),
-        ("vx", 3.6, "km/h", "warning"),
-        ("ay", 1.0 / GRAVITY, "g", "warning"),
-        ("ax", 1.0 / GRAVITY, "g", "warning"),
-        ("yaw_rate", 180.0 / np.pi, "deg/s", "error"),
-        ("sideslip_ref", 180.0 / np.pi, "deg", "error"),
-        ("yaw_rate", np.pi / 180.0, "rad/s taken for deg/s", "warning"),
+        ("vy_ref", 3.6, "in km/h but read as m/s", "warning"),
+        ("vx", 3.6, "in km/h but read as m/s", "warning"),
+        ("ay", 1.0 / GRAVITY, "in g but read as m/s²", "warning"),
+        ("ax", 1.0 / GRAVITY, "in g but read as m/s²", "warning"),
+        ("yaw_rate", 180.0 / np.pi, "in deg/s but read as rad/s", "error"),
+        ("sideslip_ref", 180.0 / np.pi, "in deg but read as rad", "error"),
+        ("yaw_rate", np.pi / 180.0, "in rad/s but read as deg/s", "warning"),
     ],
 )
-def test_a_wrong_unit_is_named(channel, factor, unit, level):
+def test_a_wrong_unit_is_named(channel, factor, units, level):
     found = [
         one
         for one in warned(changed(broadband_drive(), **{channel: lambda samples: factor * samples}))
         if one.check != "impossible"
     ]
     assert [(one.level, one.check, one.channel) for one in found] == [(level, "unit", channel)]
-    assert f"{channel} is in {unit}; set its unit" in found[0].message
+    assert f": {channel} is {units}; correct the unit" in found[0].message
 
 
 def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
@@ -148,7 +143,10 @@ def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
     found = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), vx=lambda vx: vx * 3.6))
     assert [(one.check, one.channel) for one in found] == [("unit", "vx")]
     odd = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), ay=lambda ay: ay * 2.0))
-    assert "about 1 is expected: check the units of ay, yaw_rate and vx" in odd[0].message
+    assert (
+        "gain 2.03 instead of 1 (correlation 0.99); check the units of ay, yaw_rate and vx"
+        in odd[0].message
+    )
     drive = broadband_drive()
     for slip in (
         1.0 + 6.0 * (np.sin(0.5 * drive.time) > 0.3),
@@ -172,7 +170,7 @@ def test_an_offset_of_ay_is_found_with_its_size(offset, level, missing):
     found = [finding for finding in checks_of_recording(drive) if finding.check == "offset"]
     assert [(one.level, one.channel) for one in found] == ([(level, "ay")] if level else [])
     if level:
-        assert float(found[0].message.split()[1]) == pytest.approx(offset, abs=0.03)
+        assert float(found[0].message.split()[3]) == pytest.approx(offset, abs=0.03)
 
 
 def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():

@@ -64,8 +64,10 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
     }
     units |= {"handwheel": ("Steer", "deg", 1), "sideslip_ref": ("Beta", "deg", 1)}
     assert {name: (one.column, one.unit, one.sign) for name, one in found.items()} == units
-    assert found["yaw_rate"].in_words.startswith(
-        "yaw_rate: column Gyro, deg/s, sign -1: ay vs. vx·yaw_rate: correlation -"
+    assert (
+        found["yaw_rate"]
+        .describe()
+        .startswith("yaw_rate: column 'Gyro', deg/s, sign -1: ay vs. vx·yaw_rate: correlation -")
     )
 
 
@@ -139,7 +141,7 @@ def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp
     assert examined.proposals.wheel_radius is not None
     made = draft(examined)
     assert (made.examined.proposals.wheel_radius, made.dataset["transforms"]) == (None, [])
-    assert sum("wheel_speed" in note and "samples are missing" in note for note in made.notes) == 4
+    assert sum("wheel_speed" in note and "missing samples" in note for note in made.notes) == 4
 
 
 @pytest.mark.parametrize(
@@ -172,7 +174,7 @@ def test_road_wheel_and_steering_wheel_are_told_apart_and_the_ratio_is_estimated
         tmp_path, table.drop(columns="Steer").assign(**{"SWA [rad]": 4.0 * d["handwheel"]})
     )["handwheel"]
     assert (found.column, found.unit) == ("SWA [rad]", "rad"), "though no slow corner shows it"
-    assert not any("by slow corners" in text for text in found.evidence)
+    assert not any("from slow corners" in text for text in found.evidence)
     file = write(tmp_path / "lap.csv", table)
     assert draft(inspect("my_car", [file])).ratio is None
     ratio = draft(inspect("my_car", [file], {"wheelbase": 2.7})).ratio
@@ -254,7 +256,7 @@ def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps
         "my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))]
     )
     assert any(
-        "of another place or filtered: correlation 1.000" in text
+        "correlation 1.000, measured at another point" in text
         for text in examined.proposals.by_channel["ay"].evidence
     )
     outcome, _ = write_files(examined, dry_run=True)
@@ -347,7 +349,9 @@ ROLES = {
     "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
     "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
     "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx", "AccelLateral": "ay",
-    "linear_acceleration.x": "ax", "Drehzahl": "other", "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other",
+    "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other", "Querabweichung": "other", "Vx_world": "other",
+    "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax", "Drehzahl": "other",
+    "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other",
 }  # fmt: skip
 
 
@@ -388,12 +392,12 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_th
     found = proposed(tmp_path, table.drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"}))[
         "ay"
     ]
-    assert (found.column, "contradicts its name" in found.asked) == ("LongAcc", True)
+    assert (found.column, "contradict its name" in found.question) == ("LongAcc", True)
     found = proposed(
         tmp_path, table.rename(columns={"LatAcc": "Ch7"}).assign(Ch7=0.8 * table["LatAcc"])
     )["ay"]
-    assert (found.column, "it may be a velocity" in found.asked) == ("Ch7", True)
-    assert proposed(tmp_path, table.rename(columns={"LatAcc": "Ch7"}))["ay"].asked == ""
+    assert (found.column, "it may be a velocity" in found.question) == ("Ch7", True)
+    assert proposed(tmp_path, table.rename(columns={"LatAcc": "Ch7"}))["ay"].question == ""
     found = proposed(tmp_path, table.drop(columns="LatAcc"))
     assert [(found[name].column, found[name].unit) for name in ("vx", "ax")] == [
         ("Speed", "km/h"),
@@ -526,7 +530,7 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
         1.0,
         [50, 67],
     )
-    assert any("makes 2 recordings" in note for note in made.notes)
+    assert any("split into 2 recordings" in note for note in made.notes)
 
 
 def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path):
@@ -548,7 +552,7 @@ def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others
     table = table.drop(columns="Time [s]") if suffix == ".csv" else table
     made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
     assert any(
-        note.startswith("'Steer' (handwheel) is left out: samples are missing")
+        note.startswith("'Steer' (handwheel) is left out: it has missing samples")
         for note in made.notes
     )
     assert Resample(20.0)(read_back(made)).channels.keys() == {
@@ -638,7 +642,7 @@ def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossibl
     remarks = draft(
         in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))
     ).remarks
-    assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
+    assert any("in 'lap_2', ay vs. vx·yaw_rate: gain 3.6" in one for one in remarks)
     marked = in_two_files(
         tmp_path,
         lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))),
@@ -648,7 +652,9 @@ def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossibl
     found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
     assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
     assert any(
-        re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note)
+        re.search(
+            r"'Steer' \(handwheel\) is left out: it is missing or empty in '.*lap_2.csv'", note
+        )
         for note in found.notes
     )
     roll = 0.05 * np.sin(np.arange(6000) / 50.0)
@@ -681,7 +687,7 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
         (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
     with pytest.raises(
         DataError,
-        match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike",
+        match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; use the same unit in both",
     ):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
     write(tmp_path / "lap_1.csv", usual(drive(90.0)))
@@ -713,7 +719,7 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.by_channel["ax"].column == "imu_ax"
     assert (
-        "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement"
+        "'acc_vehicle_x' is left out: it is the difference of 'mocap_speed' from row to row, not a measurement"
         in examined.proposals.notes
     )
 
@@ -733,12 +739,12 @@ def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_a
     )
     found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
     assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
-    assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
+    assert any("'speed' is " in note and "% too low" in note for note in found.notes)
     found = proposed(
         tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01)
     )
     assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
-    assert not found["yaw_rate"].asked
+    assert not found["yaw_rate"].question
 
 
 def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(
@@ -759,7 +765,7 @@ def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_th
         1,
         1,
     ]
-    assert found["sideslip_ref"].asked.startswith("sign")
+    assert found["sideslip_ref"].question.startswith("sign")
 
 
 def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(
@@ -792,7 +798,7 @@ def test_course_and_heading_without_another_reference_and_samples_that_rows_repe
     )
     notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
     assert (
-        "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column"
+        "the difference 'Heading' - 'Course' may be the missing reference of the sideslip angle; if so, save it as a column"
         in notes
     )
     table = usual(drive())
@@ -831,14 +837,19 @@ def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path,
             }
         ),
     )
-    assert "km/h at the rim by the speed" in found["wheel_speed_rl"].evidence
+    assert (
+        "circumferential speed in km/h, compared with the speed" in found["wheel_speed_rl"].evidence
+    )
     too_much = excess > 1.0
     assert (
-        "5 % too much by the wheels" in found["vx"].asked,
-        "vx km/h +1 0.952" in found["vx"].others,
+        "5 % too high compared with the wheel speeds" in found["vx"].question,
+        "vx km/h +1 0.952" in found["vx"].alternatives,
     ) == (too_much, too_much)
     assert (
-        any("too much by ay over yaw_rate" in note for note in proposals_of(tmp_path, table).notes)
+        any(
+            "too high compared with ay/yaw_rate" in note
+            for note in proposals_of(tmp_path, table).notes
+        )
         == too_much
     )
 
@@ -856,8 +867,8 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
     examined = inspect("my_car", [written(tmp_path / f"lap{suffix}", table)])
     found = examined.proposals.by_channel
     assert (found["yaw_rate"].unit, found["vx"].unit, found["ay"].unit) == ("rad/s", "km/h", "g")
-    assert "by its header in deg/s" in found["yaw_rate"].asked
-    assert (found["vx"].asked, found["ay"].asked) == ("", "")
+    assert "but deg/s according to the header" in found["yaw_rate"].question
+    assert (found["vx"].question, found["ay"].question) == ("", "")
     own = read_back(draft(examined))
     np.testing.assert_allclose(
         own["yaw_rate"], np.interp(own.time - own.time[0], d["t"], d["r"]), atol=1e-4
@@ -869,7 +880,7 @@ def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
     table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
     made = drafted(tmp_path, table)
     assert made.dataset["drop_rows"] == {"lap": [1001]}
-    assert any("written twice" in note for note in made.notes)
+    assert any("duplicates" in note for note in made.notes)
     assert len(read_back(made)) == len(table) - 1
 
 
@@ -950,7 +961,7 @@ def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
         "vy_ref": "v_lat",
     }
     assert {
-        (found[name].sign, found[name].asked) for name in ("vx", "yaw_rate", "ay", "vy_ref")
+        (found[name].sign, found[name].question) for name in ("vx", "yaw_rate", "ay", "vy_ref")
     } == {(1, "")}
 
 
@@ -1006,14 +1017,14 @@ def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
             **{"LongAcc [mm/s^2]": 1e3 * d["ax"], "VLat [m per s]": d["vx"] * np.tan(d["sideslip"])}
         ),
     )
-    assert {one.channel for one in made.examined.proposals.channels if not one.asked} == {
+    assert {one.channel for one in made.examined.proposals.channels if not one.question} == {
         "vx",
         "yaw_rate",
         "ay",
         "ax",
         "vy_ref",
     }
-    assert next(note for note in made.notes if "no unit that vehest knows" in note).startswith(
+    assert next(note for note in made.notes if "is unknown; according to" in note).startswith(
         "'m per s' of 'VLat [m per s]'"
     )
     for name, expected in (("vx", d["vx"]), ("yaw_rate", d["r"]), ("ay", d["ay"]), ("ax", d["ax"])):
@@ -1029,9 +1040,7 @@ def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
     assert not draft(inspect("my_car", files)).remarks
     write(files[1], usual(drive(100.0)).assign(Steer=1.5 * table["Steer"]))
     (remark,) = draft(inspect("my_car", files)).remarks
-    assert remark.startswith(
-        "handwheel: in 'lap_2', 1.5 times as large in the same turn as in 'lap_1'"
-    )
+    assert remark.startswith("handwheel: in 'lap_2' its gain in turns is 1.5 times that in 'lap_1'")
     write(
         files[1], usual(drive(100.0)).assign(Steer=0.0)
     )  # a sensor that is not plugged in is no other car
@@ -1047,7 +1056,7 @@ def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     for name, sign in (("Gyro", -1.0), ("Steer", 1.0), ("LatAcc", 1.0)):
         table.loc[2000:2499, name] *= sign * slow[back]
     assert any(
-        one.startswith("vx: has no sign: the car goes backwards")
+        one.startswith("vx: unsigned: positive while the car reverses")
         for one in drafted(tmp_path, table).remarks
     )
 
@@ -1069,9 +1078,9 @@ def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_an
 
 def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
     table = usual(drive()).rename(columns={"Steer": "SteeringWheelAngle [deg]"})
-    assert not proposed(tmp_path, table)["handwheel"].asked
+    assert not proposed(tmp_path, table)["handwheel"].question
     table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
-    assert proposed(tmp_path, table)["handwheel"].asked
+    assert proposed(tmp_path, table)["handwheel"].question
 
 
 TILTED = {"roll": "Roll [rad]", "pitch": "Pitch [rad]"}
@@ -1099,7 +1108,7 @@ def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
     found = proposed(tmp_path, table)
     assert (found["yaw_rate"].sign, found["ay"].sign) == (of_yaw_rate, of_ay)
     assert (found["roll"].sign, found["pitch"].sign) == (1, of_pitch)
-    assert {bool(found[name].asked) for name in TILTED} == {is_asked}
+    assert {bool(found[name].question) for name in TILTED} == {is_asked}
     mirrored = proposals_of(tmp_path, table).mirrored().by_channel
     assert (mirrored["roll"].sign, mirrored["pitch"].sign) == (1, -of_pitch)
 
@@ -1137,7 +1146,8 @@ def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path)
     made = drafted(tmp_path, table)
     assert [round(seconds) for seconds in made.durations.values()] == [40, 80]
     (note,) = [note for note in made.notes if "go back" in note]
-    assert "makes 2 recordings; a command on one recording takes the longest, 80 of 120 s" in note
+    assert "split into 2 recordings" in note
+    assert "a command on a single recording uses the longest, 80 of 120 s" in note
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.08])
@@ -1153,7 +1163,7 @@ def test_a_speed_is_compared_with_ay_less_the_change_of_the_lateral_velocity(tmp
         {"t": t, "vx": excess * d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "vy_ref": d["vy"]}
     )
     notes = proposals_of(tmp_path, table).notes
-    assert any("'vx' reads" in note for note in notes) == (excess > 1.0)
+    assert any("'vx' is " in note for note in notes) == (excess > 1.0)
 
 
 def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp_path):
@@ -1249,7 +1259,7 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     table["Velocity forward [m/s]"] = d["vx"]
     table = table.assign(**{"Gyro [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
     found = proposed(tmp_path, table)
-    assert (found["vx"].column, found["vx"].asked) == ("Velocity forward [m/s]", "")
+    assert (found["vx"].column, found["vx"].question) == ("Velocity forward [m/s]", "")
     assert {"vx_ref", "vy_ref"}.isdisjoint(found)
     heading = np.cumsum(d["r"]) / 50.0  # always nearly along x
     east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
@@ -1259,3 +1269,63 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "gyro_z [rad/s]", "ay": "LatAcc [m/s2]"}
     assert "an axis of the world" in open_questions["twist.linear.x"].text
+
+
+def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):
+    """An error of heading named dpsi, like a yaw rate, and a curvature named like nothing."""
+    d = drive()
+    noise = 0.02 * np.random.default_rng(3).standard_normal((3, len(d["t"])))
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "dpsi": d["r"] / 9.0 + 0.2 * d["sideslip"],
+            "q": d["r"] / d["vx"],
+            "AccelerationX [m/s2]": -d["ay"],
+            "AccelerationY [m/s2]": noise[0],
+            "AccelerationZ [m/s2]": d["ax"],
+            "VelocityX [m/s]": -d["vy"],
+            "VelocityY [m/s]": noise[1],
+            "VelocityZ [m/s]": d["vx"],
+            "AngularVelocityX [deg/s]": 50.0 * noise[2],
+            "AngularVelocityY [deg/s]": -np.degrees(d["r"]),
+            "AngularVelocityZ [deg/s]": 50.0 * noise[1],
+        }
+    )
+    found = proposed(tmp_path, table)
+    columns = {name: found[name].column.split(" ")[0] for name in ("vx", "yaw_rate", "ay", "ax")}
+    assert columns == {
+        "vx": "VelocityZ",
+        "yaw_rate": "AngularVelocityY",
+        "ay": "AccelerationX",
+        "ax": "AccelerationZ",
+    }
+
+
+@pytest.mark.parametrize(("name", "is_left_out"), [("accLong", True), ("LongAcc", False)])
+def test_an_ax_by_name_alone_is_left_out_unless_it_is_of_the_sensor_of_ay(
+    tmp_path, name, is_left_out
+):
+    d = drive()
+    shaking = np.random.default_rng(4).standard_normal(len(d["t"]))
+    table = usual(d).assign(LongAcc=shaking).rename(columns={"LongAcc": name})
+    channels, open_questions = left_out(tmp_path, table)
+    assert (name in open_questions, "ax" not in channels) == (True, is_left_out)
+
+
+@pytest.mark.parametrize(("speed", "is_left_out"), [("Speed", True), ("odom_vx", False)])
+def test_a_vy_by_name_alone_is_left_out_unless_it_is_named_like_the_speed(
+    tmp_path, speed, is_left_out
+):
+    d = drive()
+    shaking = np.random.default_rng(5).standard_normal(len(d["t"]))
+    table = usual(d).drop(columns="Beta").assign(odom_vy=shaking).rename(columns={"Speed": speed})
+    channels, open_questions = left_out(tmp_path, table)
+    assert ("odom_vy" in open_questions, "vy_ref" not in channels) == (True, is_left_out)
+
+
+def test_a_steering_wheel_that_turns_no_further_than_road_wheels_is_left_out(tmp_path):
+    d = drive()
+    table = usual(d).drop(columns="Steer").assign(Lenkradwinkel=np.degrees(d["steer"]))
+    channels, open_questions = left_out(tmp_path, table)
+    assert not {"steer", "handwheel"} & set(channels)
+    assert "its name suggests a steering wheel" in open_questions["Lenkradwinkel"].text

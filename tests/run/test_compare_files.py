@@ -64,7 +64,7 @@ def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_pat
     said = capsys.readouterr().err
     assert "nameless.csv': column 'beta', read as sideslip_ref: " in said
     assert said.count("warning: ") == 1
-    assert "beyond what a vehicle can do" in said
+    assert "outside the possible range" in said
 
 
 def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, tmp_path):
@@ -94,8 +94,8 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
     ("spoil", "warning"),
     [
         (lambda vy: 3.6 * vy, "vy_ref is in km/h; set its unit"),
-        (lambda vy: -vy, "disagree in sign"),
-        (np.zeros_like, "never changes: 0 m/s throughout"),
+        (lambda vy: -vy, "sign reversed"),
+        (np.zeros_like, "constant at 0 m/s throughout"),
         (lambda vy: vy, ""),
     ],
 )

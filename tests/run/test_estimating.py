@@ -74,7 +74,7 @@ def test_the_summary_for_people_names_point_band_share_rate_warnings_and_file(sa
     lap({"vx": np.zeros(3000)})
     out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv")
     assert "warnings  1, printed above" in out
-    assert err.startswith("warning: vx: never changes")
+    assert err.startswith("warning: vx: constant at 0 m/s")
 
 
 def test_the_point_of_the_self_calibrating_filter_depends_on_the_centre_of_gravity(saved):
@@ -93,7 +93,7 @@ def test_the_point_of_the_self_calibrating_filter_depends_on_the_centre_of_gravi
 
 def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refuses_it(saved):
     lap({"vx": np.zeros(3000)})
-    said = "vx: never changes: 0 m/s throughout"
+    said = "vx: constant at 0 m/s throughout"
     saved.refused(
         "estimate", "own", "lap.csv", "-o", "out.csv", "--strict", code=3, says=f"'lap.csv': {said}"
     )
@@ -108,7 +108,7 @@ def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refu
 @pytest.mark.parametrize(
     ("factor", "check", "message"),
     [
-        (-1.0, "sign", "ay and vx·yaw_rate disagree in sign"),
+        (-1.0, "sign", "ay vs. vx·yaw_rate: correlation -"),
         (1.0 / GRAVITY, "unit", "ay is in g; set its unit"),
     ],
 )

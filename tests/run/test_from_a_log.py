@@ -60,7 +60,7 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
         + transforms
     )
     out, _ = logged.done("data", "check", "my_log")
-    assert "ay points the other way" not in out
+    assert "sign reversed" not in out
     out, err = logged.done("run", "my_log", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in err
     assert "test set 'test' is too short to compare estimators: no interval, no winner" in out

@@ -170,7 +170,7 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     lap = os.fsdecode(b"lap\xff.csv")
     Path("lap.csv").rename(lap)
-    assert place("data", "check", lap)[:2] == (0, "nothing found\n")
+    assert place("data", "check", lap)[:2] == (0, "no findings\n")
     code, out, err = place("data", "show", lap, "--json")
     assert code == 0, err
     out.encode("utf-8")

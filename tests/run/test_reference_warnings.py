@@ -44,10 +44,10 @@ def small(place):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (_reversed, "disagree in sign"),
-        (_in_another_unit, "set its unit"),
-        (_zero, "vy_ref: never changes: 0 m/s throughout"),
-        (_in_degrees, "sideslip_ref is in deg; set its unit"),
+        (_reversed, "signs are inconsistent"),
+        (_in_another_unit, "correct the unit"),
+        (_zero, "vy_ref: constant at 0 m/s throughout"),
+        (_in_degrees, "sideslip_ref is in deg but read as rad; correct the unit"),
     ],
 )
 def test_every_command_that_scores_warns_of_each_recording(small, spoil, says):

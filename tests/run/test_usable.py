@@ -347,7 +347,7 @@ def test_bare_file_is_told_by_its_columns(place):
     table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
     table.to_csv("lap.csv", index=False)
     assert place.told("data", "usable", "lap.csv")["unused_columns"] == ["AccX", "Steering"]
-    assert "columns that no channel uses: AccX, Steering" in place("data", "usable", "lap.csv")[1]
+    assert "columns without a channel: AccX, Steering" in place("data", "usable", "lap.csv")[1]
     assert place("data", "usable", "nowhere.csv")[0] == 2
 
 
@@ -644,11 +644,11 @@ def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
     place.add_steered()
     logs = [f"raw/steered/{name}.csv" for name in ("first", "second")]
     said, _ = place.done("new", "my_car", *logs, "--yes")
-    lacking = dict(
-        line.removeprefix("left out: ").split(": ", 1)
-        for line in said.splitlines()
-        if line.startswith("left out: ")
-    )
+    lacking = {}
+    for line in said.splitlines():
+        if line.startswith("not compared: "):
+            names, reason = line.removeprefix("not compared: ").split(": ", 1)
+            lacking |= dict.fromkeys(names.split(", "), reason)
     assert "is not there" not in said
     assert lacking["sound"].startswith("there is no conf/estimator/sound.yaml; write one with")
     for name in ("broken_constructor", "broken_property"):

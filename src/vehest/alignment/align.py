@@ -22,10 +22,10 @@ import numpy as np
 from scipy import stats
 
 from vehest.alignment.imu import (
-    FEWEST_BLOCKS,
     IMU_CHANNELS,
+    MIN_BLOCK_SECONDS,
+    MIN_BLOCKS,
     NOTHING,
-    SHORTEST_BLOCK,
     Correlation,
     Fit,
     ImuFit,
@@ -127,18 +127,29 @@ class Alignment:
 def in_words(name: str, value: float) -> str:
     """A value in degrees or milliseconds, with its unit."""
     factor, unit = READ_AS.get(UNITS[name], (1.0, UNITS[name]))
-    shown = f"{factor * value:.3g}"
-    return shown if unit == "1" else f"{shown} {unit}"
+    number = f"{factor * value:.3g}"
+    return number if unit == "1" else f"{number} {unit}"
 
 
 def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
-    """Estimate the quantities that are asked for; the recording stays as it is.
+    """Estimate the quantities that are requested; the recording stays as it is.
 
-    The steering ratio is estimated last, on the drive as the other transforms would correct it. It needs ``handwheel`` or ``steer``,
-    ``vx``, ``yaw_rate`` and ``ay``; all others ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``).
+    The steering ratio is estimated last, on the drive as the other transforms would correct it.
 
-    Raises `DataError`: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
-    drive cannot tell the parameters apart. Raises `ConfigurationError`: the cut-off is too high for the recording's rate.
+    Parameters
+    ----------
+    recording : Recording
+        With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio; with
+        ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
+    settings : AlignmentSettings
+
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, the recording is too short, sensor and reference have
+        nothing in common, or the parameters cannot be separated in this drive.
+    ConfigurationError
+        The cut-off is too high for the recording's rate.
     """
     parameters: list[Parameter] = []
     transforms: list[dict[str, Any]] = []
@@ -164,8 +175,8 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         correlation = fit.correlation
         notes = _imu_notes(fit, parameters, settings)
     if "steering_ratio" in settings.estimate:
-        found, transform, note = _align_steering(corrected, settings)
-        parameters = [*parameters, *found]
+        estimates, transform, note = _align_steering(corrected, settings)
+        parameters = [*parameters, *estimates]
         transforms = [*transforms, transform]
         notes = [*notes, note]
     return Alignment(
@@ -193,21 +204,21 @@ def _parameter(
 
 def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
     """Delay, then offsets (they are in the sensor's axes), then mounting."""
-    found = {parameter.name: _rounded(parameter.value) for parameter in parameters}
+    values = {parameter.name: _rounded(parameter.value) for parameter in parameters}
     transforms: list[dict[str, Any]] = []
-    if "delay" in found:
+    if "delay" in values:
         transforms.append(
-            {"name": "delay_correction", "delay": found["delay"], "channels": list(IMU_CHANNELS)}
+            {"name": "delay_correction", "delay": values["delay"], "channels": list(IMU_CHANNELS)}
         )
-    if "offset_ax" in found:
+    if "offset_ax" in values:
         transforms.append(
             {
                 "name": "offset_correction",
-                "offsets": {channel: found[f"offset_{channel}"] for channel in IMU_CHANNELS},
+                "offsets": {channel: values[f"offset_{channel}"] for channel in IMU_CHANNELS},
             }
         )
     mounting: dict[str, Any] = {
-        name: found[name] for name in ("lever_x", "lever_y", "yaw") if name in found
+        name: values[name] for name in ("lever_x", "lever_y", "yaw") if name in values
     }
     if mounting:
         transforms.append({"name": "mounting_correction", **mounting})
@@ -220,13 +231,19 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     after = ImuModel(corrected)
     tilt = {name: value for name, value in fit.values.items() if name.startswith("tilt")}
     error_before, error_after = (model.measured - model(NOTHING)[0] for model in (before, after))
-    rest = after.measured - after({**NOTHING, **tilt})[0]
-    found = []
+    untilted = after.measured - after({**NOTHING, **tilt})[0]
+    residuals = []
     for row, channel in enumerate(fit.signals.channels):
-        own = rms(rest[row]) if any(tilt.values()) and channel != "yaw_rate" else math.nan
-        sizes = {"before": rms(error_before[row]), "after": rms(error_after[row]), "rest": own}
-        found.append(Residual(channel, UNITS[f"offset_{channel}"], sizes))
-    return tuple(found)
+        rms_untilted = (
+            rms(untilted[row]) if any(tilt.values()) and channel != "yaw_rate" else math.nan
+        )
+        sizes = {
+            "before": rms(error_before[row]),
+            "after": rms(error_after[row]),
+            "rest": rms_untilted,
+        }
+        residuals.append(Residual(channel, UNITS[f"offset_{channel}"], sizes))
+    return tuple(residuals)
 
 
 def _imu_notes(
@@ -239,31 +256,33 @@ def _imu_notes(
         name for name in QUANTITIES if name not in settings.estimate and name != "steering_ratio"
     ]
     if left:
-        notes.append(f"Not asked for and taken as zero: {', '.join(left)}.")
+        notes.append(f"Not requested and assumed to be zero: {', '.join(left)}.")
     if fit.suspects:
-        found = listed(
+        suspected = listed(
             [
                 f"{name} {in_words(name, value)} ± {in_words(name, sigma)}"
                 for name, (value, sigma) in fit.suspects.items()
             ]
         )
         notes.append(
-            f"The residuals suggest quantities that were not asked for, each taken alone: {found}. The others may change with them."
+            "The residuals suggest values other than zero for quantities that were not requested, "
+            f"each fitted alone: {suspected}. If they are requested too, the other estimates may change."
         )
     unproven = [
         parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high
     ]
     if unproven:
         notes.append(
-            f"Zero lies within the interval of {listed(unproven)}: this drive gives no reason to correct it."
+            f"The 95 % interval of {listed(unproven)} contains zero: this drive does not justify a correction."
         )
     if signals.speed == "vx":
         notes.append(
-            "There is no vx_ref: vx serves as the reference's forward velocity, taken to be on its clock."
+            "No vx_ref: vx is used as the reference's forward velocity and assumed to be synchronous with it."
         )
     if signals.reference_rate is None:
         notes.append(
-            "There is no yaw_rate_ref: delay and yaw rate offset come from the accelerations, less well, and a banked road shows in them."
+            "No yaw_rate_ref: delay and yaw rate offset are estimated from the accelerations; "
+            "they are less certain, and biased by the bank of the road."
         )
     if "offset_ax" in fit.names:
         angles = (
@@ -271,19 +290,21 @@ def _imu_notes(
             for name in ("offset_ax", "offset_ay")
         )
         notes.append(
-            "The offsets of ax and ay may as well be {:.2f}° and {:.2f}° of pitch and roll of the mounting: no drive tells.".format(
+            "The offsets of ax and ay cannot be distinguished from a mounting pitch of {:.2f}° and roll of {:.2f}°.".format(
                 *angles
             )
         )
     if signals.gravity is not None:
         notes.append(
-            "Gravity is taken off the accelerations by the measured roll and pitch for this estimate."
+            "For this estimate, gravity is subtracted from the accelerations by the measured roll and pitch."
         )
     if settings.tilt > 0:
-        gains = f"{_percent(values['tilt_gain_x'])} of it in ax and {_percent(values['tilt_gain_y'])} in ay"
-        causes = "gravity by pitch and roll of the body (1 % is 0.57° at 1 g), or a scale error; no transform takes it off"
+        gains = (
+            f"{_percent(values['tilt_gain_x'])} in ax and {_percent(values['tilt_gain_y'])} in ay"
+        )
         notes.append(
-            f"Beyond the acceleration of the reference the sensor shows {gains}: {causes}."
+            f"Gain error relative to the reference's acceleration: {gains}, from gravity in the "
+            "pitching and rolling body (1 % is 0.57° at 1 g) or a scale error. No transform corrects it."
         )
     return notes
 
@@ -316,11 +337,12 @@ def _align_steering(
         np.abs(low(recording["ay"])) <= settings.max_ay
     )
     seconds = float(calm.sum()) * smoothing.step / recording.rate_hz
-    least = FEWEST_BLOCKS * SHORTEST_BLOCK
-    if seconds < least:
-        calm_is = f"above {settings.min_speed:g} m/s with less than {settings.max_ay:g} m/s² of ay"
+    min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
+    if seconds < min_seconds:
+        calm_is = f"vx ≥ {settings.min_speed:g} m/s and |ay| ≤ {settings.max_ay:g} m/s²"
         raise DataError(
-            f"recording '{recording.id}': only {seconds:.3g} s are {calm_is}; the steering ratio needs at least {least:g} s"
+            f"recording '{recording.id}': only {seconds:.3g} s with {calm_is}; "
+            f"the steering ratio needs at least {min_seconds:g} s"
         )
     columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[
         :, calm
@@ -345,7 +367,7 @@ def _align_steering(
     scatter = np.sqrt(np.diag(to_gradient @ scatter_of(fit, blocks) @ to_gradient.T))
     of_model = _error_of_constant_understeer(columns, low(recording["vx"])[calm], ratio)
     gentle = np.abs(columns[2]) <= 0.5 * settings.max_ay
-    if np.count_nonzero(gentle) * smoothing.step / recording.rate_hz >= least:
+    if np.count_nonzero(gentle) * smoothing.step / recording.rate_hz >= min_seconds:
         of_gentle = np.linalg.lstsq(columns[:, gentle].T, measured[gentle], rcond=None)[0][0]
         of_model = math.hypot(of_model, float(of_gentle) - ratio)
     values = zip(
@@ -355,14 +377,14 @@ def _align_steering(
         (of_model, 0.0, 0.0),
         strict=True,
     )
-    found = [
+    estimates = [
         _parameter(name, value, size, 0.0, blocks - 1, model) for name, value, size, model in values
     ]
     by_scatter = _parameter(names[0], ratio, float(scatter[0]), 0.0, blocks - 1)
     if by_scatter.low <= 0.0 <= by_scatter.high:
-        what = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
+        problem = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
         raise DataError(
-            f"recording '{recording.id}': {what}; check its sign, or use a drive with slow turns"
+            f"recording '{recording.id}': {problem}; check its sign, or use a drive with slow turns"
         )
     transform = {
         "name": "steering_ratio",
@@ -370,9 +392,10 @@ def _align_steering(
         "offset": _rounded(offset),
         "channel": source,
     }
-    ratio_of = f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
-    note = f"{ratio_of}, from {seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
-    return found, transform, note
+    ratio_of = f"Steering ratio of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
+    limits = f"vx ≥ {settings.min_speed:g} m/s, |ay| ≤ {settings.max_ay:g} m/s²"
+    note = f"{ratio_of}, from {seconds:.0f} s ({limits}); residual {rms(error):.2g} rad RMS."
+    return estimates, transform, note
 
 
 def _error_of_constant_understeer(columns: FloatArray, speed: FloatArray, ratio: float) -> float:

@@ -8,18 +8,20 @@ import numpy as np
 
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import Motion
-from vehest.alignment.spectra import LONGEST_TIME_CONSTANT, CrossSpectra, Lag, Measured, lag_of
+from vehest.alignment.spectra import MAX_TIME_CONSTANT_SECONDS, CrossSpectra, Lag, Measured, lag_of
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
-LONGEST_UNREPORTED = 0.015  # s, of a delay
-LEAST_FIT = 0.9  # share of the phase that a low-pass must explain
-SHORTEST_TIME_CONSTANT = 0.1  # s; a shorter one is a delay in the band where cars move
-LONGEST_YAW_RESPONSE = 0.3  # s; of the yaw rate to the steering angle
-FEWEST_CHANGES = 20
-ADJACENT_CHANGES = 0.1  # share of changes that may follow the one before at once
-SINGLE_STEPS = 0.5  # share of changes by one quantum from which on a channel is quantised, not held
+MIN_REPORTED_DELAY_SECONDS = 0.015  # s, of a delay
+MIN_PHASE_SHARE = 0.9  # share of the phase that a low-pass must explain
+MIN_TIME_CONSTANT_SECONDS = 0.1  # s; a shorter one is a delay in the band where cars move
+MAX_YAW_RESPONSE_SECONDS = 0.3  # s; of the yaw rate to the steering angle
+MIN_CHANGES = 20
+MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
+MAX_SINGLE_STEP_SHARE = (
+    0.5  # share of changes by one quantum from which on a channel is quantised, not held
+)
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
@@ -41,21 +43,25 @@ def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, La
         ("yaw_rate", f"(ay - {lateral})/{motion.speed}", _established(spectra, "turn", "turned")),
         ("ay", f"{motion.speed}·yaw_rate + {lateral}", _established(sideways, "lateral", "ay")),
     ]
-    found: dict[str, tuple[str, Lag]] = {}
+    slow: dict[str, tuple[str, Lag]] = {}
     for channel, text, lag in candidates:
         if lag is not None and (
-            channel != "ay" or "yaw_rate" not in found or lag.fit > found["yaw_rate"][1].fit
+            channel != "ay" or "yaw_rate" not in slow or lag.fit > slow["yaw_rate"][1].fit
         ):
-            found.setdefault(channel, (text, lag))
-    return found
+            slow.setdefault(channel, (text, lag))
+    return slow
 
 
 def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | None:
     lag = lag_of(spectra, source, follower, low_pass=True)
-    if lag is None or lag.fit < LEAST_FIT or lag.time_constant.value >= LONGEST_TIME_CONSTANT:
+    if (
+        lag is None
+        or lag.fit < MIN_PHASE_SHARE
+        or lag.time_constant.value >= MAX_TIME_CONSTANT_SECONDS
+    ):
         return None
-    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor leads the motion
-    slow = min(lag.time_constant.low, lag.together.low) > SHORTEST_TIME_CONSTANT
+    advanced = lag.delay.high < -MIN_REPORTED_DELAY_SECONDS  # no sensor leads the motion
+    slow = min(lag.time_constant.low, lag.together.low) > MIN_TIME_CONSTANT_SECONDS
     return lag if slow and not advanced else None
 
 
@@ -66,8 +72,8 @@ def low_pass_findings(
     findings = []
     for channel, (text, lag) in slow.items():
         message = (
-            f"follows {text} as a first-order low-pass with a time constant of {_seconds(lag.time_constant)} would: "
-            f"transients are gone; an estimator must be trained with it as it is, or do without"
+            f"low-passed: it lags {text} like a first-order low-pass with a time constant of "
+            f"{_seconds(lag.time_constant)}; use it only with an estimator trained on it, or leave it out"
         )
         findings.append(Finding("warning", "bandwidth", channel, message))
     steered = (
@@ -77,12 +83,13 @@ def low_pass_findings(
     )
     if (
         steered is not None
-        and steered.fit > LEAST_FIT
-        and steered.together.low > LONGEST_YAW_RESPONSE
+        and steered.fit > MIN_PHASE_SHARE
+        and steered.together.low > MAX_YAW_RESPONSE_SECONDS
     ):
         message = (
-            f"follows {motion.steering} by {_seconds(steered.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
-            f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide"
+            f"lags {motion.steering} by {_seconds(steered.together)}, more than the "
+            f"{MAX_YAW_RESPONSE_SECONDS:g} s usual for cars: it is low-passed or delayed, or "
+            f"{motion.steering} is a command; with ay or yaw_rate_ref the check can decide"
         )
         findings.append(Finding("warning", "bandwidth", "yaw_rate", message))
     return findings
@@ -92,28 +99,34 @@ def _seconds(measured: Measured) -> str:
     return f"{measured.value:.2g} s (95 %: {max(measured.low, 0.0):.2g} to {measured.high:.2g})"
 
 
-def held_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
+def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate make one finding."""
-    held: dict[str, list[str]] = {}
+    names_by_rate: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
-        rate = held_rate(samples[moving], recording.rate_hz)
+        rate = update_rate_hz(samples[moving], recording.rate_hz)
         if rate is not None:
-            held.setdefault(f"{rate:.3g}", []).append(name)
+            names_by_rate.setdefault(f"{rate:.3g}", []).append(name)
     findings = []
-    for rate_text, names in held.items():
+    for rate_text, names in names_by_rate.items():
         delay = 0.5 / float(rate_text)
-        others = f", and so do {', '.join(names[1:])}" if len(names) > 1 else ""
+        further = f" (also {', '.join(names[1:])})" if len(names) > 1 else ""
         message = (
-            f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
-            f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)"
+            f"updated at only {rate_text} Hz and held in between{further}, in a recording at "
+            f"{recording.rate_hz:.4g} Hz, which delays it by {1e3 * delay:.3g} ms on average; "
+            f"downsample to {rate_text} Hz, or keep only the new samples (gappy)"
         )
         findings.append(
-            Finding("warning" if delay > LONGEST_UNREPORTED else "note", "held", names[0], message)
+            Finding(
+                "warning" if delay > MIN_REPORTED_DELAY_SECONDS else "note",
+                "held",
+                names[0],
+                message,
+            )
         )
     return findings
 
 
-def held_rate(samples: FloatArray, rate_hz: float) -> float | None:
+def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:
     """How often a held channel, (T,), really changes [1/s]; None if it is not held.
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does so too while it moves slowly, but
@@ -121,12 +134,12 @@ def held_rate(samples: FloatArray, rate_hz: float) -> float | None:
     """
     steps = np.diff(samples[np.isfinite(samples)])
     changes = np.flatnonzero(steps)
-    if len(changes) < FEWEST_CHANGES:
+    if len(changes) < MIN_CHANGES:
         return None
     spacing = np.diff(changes)
-    if np.mean(spacing == 1) > ADJACENT_CHANGES:
+    if np.mean(spacing == 1) > MAX_ADJACENT_SHARE:
         return None
     sizes = np.abs(steps[changes])
-    if np.mean(sizes < 1.5 * sizes.min()) > SINGLE_STEPS:
+    if np.mean(sizes < 1.5 * sizes.min()) > MAX_SINGLE_STEP_SHARE:
         return None
     return float(rate_hz / np.median(spacing))

@@ -8,16 +8,16 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from vehest.alignment.bandwidth import held_findings, low_pass_findings, low_passed
+from vehest.alignment.bandwidth import low_pass_findings, low_passed, repetition_findings
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
 from vehest.alignment.findings import Finding
 from vehest.alignment.lateral_offset import offset_findings
 from vehest.alignment.motion import WHEELS, Motion, motion_of
 from vehest.alignment.signs import (
-    FEWEST_SAMPLES,
     KINEMATIC_BAND_HZ,
-    LEAST_SLIDING,
-    SIGN_CORRELATION,
+    MIN_SAMPLES,
+    MIN_SIGN_CORRELATION,
+    MIN_SLIDING,
     kinematic_band,
     relations_of,
     sign_findings,
@@ -33,20 +33,20 @@ from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
 
-MOST_WRONG_UNITS = 3
+MAX_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
-FEWEST_STUCK = 3  # seconds, samples
+MIN_STUCK_SAMPLES = 3  # seconds, samples
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
-USUAL_RANGE = (0.005, 0.995)  # quantiles
+USUAL_QUANTILES = (0.005, 0.995)  # quantiles
 SPIKE_EXCESS = 1.0  # of the usual range, beyond it
 SPIKE_SECONDS = 0.25
-USUAL_STEPS = 0.995  # quantile of the steps between samples
+USUAL_STEP_QUANTILE = 0.995  # quantile of the steps between samples
 SPIKE_STEP = 3.0  # of a usual step: a sensor that shakes jumps all the time
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
-MOST_STEERING_OFFSET = np.deg2rad(3.0)
+MAX_STEERING_OFFSET = np.deg2rad(3.0)
 DROPOUT_SPEED = 3.0  # m/s
 DROPOUT_SHARE = 0.1  # of the other wheels' median
 DROPOUT_SECONDS = 0.1
@@ -54,46 +54,69 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
-FASTEST_REVERSE = 8.0
-LEAST_TURN = (
-    0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
-)
+MAX_REVERSE_SPEED = 8.0
+MIN_TURN = 0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
-    """All checks of a recording's samples, the gravest findings first; of a long drive part by part (`merged_findings`).
+    """Check the samples of a recording; a long drive part by part.
 
     Of a part of a drive in which the car stands throughout only impossible values count.
+
+    Returns
+    -------
+    list of Finding
+        Errors first, then warnings, then notes; merged over the parts by `merged_findings`.
     """
     slices = part_slices(len(recording), recording.rate_hz)
-    whole = len(slices) == 1 and PART not in recording.provenance
+    is_undivided = len(slices) == 1 and PART not in recording.provenance
     with np.errstate(all="ignore"):  # of samples up to 1e308, which a check may square
-        return merged_findings(_findings(recording.part(own), whole=whole) for own in slices)
+        return merged_findings(
+            _findings(recording.part(part), is_undivided=is_undivided) for part in slices
+        )
 
 
-def _findings(recording: Recording, *, whole: bool) -> list[Finding]:
+def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
     moving = ~standstill(recording)
-    checks = _CHECKS if whole or moving.any() else (_impossible_values,)
+    checks = _CHECKS if is_undivided or moving.any() else (_impossible_values,)
     return [finding for check in checks for finding in check(recording, moving)]
 
 
 def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
     """Findings in the parts of a drive, the gravest first: of each level, check and channel those of the first part that has any."""
-    found: list[Finding] = []
+    merged: list[Finding] = []
     for part in parts:
-        known = {(one.level, one.check, one.channel) for one in found}
-        found += [one for one in part if (one.level, one.check, one.channel) not in known]
+        earlier = {(finding.level, finding.check, finding.channel) for finding in merged}
+        merged += [
+            finding
+            for finding in part
+            if (finding.level, finding.check, finding.channel) not in earlier
+        ]
     order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(found, key=lambda finding: order[finding.level])
+    return sorted(merged, key=lambda finding: order[finding.level])
 
 
 def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> list[Finding]:
-    """What `checks_of_recording` finds; raises `DataError`, beginning with ``place``, where one that is not accepted is an error."""
+    """Findings of a recording, of which none may be an error.
+
+    Parameters
+    ----------
+    recording : Recording
+    accepted : collection of str
+        Checks whose errors are accepted.
+    place : str
+        Beginning of an error's message.
+
+    Raises
+    ------
+    DataError
+        A finding of a check that is not accepted is an error.
+    """
     findings = checks_of_recording(recording)
     for finding in findings:
         if finding.level == "error" and finding.check not in accepted:
             raise DataError(
-                f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])"
+                f"{place}: channel '{finding.channel}': {finding.message} (to accept it: dataset.accept=[{finding.check}])"
             )
     return findings
 
@@ -106,14 +129,16 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         if not len(outside):
             continue
         worst = outside[np.argmax(np.abs(samples[outside]))]
-        hint = (
-            "is the column in degrees? then say so in its unit"
+        remedy = (
+            "if the column is in degrees, set its unit: deg or deg/s"
             if channel.is_angular
-            else "check its unit and its column"
+            else "check the column and its unit"
         )
         message = (
-            f"{len(outside)} samples beyond what a vehicle can do, {samples[worst]:.6g} {channel.unit} at {recording.time[worst]:.12g} s "
-            f"(possible: {channel.low:.4g} to {channel.high:.4g}); {'the simulated car spun here' if spun else hint}"
+            f"{len(outside)} samples outside the possible range "
+            f"({channel.low:.4g} to {channel.high:.4g} {channel.unit}), the largest "
+            f"{samples[worst]:.6g} {channel.unit} at t = {recording.time[worst]:.12g} s; "
+            f"{'the simulated car spun here' if spun else remedy}"
         )
         yield Finding("note" if spun else "error", "impossible", name, message)
 
@@ -129,7 +154,7 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     if turned:
         motion = motion.corrected(dict.fromkeys(turned[0], -1.0))
         relations = relations_of(motion)
-    for _ in range(MOST_WRONG_UNITS):
+    for _ in range(MAX_WRONG_UNITS):
         wrong = wrong_unit(relations)
         if wrong is None:
             break
@@ -164,20 +189,24 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
     expected = motion["ay"] - motion.turning
     predicted = band(expected)
     derived = band(motion.sliding)
-    if predicted.std() == 0.0 or derived.std() < LEAST_SLIDING:
+    if predicted.std() == 0.0 or derived.std() < MIN_SLIDING:
         return
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
-    figures = f"(correlation {correlation:.2f} between {KINEMATIC_BAND_HZ[0]:g} and {KINEMATIC_BAND_HZ[1]:g} Hz)"
-    if correlation >= SIGN_CORRELATION:
+    band_hz = f"{KINEMATIC_BAND_HZ[0]:g} to {KINEMATIC_BAND_HZ[1]:g} Hz"
+    figures = f"d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation {correlation:.2f} ({band_hz})"
+    if correlation >= MIN_SIGN_CORRELATION:
         bias = float((motion.sliding - expected)[motion.moving].mean())
         yield Finding(
             "note",
             "kinematics",
             "vy_ref",
-            f"d(vy_ref)/dt follows ay - vx·yaw_rate {figures}, mean bias {bias:.3f} m/s²",
+            f"{figures}, mean difference {bias:.3f} m/s²",
         )
     else:
-        message = f"ay - vx·yaw_rate hardly follows d(vy_ref)/dt {figures}: check units, delays and where the sensors sit"
+        message = (
+            f"{figures}, expected at least {MIN_SIGN_CORRELATION:g}: "
+            "check units, delays and sensor positions"
+        )
         yield Finding("warning", "kinematics", "vy_ref", message)
 
 
@@ -189,7 +218,7 @@ def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
                 "note",
                 "nan",
                 name,
-                f"{100 * missing / len(recording):.1f} % of the samples are 'not measured'",
+                f"{100 * missing / len(recording):.1f} % of the samples are missing",
             )
 
 
@@ -197,63 +226,72 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
-        known = np.flatnonzero(~np.isnan(samples))
+        measured = np.flatnonzero(~np.isnan(samples))
         unit = CHANNELS[name].unit
         rests = CHANNELS[name].rests
-        if rests and not samples[known].any():
+        if rests and not samples[measured].any():
             continue
-        if len(known) > 1 and (samples[known] == samples[known[0]]).all():
+        if len(measured) > 1 and (samples[measured] == samples[measured[0]]).all():
             yield Finding(
                 "warning",
                 "stuck",
                 name,
-                f"never changes: {samples[known[0]]:.6g} {unit} throughout",
+                f"constant at {samples[measured[0]]:.6g} {unit} throughout; "
+                "check the sensor, or leave the channel out",
             )
             continue
-        runs = equal_runs(samples[known])
+        runs = equal_runs(samples[measured])
         runs = runs[
-            (runs[:, 1] - runs[:, 0] >= FEWEST_STUCK)
-            & ~(rests & (samples[known[runs[:, 0]]] == 0.0))
+            (runs[:, 1] - runs[:, 0] >= MIN_STUCK_SAMPLES)
+            & ~(rests & (samples[measured[runs[:, 0]]] == 0.0))
         ]
-        begins = known[runs[:, 0]]
-        ends = known[runs[:, 1] - 1] + 1
-        held = moved[ends] - moved[begins]
-        if len(runs) and held.max() >= STUCK_SECONDS * recording.rate_hz:
-            longest = int(np.argmax(held))
+        begins = measured[runs[:, 0]]
+        ends = measured[runs[:, 1] - 1] + 1
+        moving_samples = moved[ends] - moved[begins]
+        if len(runs) and moving_samples.max() >= STUCK_SECONDS * recording.rate_hz:
+            longest = int(np.argmax(moving_samples))
             first = int(begins[longest] + np.argmax(moving[begins[longest] : ends[longest]]))
-            seconds = held[longest] / recording.rate_hz
+            seconds = moving_samples[longest] / recording.rate_hz
             time = recording.time[first]
             yield Finding(
                 "warning",
                 "stuck",
                 name,
-                f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s",
+                f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s "
+                f"from t = {time:.12g} s while the car moves; check the sensor, or exclude this range",
             )
 
 
 def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """Samples that pile up at the highest or lowest value, again and again, far more often than at the value next to it."""
     for name, samples in recording.channels.items():
-        known = samples[np.isfinite(samples) & moving]
-        lowest, highest = (known.min(), known.max()) if len(known) >= FEWEST_SAMPLES else (0.0, 0.0)
-        between = known[(known > lowest) & (known < highest)]
+        measured = samples[np.isfinite(samples) & moving]
+        lowest, highest = (
+            (measured.min(), measured.max()) if len(measured) >= MIN_SAMPLES else (0.0, 0.0)
+        )
+        between = measured[(measured > lowest) & (measured < highest)]
         if not len(between):
             continue
         for side, extreme, beside in (
             ("highest", highest, between.max()),
             ("lowest", lowest, between.min()),
         ):
-            at = known == extreme
+            at = measured == extreme
             number = int(at.sum())
-            fewest = SATURATED_EXCESS * np.count_nonzero(known == beside)
+            min_number = SATURATED_EXCESS * np.count_nonzero(measured == beside)
             is_extreme = abs(extreme) >= 0.1 * max(abs(lowest), abs(highest))
             if (
                 is_extreme
-                and number > SATURATED_FRACTION * len(known)
-                and number >= fewest
+                and number > SATURATED_FRACTION * len(measured)
+                and number >= min_number
                 and len(true_runs(at)) > 1
             ):
-                message = f"{100 * number / len(known):.2g} % of the samples sit at the {side} value, {extreme:.6g} {CHANNELS[name].unit}"
+                share = f"{100 * number / len(measured):.2g} % of the samples"
+                value = f"{extreme:.6g} {CHANNELS[name].unit}"
+                message = (
+                    f"saturated: {share} are at the {side} value, {value}; "
+                    "check the range of the sensor, or exclude these samples"
+                )
                 yield Finding("warning", "saturated", name, message)
 
 
@@ -269,21 +307,21 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         counts = (samples >= CHANNELS[name].low) & (samples <= CHANNELS[name].high)
         if name == "sideslip_ref":
             counts &= speed > STANDSTILL_SPEED
-        known = samples[np.isfinite(samples)]
-        if len(known) < FEWEST_SAMPLES:
+        measured = samples[np.isfinite(samples)]
+        if len(measured) < MIN_SAMPLES:
             continue
-        low, high = np.quantile(known, USUAL_RANGE)
+        low, high = np.quantile(measured, USUAL_QUANTILES)
         excess = SPIKE_EXCESS * (high - low)
         runs = true_runs((samples > high + excess) | (samples < low - excess))
         steps = np.abs(np.diff(samples))
-        jump = max(excess, SPIKE_STEP * float(np.nanquantile(steps, USUAL_STEPS)))
-        most = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
+        jump = max(excess, SPIKE_STEP * float(np.nanquantile(steps, USUAL_STEP_QUANTILE)))
+        max_samples = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
         spikes = [
             (begin, end)
             for begin, end in runs.tolist()
             if begin > 0
             and end < len(samples)
-            and end - begin <= most
+            and end - begin <= max_samples
             and steps[begin - 1] > jump
             and steps[end - 1] > jump
             and counts[begin:end].all()
@@ -292,11 +330,11 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
             at = worst[0] + int(np.argmax(np.abs(samples[worst[0] : worst[1]])))
             unit = CHANNELS[name].unit
-            times = "once" if len(spikes) == 1 else f"{len(spikes)} times"
             message = (
-                f"jumps {times} for {SPIKE_SECONDS:g} s or less far beyond its usual "
-                f"range ({low:.4g} to {high:.4g} {unit}), to {samples[at]:.4g} {unit} at "
-                f"{recording.time[at]:.12g} s; mark such samples as missing, or cut them out"
+                f"{len(spikes)} spike{'s' if len(spikes) > 1 else ''} of at most "
+                f"{SPIKE_SECONDS:g} s far outside the usual range ({low:.4g} to {high:.4g} {unit}), "
+                f"the largest {samples[at]:.4g} {unit} at t = {recording.time[at]:.12g} s; "
+                "mark these samples as missing, or exclude them"
             )
             yield Finding("warning", "spike", name, message)
 
@@ -311,17 +349,20 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         & np.isfinite(recording["steer"])
     )
     seconds = straight.sum() / recording.rate_hz
-    shown = recording["steer"][straight]
-    if seconds >= STRAIGHT_SECONDS and abs(np.median(shown)) >= max(
-        MOST_STEERING_OFFSET, 2.0 * float(shown.std())
+    angles = recording["steer"][straight]
+    if seconds >= STRAIGHT_SECONDS and abs(np.median(angles)) >= max(
+        MAX_STEERING_OFFSET, 2.0 * float(angles.std())
     ):
-        offset = float(np.median(shown))
-        message = f"shows {np.rad2deg(offset):.3g} deg where the car hardly turns ({seconds:.3g} s of it): "
+        offset = float(np.median(angles))
+        message = (
+            f"median of {np.rad2deg(offset):.3g} deg while driving straight ahead "
+            f"(|yaw_rate| < {STRAIGHT_YAW_RATE:g} rad/s, {seconds:.3g} s)"
+        )
         yield Finding(
             "warning",
             "offset",
             "steer",
-            f"{message}take {offset:.3g} rad off with the transform offset_correction",
+            f"{message}; the transform offset_correction removes it (steer: {offset:.3g} rad)",
         )
 
 
@@ -338,16 +379,20 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         rolling &= ~scipy.ndimage.maximum_filter1d(recording["ax"] < -DROPOUT_BRAKING, around)
     wheels = np.abs(recording.stack(WHEELS))
     for place, name in enumerate(WHEELS):
-        others = np.median(np.delete(wheels, place, axis=1), axis=1)
-        runs = true_runs(rolling & (wheels[:, place] < DROPOUT_SHARE * others))
+        median_of_rest = np.median(np.delete(wheels, place, axis=1), axis=1)
+        runs = true_runs(rolling & (wheels[:, place] < DROPOUT_SHARE * median_of_rest))
         runs = runs[runs[:, 1] - runs[:, 0] > DROPOUT_SECONDS * recording.rate_hz]
         if len(runs):
-            message = f"shows next to nothing {len(runs)} times while the other wheels turn, the longest {_longest(runs, recording)}"
+            message = (
+                f"{len(runs)} dropout{'s' if len(runs) > 1 else ''}: below "
+                f"{100 * DROPOUT_SHARE:g} % of the other wheels' speed, "
+                f"the longest {_longest(runs, recording)}"
+            )
             yield Finding(
                 "warning",
                 "dropout",
                 name,
-                f"{message}; the transform speed_from_wheels leaves such a wheel out",
+                f"{message}; the transform speed_from_wheels ignores such a wheel",
             )
 
 
@@ -361,9 +406,11 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     if len(runs):
         lowest = min(float(recording[speed][begin:end].min()) for begin, end in runs.tolist())
         message = (
-            f"goes backwards {len(runs)} times (below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
-            f"{_longest(runs, recording)}, lowest {lowest:.3g} m/s; estimates there do not count if estimators take the car to go "
-            "forwards: leave the range out (start and stop of a split), or set sign: -1 for the speed if the drive goes forwards"
+            f"reversing in {len(runs)} segment{'s' if len(runs) > 1 else ''} "
+            f"(below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
+            f"{_longest(runs, recording)}, minimum {lowest:.3g} m/s; most estimators assume forward "
+            "driving: exclude the range (start and stop in the split), or set sign: -1 for the speed "
+            "if the car drove forwards"
         )
         yield Finding("note", "reverse", speed, message)
 
@@ -383,27 +430,30 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             np.convolve(recording[name], second / len(second), "same")
             for name in ("yaw_rate", "ay", angle)
         )
-        turns = np.abs(rate) > LEAST_TURN
+        turns = np.abs(rate) > MIN_TURN
         against = turns & (ay * rate < 0.0) & (turned * rate < 0.0)
         is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(
             turns
         )  # else a channel's sign is wrong
-        backwards = against & (recording["vx"] < FASTEST_REVERSE) & is_part
+        backwards = against & (recording["vx"] < MAX_REVERSE_SPEED) & is_part
     runs = true_runs(backwards & (recording["vx"] > REVERSE_SPEED))
     runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
     if len(runs):
-        message = f"has no sign: the car goes backwards {len(runs)} times while it counts up, the longest {_longest(runs, recording)}"
+        message = (
+            f"unsigned: positive while the car reverses in {len(runs)} "
+            f"segment{'s' if len(runs) > 1 else ''}, the longest {_longest(runs, recording)}"
+        )
         yield Finding(
             "warning",
             "reverse",
             "vx",
-            f"{message}; leave the range out (start and stop of a split), or log a signed speed",
+            f"{message}; exclude the range (start and stop in the split), or record a signed speed",
         )
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
     begin, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
-    return f"for {(end - begin) / recording.rate_hz:.3g} s from {recording.time[begin]:.12g} s"
+    return f"for {(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} s"
 
 
 _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
@@ -411,7 +461,7 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _agreement,
     _not_measured,
     _stuck,
-    held_findings,
+    repetition_findings,
     _saturated,
     _spikes,
     _steering_offset,

@@ -11,22 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vehest.alignment.bandwidth import LONGEST_UNREPORTED, low_passed
+from vehest.alignment.bandwidth import MIN_REPORTED_DELAY_SECONDS, low_passed
 from vehest.alignment.findings import Finding
 from vehest.alignment.lateral import lateral_lateness
 from vehest.alignment.motion import WHEELS, Motion, motion_of
 from vehest.alignment.settings import TILT_LAG_GAIN
-from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
+from vehest.alignment.spectra import MAX_LAG_SECONDS, CrossSpectra, Measured, cross_spectra, lag_of
 from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.recording import Recording
 
-LEAST_FIT = 0.97  # share of the phase that a delay must explain
-SLIPPING = frozenset({"vx", "motor_speed", "wheel speeds"})
+MIN_PHASE_SHARE = 0.97  # share of the phase that a delay must explain
+SPEEDS_WITH_SLIP = frozenset({"vx", "motor_speed", "wheel speeds"})
 """Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead and never lag."""
-LARGEST_HALF_WIDTH = 0.05  # s; a delay that is known no better is not known
-DELAYED = {"wheel speeds": WHEELS}
+MAX_HALF_WIDTH_SECONDS = 0.05  # s; a delay that is known no better is not known
+CHANNELS_OF_SIGNAL = {"wheel speeds": WHEELS}
 
 
 @dataclass(frozen=True)
@@ -106,24 +106,24 @@ def delays_of(
     motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()
 ) -> list[Delay]:
     """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed channels."""
-    found: list[Delay] = []
+    delays: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
-        found += _lateral(motion)
-    found += _pair(
+        delays += _lateral(motion)
+    delays += _pair(
         spectra, "forward", "ax", (motion.speed, "ax"), f"ax and d({motion.speed})/dt", tilted=True
     )
-    found += _pair(spectra, "yaw_rate_ref", "yaw_rate", ("yaw_rate_ref", "yaw_rate"), "both")
-    found += _pair(spectra, "d(vx_ref)", "d(vx)", ("vx_ref", "vx"), "both")
+    delays += _pair(spectra, "yaw_rate_ref", "yaw_rate", ("yaw_rate_ref", "yaw_rate"), "both")
+    delays += _pair(spectra, "d(vx_ref)", "d(vx)", ("vx_ref", "vx"), "both")
     for name in ("motor_speed", "wheel speeds"):
-        found += _pair(spectra, f"d({motion.speed})", f"d({name})", (motion.speed, name), "both")
-    found += _pair(
+        delays += _pair(spectra, f"d({motion.speed})", f"d({name})", (motion.speed, name), "both")
+    delays += _pair(
         spectra,
         "slip of vy_ref",
         "sideslip_ref",
         ("vy_ref", "sideslip_ref"),
         f"sideslip_ref and atan2(vy_ref, {motion.speed})",
     )
-    return [delay for delay in found if not {delay.channel, delay.against} & slow]
+    return [delay for delay in delays if not {delay.channel, delay.against} & slow]
 
 
 def _lateral(motion: Motion) -> list[Delay]:
@@ -151,14 +151,14 @@ def _pair(
     if not {source, follower} <= set(spectra.names):
         return []
     lag = lag_of(spectra, source, follower, low_pass=False)
-    if lag is None or lag.fit < LEAST_FIT or not _sound(lag.delay):
+    if lag is None or lag.fit < MIN_PHASE_SHARE or not _sound(lag.delay):
         return []
     delay = lag.delay.widened(TILT_LAG_GAIN) if tilted else lag.delay
     return [Delay(channels[1], channels[0], signals, delay)]
 
 
 def _sound(delay: Measured) -> bool:
-    return delay.half_width <= LARGEST_HALF_WIDTH and abs(delay.value) < LARGEST_LAG
+    return delay.half_width <= MAX_HALF_WIDTH_SECONDS and abs(delay.value) < MAX_LAG_SECONDS
 
 
 def late_channels(recording: Recording) -> dict[str, Late]:
@@ -167,21 +167,23 @@ def late_channels(recording: Recording) -> dict[str, Late]:
     spectra = spectra_of(motion)
     if spectra is None:
         return {}
-    late = _late(delays_of(motion, spectra, frozenset(low_passed(motion, spectra))))
-    return {name: one for one in late for name in one.channels}
+    late_groups = _late(delays_of(motion, spectra, frozenset(low_passed(motion, spectra))))
+    return {name: late_group for late_group in late_groups for name in late_group.channels}
 
 
 def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
     """A warning for every channel that is later than another."""
-    remedy = "{{name: delay_correction, delay: {:.3f}, channels: [{}]}} takes it off"
+    remedy = (
+        "the transform {{name: delay_correction, delay: {:.3f}, channels: [{}]}} compensates for it"
+    )
     return [
         Finding(
             "warning",
             "delay",
-            one.channels[0],
-            f"{one.evidence}; {remedy.format(one.delay, ', '.join(one.channels))}",
+            late.channels[0],
+            f"{late.evidence}; {remedy.format(late.delay, ', '.join(late.channels))}",
         )
-        for one in _late(delays)
+        for late in _late(delays)
     ]
 
 
@@ -190,17 +192,21 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
 
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
     """
-    beyond = [
-        own for own in delays if abs(own.delay.value) - own.delay.half_width > LONGEST_UNREPORTED
+    reported = [
+        delay
+        for delay in delays
+        if abs(delay.delay.value) - delay.delay.half_width > MIN_REPORTED_DELAY_SECONDS
     ]  # with its whole interval
-    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in beyond]
+    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in reported]
     late = [
         delay
         for delay in late
-        if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")
+        if delay.against not in SPEEDS_WITH_SLIP or (delay.channel, delay.against) == ("ax", "vx")
     ]
     within = [
-        own for own in delays if abs(own.delay.value) + own.delay.half_width < LONGEST_UNREPORTED
+        delay
+        for delay in delays
+        if abs(delay.delay.value) + delay.delay.half_width < MIN_REPORTED_DELAY_SECONDS
     ]
     punctual = {delay.channel for delay in within if delay.against.endswith(REFERENCE_SUFFIX)}
     late = [
@@ -208,33 +214,34 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
         for delay in late
         if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))
     ]
-    found = []
+    groups = []
     for channel in dict.fromkeys(delay.channel for delay in late):
-        own = [delay for delay in late if delay.channel == channel]
+        delays_of_channel = [delay for delay in late if delay.channel == channel]
         signals = "; ".join(
-            dict.fromkeys(delay.signals for delay in own if delay.signals != "both")
+            dict.fromkeys(delay.signals for delay in delays_of_channel if delay.signals != "both")
         )
         intervals = [
             (
                 delay.against,
                 *(1e3 * ms for ms in (delay.delay.value, delay.delay.low, delay.delay.high)),
             )
-            for delay in own
+            for delay in delays_of_channel
         ]
         figures = " and ".join(
-            f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f}) behind {name}"
+            f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f} ms) relative to {name}"
             for name, ms, low, high in intervals
         )
-        text = f"is late{' with the other wheels' if channel in DELAYED else ''}, {figures}" + (
-            f", from {signals}" if signals else ""
+        text = (
+            f"delayed{', like the other wheels,' if channel in CHANNELS_OF_SIGNAL else ''} by {figures}"
+            + (f" (from {signals})" if signals else "")
         )
-        if [delay.against for delay in own] == ["vx"]:
-            text += "; or vx comes from wheels, whose slip makes it lead"
-        found.append(
+        if [delay.against for delay in delays_of_channel] == ["vx"]:
+            text += ", unless vx is a wheel speed, which leads by its slip"
+        groups.append(
             Late(
-                DELAYED.get(channel, (channel,)),
-                round(max(delay.delay.value for delay in own), 3),
+                CHANNELS_OF_SIGNAL.get(channel, (channel,)),
+                round(max(delay.delay.value for delay in delays_of_channel), 3),
                 text,
             )
         )
-    return found
+    return groups

@@ -16,3 +16,6 @@ class Finding:
     check: str  # name of the check
     channel: str  # empty if it is about none or if the data do not decide which
     message: str  # fault, place and remedy
+    suspects: tuple[
+        str, ...
+    ] = ()  # channels of which some are at fault, where ``channel`` is empty

@@ -20,8 +20,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from vehest.alignment.motion import rms
 from vehest.alignment.settings import (
-    LARGEST_CUTOFF,
-    SHORTEST_KERNEL,
+    MAX_CUTOFF_SHARE,
+    MIN_KERNEL_SAMPLES,
     TILT_LAG_GAIN,
     AlignmentSettings,
 )
@@ -43,16 +43,16 @@ TILT_LIKENESS = (
 ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
 
 N_BLOCKS = 12
-SHORTEST_BLOCK = 2.0  # s, longer than residuals of the band remember
-FEWEST_BLOCKS = 8
-LEAST_CORRELATION = 0.5
-LARGEST_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
-LARGEST_NOISE_SHARE = 0.05
+MIN_BLOCK_SECONDS = 2.0  # s, longer than residuals of the band remember
+MIN_BLOCKS = 8
+MIN_CORRELATION = 0.5
+MAX_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
+MAX_NOISE_SHARE = 0.05
 KERNEL_REACH = 6.0  # standard deviations
 N_ITERATIONS = 60
-SETTLED = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
-SMALLEST_VARIANCE = 1e-24
-SUSPICIOUS = 3.0  # standard uncertainties
+STEP_TOLERANCE = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
+MIN_VARIANCE = 1e-24
+SUSPICIOUS_UNCERTAINTIES = 3.0  # standard uncertainties
 MORE_MOTION = "more turning, braking and accelerating"
 
 TILT_PRIOR = {
@@ -99,12 +99,12 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     start = dict(NOTHING)
     (predicted, columns) = model(NOTHING)
     if "yaw" in names:
-        expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, model.measured))
+        expected, measured = (rows[0] + 1j * rows[1] for rows in (predicted, model.measured))
         if "offset_ax" in names:
             expected = expected - expected.mean()
-            shown = shown - shown.mean()
+            measured = measured - measured.mean()
         start["yaw"] = -float(
-            np.angle(np.vdot(expected, shown))
+            np.angle(np.vdot(expected, measured))
         )  # brings both together best, without delay and lever arm
     correlation = _cross_correlation(signals, start["yaw"], settings)
     if "delay" in names:
@@ -112,7 +112,9 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
         start["delay"] = correlation.peak
     noise = _noise_of_columns(signals)
     tilts = [
-        name for name in TILT_PRIOR if settings.tilt > 0 and _is_seen(columns[name], noise[name])
+        name
+        for name in TILT_PRIOR
+        if settings.tilt > 0 and _is_above_noise(columns[name], noise[name])
     ]
     fit = _most_likely(model, start, [*names, *tilts], names)
     _require_identified(signals, fit, names, noise)
@@ -184,14 +186,14 @@ class Signals:
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     """Signals of a recording; raises `DataError` where one is missing, short or has gaps, `ConfigurationError` for too high a cut-off."""
-    asked = ", ".join(settings.kinematic)
+    quantities = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
         raise DataError(
-            f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against"
+            f"recording '{recording.id}' has no channel 'vy_ref', the reference that {quantities} require"
         )
     speed = "vx_ref" if "vx_ref" in recording else "vx"
     optional = [name for name in ("yaw_rate_ref", "roll", "pitch") if name in recording]
-    require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref", *optional], asked)
+    require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref", *optional], quantities)
     gravity = None
     if settings.tilt > 0 and ("roll" in recording or "pitch" in recording):
         level = np.zeros(len(recording))
@@ -199,8 +201,10 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
         gravity = GRAVITY * (-np.sin(pitch) + 1j * np.sin(roll) * np.cos(pitch))
     smoothing = smoothing_of(recording, settings.cutoff_at(recording.rate_hz))
     lags = settings.max_delay * recording.rate_hz
-    what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
-    check_limit("filter_samples", lags, what, ConfigurationError)
+    subject = (
+        f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
+    )
+    check_limit("filter_samples", lags, subject, ConfigurationError)
     shift = math.ceil(lags) if "delay" in settings.estimate else 0
     measured = recording["ax"] + 1j * recording["ay"]
     velocity = recording[speed] + 1j * recording["vy_ref"]
@@ -244,7 +248,7 @@ class ImuModel:
         r = self.signals.gyro - at["offset_yaw_rate"] if self._rate is None else self._rate(now)
         lever = at["lever_x"] + 1j * at["lever_y"]
         gain, lag = (
-            complex(at[f"tilt_{what}_x"], at[f"tilt_{what}_y"]) for what in ("gain", "lag")
+            complex(at[f"tilt_{part}_x"], at[f"tilt_{part}_y"]) for part in ("gain", "lag")
         )
 
         rv = r * v
@@ -323,8 +327,10 @@ class Fit:
     @property
     def cost(self) -> float:
         """Twice the negative logarithm of the likelihood, but for a constant."""
-        own = self.point
-        return float(-self.error.shape[1] * np.log(self.weights).sum() + own @ self.prior @ own)
+        values = self.point
+        return float(
+            -self.error.shape[1] * np.log(self.weights).sum() + values @ self.prior @ values
+        )
 
     @property
     def gradient(self) -> FloatArray:
@@ -353,25 +359,25 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
 
     if signals.reference_rate is not None:
         pairs = [(low(gyro, 1), low(signals.reference_rate, 1))]
-        what = "yaw acceleration"
+        quantity = "yaw acceleration"
     else:
-        own = np.exp(1j * yaw) * low(signals.measured) - 1j * low(gyro * v)
+        sensor = np.exp(1j * yaw) * low(signals.measured) - 1j * low(gyro * v)
         derived = low(v, 1)
-        pairs = [(own.real, derived.real), (own.imag, derived.imag)]
-        what = "acceleration"
+        pairs = [(sensor.real, derived.real), (sensor.imag, derived.imag)]
+        quantity = "acceleration"
     n_lags = math.ceil(settings.max_delay * signals.rate_hz)
     lags = np.arange(-n_lags, n_lags + 1)
     products = np.zeros(len(lags))
-    own_energy = np.zeros(len(lags))
+    sensor_energy = np.zeros(len(lags))
     derived_energy = 0.0
-    for own, derived in pairs:
-        own = own - own.mean()
+    for sensor, derived in pairs:
+        sensor = sensor - sensor.mean()
         core = (derived - derived.mean())[n_lags : len(derived) - n_lags]
-        products += signal.correlate(own, core, mode="valid", method="fft")
-        energy = np.concatenate([[0.0], np.cumsum(np.square(own))])
-        own_energy += energy[len(core) :] - energy[: len(lags)]
+        products += signal.correlate(sensor, core, mode="valid", method="fft")
+        energy = np.concatenate([[0.0], np.cumsum(np.square(sensor))])
+        sensor_energy += energy[len(core) :] - energy[: len(lags)]
         derived_energy += float(core @ core)
-    size = np.sqrt(own_energy * derived_energy)
+    size = np.sqrt(sensor_energy * derived_energy)
     value = np.divide(products, size, out=np.zeros(len(lags)), where=size > 0)
     top = int(np.argmax(value))
     at_end = top in (0, len(value) - 1)
@@ -380,25 +386,31 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
         before, at, after = value[top - 1 : top + 2]
         bend = before - 2.0 * at + after
         shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return Correlation(what, at_end, float(lags[top] + shift) / signals.rate_hz, float(value[top]))
+    return Correlation(
+        quantity, at_end, float(lags[top] + shift) / signals.rate_hz, float(value[top])
+    )
 
 
 def _require_peak(
     recording: Recording, correlation: Correlation, settings: AlignmentSettings
 ) -> None:
     """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that are searched."""
-    if correlation.highest < LEAST_CORRELATION:
-        what = f"{correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most"
+    if correlation.highest < MIN_CORRELATION:
+        problem = (
+            f"the {correlation.signal} of sensor and reference has a correlation of at most "
+            f"{correlation.highest:.2f} (required: {MIN_CORRELATION:g})"
+        )
         fix = f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
-        raise DataError(f"recording '{recording.id}': {what}; {fix}")
+        raise DataError(f"recording '{recording.id}': {problem}; {fix}")
     if correlation.at_end:
         raise DataError(
-            f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay"
+            f"recording '{recording.id}': the largest correlation is at the limit of the searched "
+            f"delays ({settings.max_delay:g} s); raise max_delay"
         )
 
 
 def _most_likely(
-    model: ImuModel, start: Mapping[str, float], names: Sequence[str], asked: Sequence[str]
+    model: ImuModel, start: Mapping[str, float], names: Sequence[str], requested: Sequence[str]
 ) -> Fit:
     """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the mean square of its own residuals."""
     prior = np.diag([TILT_PRIOR[name] ** -2 if name in TILT_PRIOR else 0.0 for name in names])
@@ -406,7 +418,7 @@ def _most_likely(
     def fit_at(values: Mapping[str, float]) -> Fit:
         predicted, by_name = model(values)
         error = model.measured - predicted
-        weights = 1.0 / np.maximum(np.mean(np.square(error), axis=1), SMALLEST_VARIANCE)
+        weights = 1.0 / np.maximum(np.mean(np.square(error), axis=1), MIN_VARIANCE)
         return Fit(
             names, dict(values), error, np.stack([by_name[name] for name in names]), weights, prior
         )
@@ -415,10 +427,10 @@ def _most_likely(
     damping = 1e-4
     for _ in range(N_ITERATIONS):
         information = fit.information
-        require_condition(model.signals.recording, information, names, asked)
+        require_condition(model.signals.recording, information, names, requested)
         step = np.linalg.solve(information + damping * np.diag(np.diag(information)), fit.gradient)
         moved = fit_at({**fit.values, **dict(zip(names, (fit.point + step).tolist(), strict=True))})
-        settled = float(np.abs(step).max()) < SETTLED
+        settled = float(np.abs(step).max()) < STEP_TOLERANCE
         if moved.cost <= fit.cost:
             fit = moved
             damping = damping / 10.0
@@ -426,34 +438,37 @@ def _most_likely(
             damping = max(damping, 1e-4) * 10.0
         if settled:
             return fit
-    fix = f"ask for fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
+    fix = f"request fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
     raise DataError(
-        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; {fix}"
+        f"recording '{model.signals.recording.id}': the estimate of {listed(requested)} does not converge; {fix}"
     )
 
 
 def require_condition(
-    recording: Recording, information: FloatArray, names: Sequence[str], asked: Sequence[str]
+    recording: Recording, information: FloatArray, names: Sequence[str], requested: Sequence[str]
 ) -> None:
     """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number of the scaled problem is too large."""
     scale = np.sqrt(np.diag(information))
     silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
     if silent:
         raise DataError(
-            f"recording '{recording.id}': nothing in it depends on {listed(silent)}; the drive needs turning and accelerating"
+            f"recording '{recording.id}': no signal depends on {listed(silent)}; the drive needs turning and accelerating"
         )
     condition = condition_of(information)
-    if condition <= LARGEST_CONDITION:
+    if condition <= MAX_CONDITION:
         return
     weakest = np.linalg.eigh(information / scale / scale[:, None])[1][:, 0]
     confused = [
-        name if name in asked else "tilt of the body"
+        name if name in requested else "tilt of the body"
         for name, part in zip(names, weakest, strict=True)
         if abs(part) > 0.3
     ]
-    what = f"{listed(list(dict.fromkeys(confused)))} apart (condition number {condition:.2g}, at most {LARGEST_CONDITION:g})"
-    fix = "ask for fewer quantities, or use a drive with varying speed and turns both ways"
-    raise DataError(f"recording '{recording.id}': this drive cannot tell {what}; {fix}")
+    problem = (
+        f"{listed(list(dict.fromkeys(confused)))} cannot be separated in this drive "
+        f"(condition number {condition:.2g}, at most {MAX_CONDITION:g})"
+    )
+    fix = "request fewer quantities, or use a drive with varying speed and turns both ways"
+    raise DataError(f"recording '{recording.id}': {problem}; {fix}")
 
 
 def condition_of(information: FloatArray) -> float:
@@ -499,30 +514,30 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
     }
 
 
-def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
+def _is_above_noise(column: FloatArray, noise: tuple[float, float, float]) -> bool:
     """Whether an effect varies enough to be separated from noise; where it does not, it counts as an uncertainty only."""
-    return sum(size**2 for size in noise) <= LARGEST_NOISE_SHARE * float(column.var(axis=1).sum())
+    return sum(size**2 for size in noise) <= MAX_NOISE_SHARE * float(column.var(axis=1).sum())
 
 
 def _require_identified(
     signals: Signals,
     fit: Fit,
-    asked: Sequence[str],
+    requested: Sequence[str],
     noise: Mapping[str, tuple[float, float, float]],
 ) -> None:
     """Refuse parameters whose column, without the share of the others, does not stand well above the noise of yaw rate and reference."""
-    unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(asked), : len(asked)]))
-    for index, name in enumerate(asked):
+    unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(requested), : len(requested)]))
+    for index, name in enumerate(requested):
         share = (
             fit.error.shape[1]
             * float(fit.weights @ np.square(noise[name][: len(fit.weights)]))
             / unique[index]
         )
-        if share > LARGEST_NOISE_SHARE:
-            what = f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %)"
+        if share > MAX_NOISE_SHARE:
+            problem = f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most {100 * MAX_NOISE_SHARE:g} %)"
             fix = f"lower the cut-off, or use a drive with {MORE_MOTION}"
             raise DataError(
-                f"recording '{signals.recording.id}': {name} cannot be estimated: {what}; {fix}"
+                f"recording '{signals.recording.id}': {name} cannot be estimated: {problem}; {fix}"
             )
 
 
@@ -533,15 +548,17 @@ def _noise(samples: FloatArray) -> float:
 
 def require_length(recording: Recording, usable: float, lost: float) -> None:
     """Refuse, by a `DataError`, what is too short for an uncertainty."""
-    least = FEWEST_BLOCKS * SHORTEST_BLOCK
-    if usable < least:
-        needed = f"an uncertainty needs at least {least + lost:.3g} s, of which {lost:.2g} s for filtering and shifting"
-        raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s; {needed}")
+    min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
+    if usable < min_seconds:
+        requirement = f"an uncertainty needs at least {min_seconds + lost:.3g} s, of which {lost:.2g} s for filtering and shifting"
+        raise DataError(
+            f"recording '{recording.id}' lasts {recording.duration:.3g} s; {requirement}"
+        )
 
 
 def n_blocks(seconds: float) -> int:
     """Number of blocks that a drive is divided into: longer ones for longer drives."""
-    return min(max(int(seconds / SHORTEST_BLOCK), FEWEST_BLOCKS), N_BLOCKS)
+    return min(max(int(seconds / MIN_BLOCK_SECONDS), MIN_BLOCKS), N_BLOCKS)
 
 
 def scatter_of(fit: Fit, blocks: int) -> FloatArray:
@@ -559,9 +576,9 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     for first, last in itertools.pairwise(edges):
         columns = fit.columns[:, :, first:last]
         error = fit.error[:, first:last]
-        own = np.einsum("pct,qct,c->pq", columns, columns, fit.weights, optimize=True)
+        block_information = np.einsum("pct,qct,c->pq", columns, columns, fit.weights, optimize=True)
         score = np.einsum("pct,ct,c->p", columns, error, fit.weights, optimize=True)
-        changes.append(np.linalg.lstsq(information - own, -score, rcond=None)[0])
+        changes.append(np.linalg.lstsq(information - block_information, -score, rcond=None)[0])
     moved = np.stack(changes)
     inverse = np.linalg.inv(information)
     return (blocks - 1) / blocks * moved.T @ moved + inverse @ fit.prior @ inverse
@@ -615,15 +632,15 @@ def _suspects(
         wider = replace(
             fit,
             names=names,
-            columns=np.stack([columns[each] for each in names]),
+            columns=np.stack([columns[parameter] for parameter in names]),
             prior=np.pad(fit.prior, (0, 1)),
         )
-        if condition_of(wider.information) > LARGEST_CONDITION:
+        if condition_of(wider.information) > MAX_CONDITION:
             continue
         step = np.linalg.solve(wider.information, wider.gradient)
         left = replace(wider, error=fit.error - np.einsum("p,pct->ct", step, wider.columns))
         uncertainty = math.hypot(*(float(sizes[-1]) for sizes in uncertainties(left)))
-        if abs(step[-1]) > SUSPICIOUS * uncertainty:
+        if abs(step[-1]) > SUSPICIOUS_UNCERTAINTIES * uncertainty:
             suspects[name] = (float(step[-1]), uncertainty)
     return suspects
 
@@ -648,7 +665,7 @@ class Smoothing:
     @property
     def step(self) -> int:
         """Every how many samples one is kept."""
-        return max(math.floor(self.deviation / SHORTEST_KERNEL), 1)
+        return max(math.floor(self.deviation / MIN_KERNEL_SAMPLES), 1)
 
     def __call__(
         self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0
@@ -684,9 +701,9 @@ class Smoothing:
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
     """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to be sampled, or longer than the limit."""
     length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
-    what = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
-    check_limit("filter_samples", length, what, ConfigurationError)
-    limit = LARGEST_CUTOFF * recording.rate_hz
+    subject = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
+    check_limit("filter_samples", length, subject, ConfigurationError)
+    limit = MAX_CUTOFF_SHARE * recording.rate_hz
     if cutoff_hz > limit:
         fix = f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
         raise ConfigurationError(
@@ -695,12 +712,12 @@ def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
     return Smoothing(_deviation(cutoff_hz, recording.rate_hz), recording.rate_hz)
 
 
-def require_complete(recording: Recording, names: Sequence[str], asked: str) -> None:
+def require_complete(recording: Recording, names: Sequence[str], quantities: str) -> None:
     """Refuse, by a `DataError`, channels that are not there or have gaps."""
     for name in names:
         if np.isnan(recording[name]).any():
             raise DataError(
-                f"recording '{recording.id}': channel '{name}' has gaps; cut a range without them to estimate {asked}"
+                f"recording '{recording.id}': channel '{name}' has gaps; select a range without gaps to estimate {quantities}"
             )
 
 

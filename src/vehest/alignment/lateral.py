@@ -9,8 +9,8 @@ import scipy
 
 from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import (
-    LARGEST_LAG,
-    RATE_KEPT,
+    MAX_LAG_SECONDS,
+    MIN_AVERAGED_RATE_HZ,
     ComplexArray,
     CrossSpectra,
     Measured,
@@ -21,17 +21,17 @@ from vehest.alignment.spectra import (
 from vehest.constants import FloatArray
 
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
-LARGEST_GAIN = (
+MAX_GAIN_RATIO = (
     2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
 )
-LEAST_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
+MIN_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
 N_SHIFTS = 6
-SETTLED = 1e-3  # s
-FEWEST_SAMPLES = 10
+SHIFT_TOLERANCE_SECONDS = 1e-3  # s
+MIN_SAMPLES = 10
 N_STEPS = 8
 N_WEIGHTINGS = 3
-LARGEST_STEP = 0.1  # s
-LOWEST_RESIDUAL = 1e-6  # of the power of ay; nothing is known better
+MAX_STEP_SECONDS = 0.1  # s
+MIN_RESIDUAL_SHARE = 1e-6  # of the power of ay; nothing is known better
 
 
 def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | None:
@@ -44,27 +44,30 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
     velocity shrinks neither. Bins have the weight that the residual leaves them. Channels are shifted and fitted again until
     next to nothing is left, since turning the phase of a segment does not shift its ends.
 
-    Returns:
-        None where a channel is missing, the drive is too short, or d(vy)/dt does not explain ay without vx·yaw_rate.
+    Returns
+    -------
+    tuple of Measured, or None
+        τ₁, τ₂ and their difference [s]; None where a channel is missing, the drive is too short, or
+        d(vy)/dt does not explain ay without vx·yaw_rate.
     """
     if (
         not motion.velocity
         or not {"ay", "yaw_rate"} <= set(motion.channels)
-        or len(motion) < FEWEST_SAMPLES
+        or len(motion) < MIN_SAMPLES
     ):
         return None
-    slower = motion.slower(max(int(motion.rate_hz / RATE_KEPT), 1))
+    slower = motion.slower(max(int(motion.rate_hz / MIN_AVERAGED_RATE_HZ), 1))
     turning = sliding = 0.0
     for _ in range(N_SHIFTS):
-        found = _spectra(slower, turning, sliding)
-        weighted = None if found is None else _weighted(found.whole, found.omega)
-        if found is None or weighted is None:
+        shifted = _spectra(slower, turning, sliding)
+        weighted = None if shifted is None else _weighted(shifted.total, shifted.omega)
+        if shifted is None or weighted is None:
             return None
-        spectra = found
+        spectra = shifted
         (start, weight) = weighted
         if (
-            max(map(abs, start)) < SETTLED
-            or max(abs(turning + start[0]), abs(sliding + start[1])) > LARGEST_LAG
+            max(map(abs, start)) < SHIFT_TOLERANCE_SECONDS
+            or max(abs(turning + start[0]), abs(sliding + start[1])) > MAX_LAG_SECONDS
         ):
             break
         turning = turning + start[0]
@@ -89,35 +92,35 @@ def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | N
         yaw_rate = scipy.interpolate.CubicSpline(clock, yaw_rate)(
             np.clip(clock + turning - sliding, 0.0, clock[-1])
         )
-    shown = (
+    signals = (
         ay,
         motion.vx * yaw_rate,
         motion.sliding,
         motion.derivative(yaw_rate),
         motion.derivative(motion.vx) * yaw_rate,
     )
-    if not all(0.0 < np.ptp(samples) < np.inf for samples in shown):
+    if not all(0.0 < np.ptp(samples) < np.inf for samples in signals):
         return None
-    return cross_spectra(dict(zip(SIGNALS, shown, strict=True)), motion.rate_hz, motion.moving)
+    return cross_spectra(dict(zip(SIGNALS, signals, strict=True)), motion.rate_hz, motion.moving)
 
 
 def _weighted(
-    whole: ComplexArray, omega: FloatArray
+    spectrum: ComplexArray, omega: FloatArray
 ) -> tuple[tuple[float, float], FloatArray] | None:
     """Both delays, and the weights that the residual leaves, (F,)."""
-    floor = LOWEST_RESIDUAL * float(whole[:, 0, 0].real.max())
+    floor = MIN_RESIDUAL_SHARE * float(spectrum[:, 0, 0].real.max())
     weight = np.ones(len(omega)) / max(floor, np.finfo(float).tiny)
     start = (0.0, 0.0)
     explained = 0.0
     for _ in range(N_WEIGHTINGS):
-        fitted = _fit(whole, omega, weight, start)
+        fitted = _fit(spectrum, omega, weight, start)
         if fitted is None:
             return None
         start, residual, explained = fitted
         weight = 1.0 / np.maximum(smoothed(residual), max(floor, np.finfo(float).tiny))
     if (
-        explained < LEAST_SLIDING_SHARE
-        or not 1.0 / LARGEST_GAIN < _sliding_gain(whole, omega, weight, start) < LARGEST_GAIN
+        explained < MIN_SLIDING_SHARE
+        or not 1.0 / MAX_GAIN_RATIO < _sliding_gain(spectrum, omega, weight, start) < MAX_GAIN_RATIO
     ):
         return None
     return start, weight
@@ -155,10 +158,10 @@ def _fit(
             return None
         if not np.isfinite(values).all() or values[0] == 0.0:
             return None
-        turning += float(np.clip(values[1] / values[0], -LARGEST_STEP, LARGEST_STEP))
-        sliding += float(np.clip(values[2] / values[0], -LARGEST_STEP, LARGEST_STEP))
+        turning += float(np.clip(values[1] / values[0], -MAX_STEP_SECONDS, MAX_STEP_SECONDS))
+        sliding += float(np.clip(values[2] / values[0], -MAX_STEP_SECONDS, MAX_STEP_SECONDS))
         turning, sliding = (
-            min(max(delay, -LARGEST_LAG), LARGEST_LAG) for delay in (turning, sliding)
+            min(max(delay, -MAX_LAG_SECONDS), MAX_LAG_SECONDS) for delay in (turning, sliding)
         )
         if np.abs(values[1:3]).max() < 1e-6 * abs(values[0]):
             break
@@ -181,6 +184,6 @@ def _sliding_gain(
     advance = np.exp(
         1j * np.multiply.outer(omega, [0.0, delays[0], delays[1], delays[0], delays[0]])
     )
-    own = np.einsum("fst,fs,ft,f->st", spectrum, advance.conj(), advance, weight).real
-    gains = np.linalg.lstsq(own[1:, 1:], own[1:, 0], rcond=None)[0]
+    products = np.einsum("fst,fs,ft,f->st", spectrum, advance.conj(), advance, weight).real
+    gains = np.linalg.lstsq(products[1:, 1:], products[1:, 0], rcond=None)[0]
     return float(gains[1] / gains[0]) if gains[0] != 0.0 else 0.0

@@ -9,16 +9,16 @@ import numpy as np
 from vehest.alignment.findings import Finding, Level
 from vehest.alignment.motion import Motion
 from vehest.alignment.signs import settled_samples
-from vehest.alignment.spectra import MOST_GROUPS, Measured, jackknife
+from vehest.alignment.spectra import MAX_GROUPS, Measured, jackknife
 from vehest.constants import GRAVITY, FloatArray
 
-NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
-DOUBTFUL_OFFSET = (
+MIN_NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
+MAX_NOTED_OFFSET = (
     0.5  # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
 )
-LARGEST_GYRO_OFFSET = 0.05  # rad/s
+MAX_GYRO_OFFSET = 0.05  # rad/s
 BLOCK_SECONDS = 2.0
-FEWEST_BLOCKS = 6
+MIN_BLOCKS = 6
 
 
 def lateral_offset(motion: Motion) -> Measured | None:
@@ -32,8 +32,8 @@ def lateral_offset(motion: Motion) -> Measured | None:
         return None
     left = (motion["ay"] - motion.sliding if motion.velocity else motion["ay"])[settled]
     turning = motion.turning[settled]
-    number = min(int(len(left) / (BLOCK_SECONDS * motion.rate_hz)), MOST_GROUPS)
-    if number < FEWEST_BLOCKS:
+    number = min(int(len(left) / (BLOCK_SECONDS * motion.rate_hz)), MAX_GROUPS)
+    if number < MIN_BLOCKS:
         return None
     starts = np.linspace(0, len(left), number + 1).astype(int)[:-1]
     sums = np.stack(
@@ -57,21 +57,24 @@ def _intercept(sums: FloatArray) -> FloatArray:
 def offset_findings(motion: Motion) -> list[Finding]:
     """A note of an offset beyond a level mounting, a warning of one beyond any road."""
     offset = lateral_offset(motion)
-    if offset is None or abs(offset.value) < NOTED_OFFSET or abs(offset.value) < offset.half_width:
+    if (
+        offset is None
+        or abs(offset.value) < MIN_NOTED_OFFSET
+        or abs(offset.value) < offset.half_width
+    ):
         return []
-    level: Level = "warning" if abs(offset.value) > DOUBTFUL_OFFSET else "note"
+    level: Level = "warning" if abs(offset.value) > MAX_NOTED_OFFSET else "note"
     degrees = np.degrees(np.arcsin(min(abs(offset.value) / GRAVITY, 1.0)))
     turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
     gyro = (
-        f", or an offset of yaw_rate of {turning:.3f} rad/s"
-        if abs(turning) < LARGEST_GYRO_OFFSET
-        else ""
+        f", or a yaw_rate offset of {turning:.3f} rad/s" if abs(turning) < MAX_GYRO_OFFSET else ""
     )
     expected = f"{motion.speed}·yaw_rate" + (
         f" + d({motion.velocity})/dt" if motion.velocity else ""
     )
     message = (
-        f"lies {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) beside {expected} over the whole drive: a unit or a "
-        f"road tilted by {degrees:.1f} deg{gyro}; the transform offset_correction takes it off"
+        f"constant offset of {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) "
+        f"relative to {expected}: a sensor or road inclined by {degrees:.1f} deg{gyro}; "
+        "the transform offset_correction removes it"
     )
     return [Finding(level, "offset", "ay", message)]

@@ -11,8 +11,8 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
-LARGEST_EXCESS = 100.0  # times what a vehicle can do; beyond lies no wrong unit
-MOST_MISSING = 0.05  # of the samples of a channel, which a line then bridges
+MAX_EXCESS = 100.0  # times what a vehicle can do; beyond lies no wrong unit
+MAX_MISSING_SHARE = 0.05  # of the samples of a channel, which a line then bridges
 WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr")
 
 
@@ -110,7 +110,9 @@ class Motion:
 def motion_of(recording: Recording, moving: BoolArray) -> Motion:
     """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``: where the car does not stand."""
     channels = {
-        name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None
+        name: complete
+        for name in recording.channels
+        if (complete := _bridged(recording, name)) is not None
     }
     speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
     velocity = (
@@ -119,16 +121,16 @@ def motion_of(recording: Recording, moving: BoolArray) -> Motion:
     return Motion(recording.rate_hz, channels, speed, velocity, moving)
 
 
-def _whole(recording: Recording, name: str) -> FloatArray | None:
+def _bridged(recording: Recording, name: str) -> FloatArray | None:
     samples = recording[name]
     described = CHANNELS[name]
     unknown = np.isnan(samples) if name in recording.gappy else None
     if unknown is not None and unknown.any():
-        if unknown.mean() > MOST_MISSING:
+        if unknown.mean() > MAX_MISSING_SHARE:
             return None
         places = np.arange(len(samples))
         samples = np.interp(places, places[~unknown], samples[~unknown])
-    bound = LARGEST_EXCESS * max(abs(described.low), abs(described.high))
+    bound = MAX_EXCESS * max(abs(described.low), abs(described.high))
     return None if np.abs(samples).max() > bound else samples
 
 

@@ -13,9 +13,9 @@ TILT_LAG_GAIN = 0.005
 The body follows late, say 0.1 times 50 ms.
 """
 
-USUAL_CUTOFF = 2.0  # Hz
-SHORTEST_KERNEL = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
-LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (2.0 * math.pi * SHORTEST_KERNEL)  # of the rate
+DEFAULT_CUTOFF_HZ = 2.0  # Hz
+MIN_KERNEL_SAMPLES = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
+MAX_CUTOFF_SHARE = math.sqrt(math.log(2.0)) / (2.0 * math.pi * MIN_KERNEL_SAMPLES)  # of the rate
 
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "lever_arm": ("lever_x", "lever_y"),
@@ -45,7 +45,7 @@ class AlignmentSettings:
     def __post_init__(self) -> None:
         offered = ", ".join(QUANTITIES)
         if not self.estimate:
-            raise ConfigurationError(f"say what to estimate: one or more of {offered}")
+            raise ConfigurationError(f"name what to estimate: one or more of {offered}")
         unknown = [name for name in self.estimate if name not in QUANTITIES]
         if unknown:
             raise ConfigurationError(f"'{unknown[0]}' cannot be estimated; there are: {offered}")
@@ -62,7 +62,7 @@ class AlignmentSettings:
         """-3 dB frequency of the low-pass [Hz]: as set, or 2 Hz, or what a rate below 23 Hz allows."""
         if self.cutoff_hz is not None:
             return self.cutoff_hz
-        return min(USUAL_CUTOFF, LARGEST_CUTOFF * rate_hz)
+        return min(DEFAULT_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz)
 
     @property
     def kinematic(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,37 +18,30 @@ from vehest.data.errors import listed
 
 KINEMATIC_BAND_HZ = (0.1, 2.0)
 FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording
-FEWEST_SAMPLES = 100
-LEAST_SECONDS = 10.0  # of filtered samples
-STEADY_CORRELATION = 0.7
-SIGN_CORRELATION = 0.3  # of relations with derivatives
-SCALE_CORRELATION = 0.8
-SAME_CORRELATION = 0.95  # of one angle measured twice
-LEAST_ACCELERATION = 0.2  # m/s², standard deviation
-LEAST_SLIDING = 1e-3  # m/s²
-LEAST_SIDESLIP = 1e-3  # rad
-DRIFTING = 0.2  # rad of sideslip, beyond which drivers steer against the turn
-STEERED_SECONDS = 5.0
-MOST_TURNED = 4  # channels at a time
+MIN_SAMPLES = 100
+MIN_SETTLED_SECONDS = 10.0  # of filtered samples
+MIN_STEADY_CORRELATION = 0.7
+MIN_SIGN_CORRELATION = 0.3  # of relations with derivatives
+MIN_SCALE_CORRELATION = 0.8
+MIN_SAME_CORRELATION = 0.95  # of one angle measured twice
+MIN_ACCELERATION = 0.2  # m/s², standard deviation
+MIN_SLIDING = 1e-3  # m/s²
+MIN_SIDESLIP = 1e-3  # rad
+MAX_ROLLING_SIDESLIP = 0.2  # rad of sideslip, beyond which drivers steer against the turn
+MIN_STEERED_SECONDS = 5.0
+MAX_REVERSED_CHANNELS = 4  # channels at a time
 KILOMETRES_AN_HOUR = 3.6
 DEGREES_PER_RADIAN = 180.0 / np.pi
-TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
+SCALE_TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
 LONGITUDINAL_TOLERANCE = 3.0  # of ax, which pitch, grade and slip change; its wrong factor is 9.8
 EXACTNESS = 1.25  # within which a wrong factor must explain a scale
-_KILOMETRES = ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h"))
-_STANDARD_GRAVITY = ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g"))
-_DEGREES_A_SECOND = (
-    (DEGREES_PER_RADIAN, "deg/s"),
-    (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s"),
-)
-_DEGREES = ((DEGREES_PER_RADIAN, "deg"), (1.0 / DEGREES_PER_RADIAN, "rad taken for deg"))
-WRONG_FACTORS = {
-    **dict.fromkeys(("vx", "vx_ref", "vy_ref"), _KILOMETRES),
-    **dict.fromkeys(("ax", "ay"), _STANDARD_GRAVITY),
-    **dict.fromkeys(("yaw_rate", "yaw_rate_ref"), _DEGREES_A_SECOND),
-    "sideslip_ref": _DEGREES,
+ALTERNATIVE_UNITS = {
+    **dict.fromkeys(("vx", "vx_ref", "vy_ref"), (KILOMETRES_AN_HOUR, "km/h", "m/s")),
+    **dict.fromkeys(("ax", "ay"), (1.0 / GRAVITY, "g", "m/s²")),
+    **dict.fromkeys(("yaw_rate", "yaw_rate_ref"), (DEGREES_PER_RADIAN, "deg/s", "rad/s")),
+    "sideslip_ref": (DEGREES_PER_RADIAN, "deg", "rad"),
 }
-"""Channel -> factor and unit of each mistake."""
+"""Channel -> factor by which its values are too large in a wrong unit, that unit, and the SI unit."""
 UNSAFE = {
     "yaw_rate": "deg/s",
     "sideslip_ref": "deg",
@@ -64,15 +58,13 @@ class Relation:
     powers: tuple[int, ...]  # of each channel in left over right, 1 or -1
     scale: float  # left over right
     correlation: float
-    tolerance: float = (
-        TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
-    )
-    least_correlation: float = SCALE_CORRELATION  # below which the scale is unknown
+    tolerance: float = SCALE_TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
+    least_correlation: float = MIN_SCALE_CORRELATION  # below which the scale is unknown
 
     @property
     def text(self) -> str:
-        """The relation as a subject."""
-        return f"{self.left} and {self.right}"
+        """Both quantities, such as ``ay vs. vx·yaw_rate``."""
+        return f"{self.left} vs. {self.right}"
 
     def holds(self, scale: float) -> bool:
         """Whether left over right could be such."""
@@ -89,11 +81,17 @@ class Relation:
 
 def relations_of(motion: Motion) -> list[Relation]:
     """All relations between the channels that the drive shows clearly."""
-    found = [one for of in (_lateral, _steered, _longitudinal, _repeated) for one in of(motion)]
+    relations = [
+        relation
+        for relations_between in (_lateral, _steered, _longitudinal, _repeated)
+        for relation in relations_between(motion)
+    ]
     return [
-        one
-        for one in found
-        if np.isfinite(one.scale) and np.isfinite(one.correlation) and one.scale != 0.0
+        relation
+        for relation in relations
+        if np.isfinite(relation.scale)
+        and np.isfinite(relation.correlation)
+        and relation.scale != 0.0
     ]
 
 
@@ -107,7 +105,7 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
     moving = motion.moving
     measured = motion["ay"]
     turning = motion.turning
-    if np.count_nonzero(moving) < FEWEST_SAMPLES or measured.std() < LEAST_ACCELERATION:
+    if np.count_nonzero(moving) < MIN_SAMPLES or measured.std() < MIN_ACCELERATION:
         return
     product = f"{motion.speed}·yaw_rate"
     steady = (samples[moving] - samples[moving].mean() for samples in (measured, turning))
@@ -118,12 +116,12 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
     a, p, d, steep = (
         band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning))
     )
-    if d.std() < LEAST_SLIDING or p.std() == 0.0:
+    if d.std() < MIN_SLIDING or p.std() == 0.0:
         return
     right, left = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
-    known = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
-    channels = (motion.velocity, "ay", motion.speed)[:known]
-    powers = (1, -1, 1)[:known]
+    n_suspects = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
+    channels = (motion.velocity, "ay", motion.speed)[:n_suspects]
+    powers = (1, -1, 1)[:n_suspects]
     yield from _related(
         f"d({motion.velocity})/dt",
         f"ay - {product}",
@@ -131,7 +129,7 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
         powers,
         left,
         right,
-        SIGN_CORRELATION,
+        MIN_SIGN_CORRELATION,
     )
 
 
@@ -141,8 +139,8 @@ def _steered(motion: Motion) -> Iterator[Relation]:
         return
     rolling = motion.moving.copy()
     if motion.velocity:
-        rolling &= np.abs(motion.vy) < DRIFTING * np.abs(motion.vx)
-    if np.count_nonzero(rolling) >= max(STEERED_SECONDS * motion.rate_hz, FEWEST_SAMPLES):
+        rolling &= np.abs(motion.vy) < MAX_ROLLING_SIDESLIP * np.abs(motion.vx)
+    if np.count_nonzero(rolling) >= max(MIN_STEERED_SECONDS * motion.rate_hz, MIN_SAMPLES):
         names = (motion.steering, "yaw_rate", motion.speed)
         steady = (
             samples[rolling] - samples[rolling].mean()
@@ -180,19 +178,19 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
     for name in ("yaw_rate", "vx"):
         reference = f"{name}_ref"
         moving = motion.moving
-        if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
+        if name in motion and reference in motion and np.count_nonzero(moving) >= MIN_SAMPLES:
             pair = (name, reference)
             steady = (
-                motion[one][moving] - motion[one][moving].mean() for one in pair
+                motion[channel][moving] - motion[channel][moving].mean() for channel in pair
             )  # slip is no factor: means alone would agree
             yield from _related(*pair, pair, (1, -1), *steady)
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
         forwards = motion.moving & (
             motion.vx > 0.0
         )  # the angle of a car that goes backwards is taken either way
-        shown = motion["sideslip_ref"][forwards]
+        angle = motion["sideslip_ref"][forwards]
         expected = np.arctan2(motion.vy, motion.vx)[forwards]
-        if len(expected) >= FEWEST_SAMPLES and np.std(expected) >= LEAST_SIDESLIP:
+        if len(expected) >= MIN_SAMPLES and np.std(expected) >= MIN_SIDESLIP:
             names = ("sideslip_ref", "vy_ref", motion.speed)
             right = f"atan2(vy_ref, {motion.speed})"
             yield from _related(
@@ -200,9 +198,9 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
                 right,
                 names,
                 (1, -1, 1),
-                shown,
+                angle,
                 expected,
-                least_correlation=SAME_CORRELATION,
+                least_correlation=MIN_SAME_CORRELATION,
             )
 
 
@@ -211,16 +209,16 @@ def _related(
     right: str,
     channels: tuple[str, ...],
     powers: tuple[int, ...],
-    shown: FloatArray,
+    measured: FloatArray,
     expected: FloatArray,
-    least: float = STEADY_CORRELATION,
+    min_correlation: float = MIN_STEADY_CORRELATION,
     **limits: float,
 ) -> Iterator[Relation]:
     """The relation of two signals, about nil, whose correlation is ``least`` at least."""
-    sizes = rms(shown), rms(expected)
+    sizes = rms(measured), rms(expected)
     if 0.0 < min(sizes) <= max(sizes) < np.inf:
-        correlation = float(np.mean(shown / sizes[0] * (expected / sizes[1])))
-        if abs(correlation) >= least:
+        correlation = float(np.mean(measured / sizes[0] * (expected / sizes[1])))
+        if abs(correlation) >= min_correlation:
             yield Relation(
                 left,
                 right,
@@ -254,7 +252,7 @@ def settled_samples(motion: Motion) -> BoolArray | None:
     settled = motion.moving.copy()
     margin = round(FILTER_END_SECONDS * motion.rate_hz)
     settled[:margin] = settled[max(len(settled) - margin, 0) :] = False
-    return settled if np.count_nonzero(settled) >= LEAST_SECONDS * motion.rate_hz else None
+    return settled if np.count_nonzero(settled) >= MIN_SETTLED_SECONDS * motion.rate_hz else None
 
 
 # --- signs -------------------------------------------------------------------------------------------------------------------------
@@ -277,7 +275,7 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
         }
     )
     explaining: list[tuple[int, tuple[str, ...]]] = []
-    for number in range(1, MOST_TURNED + 1):
+    for number in range(1, MAX_REVERSED_CHANNELS + 1):
         for turned in itertools.combinations(suspects, number):
             if all(
                 (len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0)
@@ -297,43 +295,41 @@ def sign_findings(
         return []
     agreeing = [relation.text for relation in relations if relation.correlation > 0.0]
     figures = ", ".join(
-        f"{relation.text} disagree in sign (correlation {relation.correlation:.2f})"
-        for relation in against
+        f"{relation.text}: correlation {relation.correlation:.2f}" for relation in against
     )
-    evidence = figures + (f"; {listed(agreeing)} agree" if agreeing else "")
+    evidence = figures + (f"; consistent: {', '.join(agreeing)}" if agreeing else "")
     if not explanations:
-        return [
-            Finding(
-                "warning",
-                "sign",
-                "",
-                f"{evidence}: no few channels explain it; check the signs of all",
-            )
-        ]
+        names = dict.fromkeys(name for relation in against for name in relation.channels)
+        advice = f"signs are inconsistent ({evidence}); check those of {listed(list(names))}"
+        return [Finding("warning", "sign", "", advice, tuple(names))]
     if (
         motion.speed,
     ) in explanations:  # only suspected where it is negative, where the check reverse warns
         return []
     best = explanations[0]
-    others = explanations[1:]
+    alternatives = explanations[1:]
     if _decided(relations, explanations):
         alternative = (
-            f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
+            f", or instead {' or '.join(map(_together, alternatives))}" if alternatives else ""
         )
-        advice = f"{listed(best)} {'points' if len(best) == 1 else 'point'} the other way{alternative}; set sign: -1 for it"
-        return [Finding("warning", "sign", name, f"{evidence}: {advice}") for name in best]
-    either = " or ".join(_together(names) for names in explanations)
-    advice = f"either {either} point the other way, which a steering angle or yaw_rate_ref would decide; set sign: -1 for it"
-    return [Finding("warning", "sign", "", f"{evidence}: {advice}")]
+        advice = f"sign reversed ({evidence}); set sign: -1 for {listed(best)}{alternative}"
+        return [Finding("warning", "sign", name, advice) for name in best]
+    either = " or ".join(map(_together, explanations))
+    advice = (
+        f"signs are inconsistent ({evidence}): set sign: -1 for {either}; "
+        "a steering angle or yaw_rate_ref would decide which"
+    )
+    suspects = dict.fromkeys(name for names in explanations for name in names)
+    return [Finding("warning", "sign", "", advice, tuple(suspects))]
 
 
 def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
     """One explanation is the smallest, or the only one, and steering or heading was asked."""
-    smallest, *others = (_number(names) for names in explanations)
+    smallest, *numbers = (_number(names) for names in explanations)
     heading = any(
         set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations
     )
-    return not others or (others[0] > smallest and heading)
+    return not numbers or (numbers[0] > smallest and heading)
 
 
 def _number(names: Sequence[str]) -> int:
@@ -344,48 +340,54 @@ def _number(names: Sequence[str]) -> int:
 # --- units -------------------------------------------------------------------------------------------------------------------------
 
 
+class UnitMistake(NamedTuple):
+    """A channel whose values are in another unit than declared."""
+
+    channel: str
+    factor: float  # by which its values are too large
+    actual: str  # unit of the values
+    declared: str  # unit in which they were read
+
+
+def unit_mistakes() -> Iterator[UnitMistake]:
+    """All mistakes that are looked for."""
+    for channel, (factor, unit, si) in ALTERNATIVE_UNITS.items():
+        yield UnitMistake(channel, factor, unit, si)
+        yield UnitMistake(channel, 1.0 / factor, si, unit)
+
+
 @dataclass(frozen=True)
 class WrongUnit:
     """A factor by which channels disagree."""
 
     relations: tuple[Relation, ...]  # that are wrong by it
-    explanations: tuple[
-        tuple[str, float, str], ...
-    ]  # channel, factor and unit that explain it equally well; empty if none does
+    explanations: tuple[UnitMistake, ...]  # that explain it equally well; empty if none does
 
     @property
     def factors(self) -> dict[str, float]:
         """Factors that put the first explanation right."""
-        return {name: 1.0 / factor for name, factor, _ in self.explanations[:1]}
+        return {mistake.channel: 1.0 / mistake.factor for mistake in self.explanations[:1]}
 
     @property
     def finding(self) -> Finding:
         """For people."""
         figures = ", ".join(
-            f"{relation.left} is {relation.scale:.3g} times as large as {relation.right} (correlation {relation.correlation:.2f})"
+            f"{relation.text}: gain {relation.scale:.3g} instead of 1 "
+            f"(correlation {relation.correlation:.2f})"
             for relation in self.relations
         )
-        if len(self.explanations) == 1:
-            name, _, unit = self.explanations[0]
-            level: Level = "error" if UNSAFE.get(name) == unit else "warning"
-            return Finding(level, "unit", name, f"{figures}: {name} is in {unit}; set its unit")
-        if self.explanations:
-            either = " or ".join(f"{name} is in {unit}" for name, _, unit in self.explanations)
-            return Finding(
-                "warning",
-                "unit",
-                self.explanations[0][0],
-                f"{figures}: either {either}; set the unit",
-            )
-        names = list(
-            dict.fromkeys(name for relation in self.relations for name in relation.channels)
+        if not self.explanations:
+            names = dict.fromkeys(name for relation in self.relations for name in relation.channels)
+            advice = f"check the units of {listed(list(names))}"
+            return Finding("warning", "unit", next(iter(names)), f"{figures}; {advice}")
+        first = self.explanations[0]
+        causes = " or ".join(
+            f"{mistake.channel} is in {mistake.actual} but read as {mistake.declared}"
+            for mistake in self.explanations
         )
-        return Finding(
-            "warning",
-            "unit",
-            names[0],
-            f"{figures}, about 1 is expected: check the units of {listed(names)}",
-        )
+        is_unsafe = UNSAFE.get(first.channel) == first.actual and len(self.explanations) == 1
+        level: Level = "error" if is_unsafe else "warning"
+        return Finding(level, "unit", first.channel, f"{figures}: {causes}; correct the unit")
 
 
 def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
@@ -393,25 +395,25 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
     wrong = [relation for relation in relations if not relation.holds(relation.scale)]
     if not wrong:
         return None
-    explained: dict[tuple[str, float, str], list[Relation]] = {}
-    for name, factors in WRONG_FACTORS.items():
-        for factor, unit in factors:
-            put_right = [
-                relation
-                for relation in wrong
-                if 1.0 / EXACTNESS < abs(relation.without(name, factor)) < EXACTNESS
-            ]
-            broken = [
-                one
-                for one in relations
-                if one not in wrong and not one.holds(one.without(name, factor))
-            ]
-            if put_right and not broken:
-                explained[name, factor, unit] = put_right
+    explained: dict[UnitMistake, list[Relation]] = {}
+    for mistake in unit_mistakes():
+        put_right = [
+            relation
+            for relation in wrong
+            if 1.0 / EXACTNESS < abs(relation.without(mistake.channel, mistake.factor)) < EXACTNESS
+        ]
+        broken = [
+            relation
+            for relation in relations
+            if relation not in wrong
+            and not relation.holds(relation.without(mistake.channel, mistake.factor))
+        ]
+        if put_right and not broken:
+            explained[mistake] = put_right
     if not explained:
         return WrongUnit(tuple(wrong), ())
-    most = max(len(put_right) for put_right in explained.values())
-    best = tuple(key for key, put_right in explained.items() if len(put_right) == most)
+    n_explained = max(len(put_right) for put_right in explained.values())
+    best = tuple(key for key, put_right in explained.items() if len(put_right) == n_explained)
     return WrongUnit(tuple(explained[best[0]]), best)
 
 

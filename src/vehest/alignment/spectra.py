@@ -20,19 +20,19 @@ ComplexArray = NDArray[np.complex128]
 BAND_HZ = (0.1, 3.0)  # where cars move and references can be differentiated
 SEGMENT_SECONDS = (4.0, 16.0)
 SEGMENTS_IN_A_DRIVE = 8.0  # without overlap, of a short one
-SHORTEST_DRIVE = 16.0  # s
-LOWEST_RATE = 5.0  # Hz
-FEWEST_BINS = 4
-FEWEST_SEGMENTS = 6
-SAMPLES_A_PERIOD = 5.0  # at least
-RATE_KEPT = 30.0  # Hz; a faster recording is averaged down to at least this
-MOST_GROUPS = 12
+MIN_DRIVE_SECONDS = 16.0  # s
+MIN_RATE_HZ = 5.0  # Hz
+MIN_BINS = 4
+MIN_SEGMENTS = 6
+MIN_SAMPLES_A_PERIOD = 5.0  # at least
+MIN_AVERAGED_RATE_HZ = 30.0  # Hz; a faster recording is averaged down to at least this
+MAX_GROUPS = 12
 SMOOTHED_BINS = 5
-LARGEST_COHERENCE = 0.99
-LEAST_POWER = 1e-6  # of the strongest bin; below a window leaks more than that
-LEAST_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
-LARGEST_LAG = 0.5  # s
-LONGEST_TIME_CONSTANT = 10.0  # s
+MAX_COHERENCE = 0.99
+MIN_POWER_SHARE = 1e-6  # of the strongest bin; below a window leaks more than that
+MIN_MEAN_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
+MAX_LAG_SECONDS = 0.5  # s
+MAX_TIME_CONSTANT_SECONDS = 10.0  # s
 N_STEPS = 25
 CONFIDENCE = 0.95
 
@@ -51,7 +51,7 @@ class CrossSpectra:
         return 2.0 * math.pi * self.frequency
 
     @property
-    def whole(self) -> ComplexArray:
+    def total(self) -> ComplexArray:
         """Sum over the groups, (F, N, N)."""
         return np.asarray(self.groups.sum(axis=0), dtype=np.complex128)
 
@@ -68,36 +68,50 @@ class CrossSpectra:
 
 
 def cross_spectra(
-    signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None
+    signals: Mapping[str, FloatArray], rate_hz: float, selected: BoolArray | None = None
 ) -> CrossSpectra | None:
-    """Welch's cross-spectra in the band, from segments of ``used`` samples, (T,) as signals, under a Hann window; None where too short."""
+    """Estimate cross-spectra in the band by Welch's method under a Hann window.
+
+    Parameters
+    ----------
+    signals : mapping of str to (T,)
+    rate_hz : float
+        Sampling rate.
+    selected : (T,) of bool, optional
+        Only segments whose samples are all selected count.
+
+    Returns
+    -------
+    CrossSpectra or None
+        None where the drive is too short or too slowly sampled.
+    """
     duration = len(next(iter(signals.values()), ())) / rate_hz
-    if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
+    if duration < MIN_DRIVE_SECONDS or rate_hz < MIN_RATE_HZ:
         return None
-    factor = max(math.floor(rate_hz / RATE_KEPT), 1)
+    factor = max(math.floor(rate_hz / MIN_AVERAGED_RATE_HZ), 1)
     rate = rate_hz / factor
     seconds = min(max(duration / SEGMENTS_IN_A_DRIVE, SEGMENT_SECONDS[0]), SEGMENT_SECONDS[1])
     length = round(seconds * rate)
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
     inside = (frequency >= max(BAND_HZ[0], 1.5 / seconds)) & (
-        frequency <= min(BAND_HZ[1], rate / SAMPLES_A_PERIOD)
+        frequency <= min(BAND_HZ[1], rate / MIN_SAMPLES_A_PERIOD)
     )
-    if np.count_nonzero(inside) < FEWEST_BINS:
+    if np.count_nonzero(inside) < MIN_BINS:
         return None
     window = np.hanning(length + 1)[:-1]
-    whole = None
-    if used is not None and not used.all():
-        whole = _pieces(used.astype(np.float64), factor, length).min(axis=1) == 1.0
-        if np.count_nonzero(whole) < FEWEST_SEGMENTS:
+    is_selected = None
+    if selected is not None and not selected.all():
+        is_selected = _pieces(selected.astype(np.float64), factor, length).min(axis=1) == 1.0
+        if np.count_nonzero(is_selected) < MIN_SEGMENTS:
             return None
     parts = []
     for samples in signals.values():
         pieces = _pieces(samples, factor, length)
-        pieces = pieces if whole is None else pieces[whole]
+        pieces = pieces if is_selected is None else pieces[is_selected]
         level = pieces.mean(axis=1, keepdims=True)
         parts.append(np.fft.rfft((pieces - level) * window, axis=1)[:, inside])
     spectrum = np.stack(parts, axis=-1)  # (segments, F, N)
-    edges = np.linspace(0, len(spectrum), min(MOST_GROUPS, len(spectrum)) + 1).astype(int)
+    edges = np.linspace(0, len(spectrum), min(MAX_GROUPS, len(spectrum)) + 1).astype(int)
     groups = []
     for first, last in itertools.pairwise(edges):
         across = spectrum[first:last].transpose(1, 2, 0)  # (F, N, segments)
@@ -137,16 +151,16 @@ class Measured:
 
 def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
     """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after another (Student's)."""
-    whole = groups.sum(axis=0)
+    total = groups.sum(axis=0)
     number = len(groups)
-    left_out = np.stack([fit(whole - group) for group in groups])
+    left_out = np.stack([fit(total - group) for group in groups])
     spread = np.sqrt(
         (number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0)
     )
     factor = student(number - 1)
     return [
         Measured(value, factor * width)
-        for value, width in zip(fit(whole).tolist(), spread.tolist(), strict=True)
+        for value, width in zip(fit(total).tolist(), spread.tolist(), strict=True)
     ]
 
 
@@ -171,24 +185,35 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not the mean phase. Each bin has the
     weight of maximum likelihood, coherence² / (1 - coherence²) (Hannan & Thomson, Biometrika 60 (3), 1973).
 
-    ``low_pass`` says whether T is fitted too. None where a signal is missing, or the two are hardly coherent.
+    Parameters
+    ----------
+    spectra : CrossSpectra
+    source, follower : str
+        Names of the signals.
+    low_pass : bool
+        Whether T is fitted, else 0.
+
+    Returns
+    -------
+    Lag or None
+        None where a signal is missing, or the coherence is too low.
     """
     if not {source, follower} <= set(spectra.names):
         return None
     x = spectra.names.index(source)
     y = spectra.names.index(follower)
-    whole = spectra.whole
-    across = smoothed(whole[:, x, y].real) + 1j * smoothed(whole[:, x, y].imag)
-    power = smoothed(whole[:, x, x].real) * smoothed(whole[:, y, y].real)
+    total = spectra.total
+    across = smoothed(total[:, x, y].real) + 1j * smoothed(total[:, x, y].imag)
+    power = smoothed(total[:, x, x].real) * smoothed(total[:, y, y].real)
     if not (power > 0.0).all() or not np.isfinite(power).all():
         return None
-    coherence = np.minimum(np.square(np.abs(across)) / power, LARGEST_COHERENCE)
-    coherence[power < LEAST_POWER**2 * power.max()] = 0.0
-    if coherence.mean() < LEAST_COHERENCE:
+    coherence = np.minimum(np.square(np.abs(across)) / power, MAX_COHERENCE)
+    coherence[power < MIN_POWER_SHARE**2 * power.max()] = 0.0
+    if coherence.mean() < MIN_MEAN_COHERENCE:
         return None
     weight = coherence / (1.0 - coherence) / np.maximum(np.abs(across), np.finfo(float).tiny)
     omega = spectra.omega
-    start = _coarse(weight * whole[:, x, y], omega, low_pass=low_pass)
+    start = _coarse(weight * total[:, x, y], omega, low_pass=low_pass)
 
     def fitted(cross_spectra: ComplexArray) -> FloatArray:
         delay, time_constant = _refined(
@@ -198,8 +223,8 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
 
     delay, time_constant, together = jackknife(spectra.groups, fitted)
     phase = omega * delay.value + np.arctan(omega * time_constant.value)
-    explained = np.sum(weight * (whole[:, x, y] * np.exp(1j * phase)).real) / np.sum(
-        weight * np.abs(whole[:, x, y])
+    explained = np.sum(weight * (total[:, x, y] * np.exp(1j * phase)).real) / np.sum(
+        weight * np.abs(total[:, x, y])
     )
     return Lag(delay, time_constant, together, float(explained))
 
@@ -213,9 +238,9 @@ def smoothed(values: FloatArray) -> FloatArray:
 
 
 def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
-    delays = np.linspace(-LARGEST_LAG, LARGEST_LAG, 41)
+    delays = np.linspace(-MAX_LAG_SECONDS, MAX_LAG_SECONDS, 41)
     constants = (
-        np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)])
+        np.concatenate([[0.0], np.geomspace(0.05, MAX_TIME_CONSTANT_SECONDS, 15)])
         if low_pass
         else np.zeros(1)
     )
@@ -238,23 +263,23 @@ def _refined(
         by_constant = omega / (1.0 + np.square(omega * constant))
         first = -(by_delay * turned.imag).sum()
         second = -(by_constant * turned.imag).sum()
-        own = (size * by_delay**2).sum()
-        shared = (size * by_delay * by_constant).sum()
-        other = (size * by_constant**2).sum()
-        if own <= 0.0:
+        delay_weight = (size * by_delay**2).sum()
+        joint_weight = (size * by_delay * by_constant).sum()
+        constant_weight = (size * by_constant**2).sum()
+        if delay_weight <= 0.0:
             break
-        determinant = own * other * (1.0 + 1e-6) - shared * shared
-        step = first / own
+        determinant = delay_weight * constant_weight * (1.0 + 1e-6) - joint_weight * joint_weight
+        step = first / delay_weight
         change = 0.0
         if low_pass and determinant > 0.0:
-            moved = (own * second - shared * first) / determinant
+            moved = (delay_weight * second - joint_weight * first) / determinant
             if constant > 0.0 or moved > 0.0:
-                step = (other * first - shared * second) / determinant
+                step = (constant_weight * first - joint_weight * second) / determinant
                 change = moved
         step = min(max(step, -0.1), 0.1)
         change = min(max(change, -0.5), 0.5)
-        delay = min(max(delay + step, -LARGEST_LAG), LARGEST_LAG)
-        constant = min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT)
+        delay = min(max(delay + step, -MAX_LAG_SECONDS), MAX_LAG_SECONDS)
+        constant = min(max(constant + change, 0.0), MAX_TIME_CONSTANT_SECONDS)
         if abs(step) + abs(change) < 1e-7:
             break
     return float(delay), float(constant)

@@ -12,35 +12,37 @@ from vehest.data.runs import equal_runs
 
 BoolArray = NDArray[np.bool_]
 
-STANDSTILL_YAW_RATE = 0.05  # rad/s
-STANDSTILL_SHAKING = 0.3  # m/s²
+MAX_STANDSTILL_YAW_RATE = 0.05  # rad/s
+MAX_STANDSTILL_SHAKING = 0.3  # m/s²
 
 
 def standstill(recording: Recording) -> BoolArray:
     """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
-    standing = np.zeros(len(recording), dtype=bool)
+    is_standing = np.zeros(len(recording), dtype=bool)
     if "vx" not in recording:
-        return standing
+        return is_standing
     slow = np.abs(recording["vx"]) < STANDSTILL_SPEED
     starts, ends = equal_runs(slow).T
     lengths = ends - starts
-    still = slow[starts]
+    is_still = slow[starts]
     if "yaw_rate" in recording:
-        still &= ~(np.fmax.reduceat(np.abs(recording["yaw_rate"]), starts) > STANDSTILL_YAW_RATE)
+        is_still &= ~(
+            np.fmax.reduceat(np.abs(recording["yaw_rate"]), starts) > MAX_STANDSTILL_YAW_RATE
+        )
     for name in ("ax", "ay"):
         if name in recording:
-            still &= _spreads(recording[name], starts, lengths) <= STANDSTILL_SHAKING
-    return np.repeat(still, lengths)
+            is_still &= _spreads(recording[name], starts, lengths) <= MAX_STANDSTILL_SHAKING
+    return np.repeat(is_still, lengths)
 
 
 def _spreads(
     samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> FloatArray:
     """Standard deviation of the known samples of each run; 0 where none is known."""
-    known = np.isfinite(samples)
-    number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
-    mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number
-    deviation = np.where(known, samples - np.repeat(mean, lengths), 0.0)
+    measured = np.isfinite(samples)
+    number = np.maximum(np.add.reduceat(measured.astype(np.int64), starts), 1)
+    mean = np.add.reduceat(np.where(measured, samples, 0.0), starts) / number
+    deviation = np.where(measured, samples - np.repeat(mean, lengths), 0.0)
     return np.asarray(
         np.sqrt(np.add.reduceat(np.square(deviation), starts) / number), dtype=np.float64
     )

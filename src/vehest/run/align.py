@@ -30,7 +30,7 @@ def align_recording(
 ) -> Alignment:
     """Estimate quantities from one recording; raises `VehestError` where it is not there, cannot be read or does not determine them."""
     with reading(source, overrides) as config:
-        recording = _one_recording(source, config, recording_id)
+        recording = _recording_of(source, config, recording_id)
         refuse_errors(
             recording, config["dataset"].get("accept") or (), f"recording '{recording.id}'"
         )
@@ -42,26 +42,26 @@ def align_recording(
 def in_words(alignment: Alignment, out: Path | None) -> Lines:
     """An alignment for a terminal; ``out`` is where it was written."""
     drive = alignment.recording
-    first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; nothing is applied"
+    first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; no correction is applied"
     lines: Lines = [first, _parameters(alignment)]
     rows = [
         [
-            own.channel,
-            *(f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values()),
-            own.unit,
+            residual.channel,
+            *(f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in residual.rms.values()),
+            residual.unit,
         ]
-        for own in alignment.residuals
+        for residual in alignment.residuals
     ]
     if rows:
         lines += [
             "",
             TerminalTable(
-                "", ("residual rms", "before", "after", "and without tilt", "unit"), rows
+                "", ("residual RMS", "before", "after", "after, without tilt", "unit"), rows
             ),
         ]
     lines += [
         *(f"note: {note}" for note in alignment.notes),
-        f"to correct it: '{override_of(alignment)}'",
+        f"to apply the corrections: '{override_of(alignment)}'",
     ]
     return lines if out is None else [*lines, f"written: {out}"]
 
@@ -85,13 +85,13 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "cutoff_hz": alignment.settings.cutoff_at(drive.rate_hz),
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
-            {"channel": one.channel, "unit": one.unit}
+            {"channel": residual.channel, "unit": residual.unit}
             | {
-                "rms_before": one.rms["before"],
-                "rms_after": one.rms["after"],
-                "rms_without_tilt": one.rms["rest"],
+                "rms_before": residual.rms["before"],
+                "rms_after": residual.rms["after"],
+                "rms_without_tilt": residual.rms["rest"],
             }
-            for one in alignment.residuals
+            for residual in alignment.residuals
         ],
         "correlation": None
         if correlation is None
@@ -108,14 +108,14 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigurationError(f"'{folder}' is not a folder; name a new one")
-    others = (
+    foreign = (
         sorted(path.name for path in folder.iterdir() if path.name not in FILES)
         if folder.is_dir()
         else []
     )
-    if others:
+    if foreign:
         raise ConfigurationError(
-            f"folder '{folder}' holds other files ('{others[0]}'); name a new one"
+            f"folder '{folder}' contains other files ('{foreign[0]}'); name a new one"
         )
     recording = {"recording": alignment.recording.id, "kind": alignment.recording.kind}
     table = pd.DataFrame(
@@ -132,19 +132,19 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
             (aside / name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _one_recording(source: str, config: Config, recording_id: str | None) -> Recording:
+def _recording_of(source: str, config: Config, recording_id: str | None) -> Recording:
     if source in choices("dataset"):
         origin = open_source(config["dataset"])
-        known = origin.ids()
-        if recording_id is None and len(known) != 1:
+        ids = origin.ids()
+        if recording_id is None and len(ids) != 1:
             raise ConfigurationError(
-                f"recordings of data set '{source}': {counted(known)}; choose one by --recording ID"
+                f"recordings of data set '{source}': {counted(ids)}; choose one by --recording ID"
             )
-        return origin.read(known[0] if recording_id is None else recording_id)
+        return origin.read(ids[0] if recording_id is None else recording_id)
     recording = read_single(config["dataset"], Path(source))
     if recording_id not in (None, recording.id):
         raise ConfigurationError(
-            f"'{source}' holds the recording '{recording.id}', not '{recording_id}'"
+            f"'{source}' contains the recording '{recording.id}', not '{recording_id}'"
         )
     return recording
 
@@ -170,13 +170,13 @@ def _parameters(alignment: Alignment) -> TerminalTable:
 def _report(alignment: Alignment) -> str:
     from vehest.report.document import as_text
 
-    shown = in_words(alignment, None)[:-1]  # without the override, which stands below
+    printed = in_words(alignment, None)[:-1]  # without the override, which stands below
     cutoff_hz = alignment.settings.cutoff_at(alignment.recording.rate_hz)
     parts = [
         f"# Alignment of {as_text(alignment.recording.id)}",
         f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {cutoff_hz:.3g} Hz.",
-        *(as_text(one) if isinstance(one, str) else _markdown(one) for one in shown),
-        "Transforms that would correct it, in this order, for `downsample`:",
+        *(as_text(line) if isinstance(line, str) else _markdown(line) for line in printed),
+        "Transforms that apply the corrections, in this order, for `downsample`:",
         f"```yaml\n{_transforms(alignment).rstrip()}\n```",
         f"```sh\nvehest downsample DATASET rate_hz=… '{override_of(alignment)}'\n```",
     ]

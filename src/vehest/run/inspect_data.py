@@ -65,10 +65,8 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
                 for key in ("title", "licence", "citation")
             }
         )
-    shown = ("dataset", "kind", "source", "here", "title")
-    table = TerminalTable(
-        "", ("data set", *shown[1:]), [[row[key] for key in shown] for row in rows]
-    )
+    keys = ("dataset", "kind", "source", "here", "title")
+    table = TerminalTable("", ("data set", *keys[1:]), [[row[key] for key in keys] for row in rows])
     cited = [
         line
         for row in rows
@@ -82,13 +80,17 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
     with reading(source, overrides) as config:
         recordings = [_described(read()) for _, read in _readers(source, config)]
     lines: Lines = []
-    for own in recordings:
-        about = f"{own['id']}: {own['kind']}, {own['vehicle']}, {own['rate_hz']:g} Hz, {_stretch(own['start'], own['end'])}"
+    for recording in recordings:
+        period = _stretch(recording["start"], recording["end"])
+        about = f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, {period}"
         rows = [
             [channel["name"], channel["unit"], *(f"{channel[key]:.4g}" for key in SPREAD)]
-            for channel in own["channels"]
+            for channel in recording["channels"]
         ]
-        lines += [f"{about}, {own['samples']} samples", *(f"  {line}" for line in own["origin"])]
+        lines += [
+            f"{about}, {recording['samples']} samples",
+            *(f"  {line}" for line in recording["origin"]),
+        ]
         lines.append(TerminalTable("", ("channel", "unit", *SPREAD), rows))
     return {"source": source, "recordings": recordings}, lines
 
@@ -117,7 +119,7 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
     for row in rows:
         channel = f" {row['channel']}:" if row["channel"] else ""
         lines.append(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
-    return rows, lines or ["nothing found"]
+    return rows, lines or ["no findings"]
 
 
 def _missing_samples(recording: Recording) -> Iterator[Finding]:
@@ -135,16 +137,16 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
             config["dataset"], None if source in choices("dataset") else Path(source)
         )
     if not recordings:
-        raise DataError(f"'{source}' holds no recordings")
+        raise DataError(f"'{source}' contains no recordings")
     rows = all_usabilities(recordings, config["dataset"])
     missing = absent_channels(SCORED, recordings).to_estimate
     lines = usable_in_words(rows)
     if missing:
-        lines.append(f"every estimate is scored by {' and '.join(missing)}")
+        lines.append(f"missing channels that every score requires: {' and '.join(missing)}")
     if columns:
         names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
         lines.append(
-            f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset"
+            f"columns without a channel: {names}; if one of them is a missing channel, declare it in conf/dataset"
         )
     plain = {
         "source": source,

@@ -17,10 +17,10 @@ def reference_findings(recording: Recording) -> Iterator[Finding]:
     """Findings that a reference of a recording has another sign or unit, is stuck or impossible, accepted errors included."""
     if any(name.endswith(REFERENCE_SUFFIX) for name in recording.channels):
         for finding in checks_of_recording(recording):
-            concerned = finding.channel or finding.message
+            concerned = (finding.channel, *finding.suspects)
             if (
                 finding.level != "note"
                 and finding.check in CHECKS_OF_SIGNS_AND_UNITS
-                and REFERENCE_SUFFIX in concerned
+                and any(name.endswith(REFERENCE_SUFFIX) for name in concerned)
             ):
                 yield finding

@@ -26,7 +26,7 @@ from vehest.inference.car_values import with_car_values
 from vehest.run.printing import TerminalTable
 from vehest.sources.base import car_of
 
-SUFFICES = "it does without"
+SUFFICES = "no channel is missing"
 """Of settings with which no channel is missing."""
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
@@ -49,8 +49,8 @@ class Missing:
     def in_words(self) -> list[str]:
         """Each channel with its supply."""
         return [
-            f"{channel} ({'not in the log' if own is None else own.in_words()})"
-            for channel, own in self.supplies.items()
+            f"{channel} ({'not in the log' if supply is None else supply.in_words()})"
+            for channel, supply in self.supplies.items()
         ]
 
 
@@ -100,9 +100,9 @@ class Usability:
             "missing_to_estimate": self.missing.to_estimate,
             "missing_to_train": self.missing.to_train,
             "supplies": {
-                channel: own.transforms
-                for channel, own in self.missing.supplies.items()
-                if own is not None
+                channel: supply.transforms
+                for channel, supply in self.missing.supplies.items()
+                if supply is not None
             },
             "settings": [*self.settings, *self.patterns],
             "to_give": self.to_give,
@@ -177,24 +177,28 @@ def _usability(
     to_estimate: Sequence[RecordingSummary],
 ) -> Usability:
     """As `usability`, where nothing but vehest's errors is expected."""
-    both = [*recordings, *to_estimate]
-    own = str(config["estimator"]["name"])
+    summaries = [*recordings, *to_estimate]
+    family = str(config["estimator"]["name"])
     try:
         estimator, training = _built(config)
     except ConfigurationError as error:
         channels: Sequence[str] = ()
         with suppress(ConfigurationError):  # a class of another package that cannot be loaded
-            channels = getattr(estimator_class(own), "channels", ())
-        absent = absent_channels(channels, both)
-        return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
+            channels = getattr(estimator_class(family), "channels", ())
+        missing = absent_channels(channels, summaries)
+        return Usability(
+            name, None, config["estimator"].get("rate_hz"), missing, to_give=str(error)
+        )
     missing = _missing(estimator, training, recordings, to_estimate)
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
     patterns = (
-        estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
+        estimator.unmatched_patterns(training, [summary.id for summary in recordings])
+        if recordings
+        else ()
     )
     own_rate = estimator.settings.rate_hz
-    rate = min([own_rate, *(one.rate_hz for one in both)])
-    gappy = {name for one in both for name in one.gappy}
+    rate = min([own_rate, *(summary.rate_hz for summary in summaries)])
+    gappy = {name for summary in summaries for name in summary.gappy}
     gaps = tuple(
         channel
         for channel in estimator.channels
@@ -210,7 +214,7 @@ def _usability(
         settings,
         without,
         patterns,
-        car=car_parameters(own),
+        car=car_parameters(family),
         settings_suffice=bool(settings) and not has_supplies and without.endswith(SUFFICES),
         of_car=_overrides_of_car(estimator),
     )
@@ -218,11 +222,11 @@ def _usability(
 
 def _overrides_of_car(estimator: Estimator) -> str:
     """Overrides with values of the car that a first comparison needs and the settings do not have yet, for people."""
-    needed = " ".join(trial.overrides for trial in estimator.trials)
-    if "{car}" in needed:
+    overrides = " ".join(trial.overrides for trial in estimator.trials)
+    if "{car}" in overrides:
         return "estimator.car.mass=… and the car's other values"
     default = getattr(type(estimator.settings)(), "wheelbase", None)
-    if "{wheelbase}" in needed and getattr(estimator.settings, "wheelbase", None) == default:
+    if "{wheelbase}" in overrides and getattr(estimator.settings, "wheelbase", None) == default:
         return "estimator.wheelbase=…"
     return ""
 
@@ -240,12 +244,12 @@ def car_parameters(estimator: str) -> tuple[str, ...]:
 def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     """A table of estimators, transforms that make channels that some lack, and estimators that take another car's parameters."""
     supplies = {
-        channel: own.in_words()
+        channel: supply.in_words()
         for row in rows
-        for channel, own in row.missing.supplies.items()
-        if own is not None
+        for channel, supply in row.missing.supplies.items()
+        if supply is not None
     }
-    header = ("estimator", "usable", "rate", "missing", "what could supply it")
+    header = ("estimator", "usable", "rate", "missing", "remedy")
     lines: list[str | TerminalTable] = [
         TerminalTable("", header, [_cells(row) for row in rows]),
         "",
@@ -255,7 +259,7 @@ def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     if borrowing:
         names = ", ".join(borrowing)
         lines.append(
-            f"{names} require your car's parameters, estimator.car.mass=… and so on; without them they use those of another car"
+            f"{names} require the parameters of your car, estimator.car.mass=… and so on; the defaults are those of another car"
         )
     return lines
 
@@ -265,26 +269,26 @@ def _cells(row: Usability) -> list[str]:
     to_train = ", ".join(
         name for name in row.missing.to_train if name not in row.missing.to_estimate
     )
-    made = ", ".join(
-        f"{channel}: {own.transforms[-1]['name']}"
-        for channel, own in row.missing.supplies.items()
-        if own is not None
+    derived = ", ".join(
+        f"{channel}: {supply.transforms[-1]['name']}"
+        for channel, supply in row.missing.supplies.items()
+        if supply is not None
     )
     missing = [
         ", ".join(row.missing.to_estimate),
         f"to train {to_train}" if to_train else "",
         "a setting" if row.to_give else "",
         "training recordings of the name it expects" if row.patterns else "",
-        f"parts of {', '.join(row.gaps)}" if row.gaps else "",
+        f"samples of {', '.join(row.gaps)}" if row.gaps else "",
     ]
     supplies = [
-        made,
-        f"{'the others are ' if made else ''}not in the log" if row.missing.unsupplied else "",
+        derived,
+        f"{'the others are ' if derived else ''}not in the log" if row.missing.unsupplied else "",
         row.without,
         row.of_car if row.usable == "with settings" else "",
         row.to_give,
         *row.patterns,
-        "leave gaps out in conf/split" if row.gaps else "",
+        "exclude the gaps in conf/split" if row.gaps else "",
     ]
     rate = "" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
     if row.rate_hz is not None and row.rate_hz != row.own_rate_hz:
@@ -304,34 +308,37 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
     )
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
-    made = made_by(config["downsample"]["transforms"])  # of references they are no part
+    derived = made_by(config["downsample"]["transforms"])  # of references they are no part
     to_train, to_estimate = (
-        [replace(own, channels=own.channels | made) for own in part]
+        [replace(summary, channels=summary.channels | derived) for summary in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)
     )
-    found = usability(estimator.name, config, to_train, to_estimate)
-    if found.to_give:  # its settings are complete: a class of another package that fails
-        raise ConfigurationError(found.to_give)
+    usable = usability(estimator.name, config, to_train, to_estimate)
+    if usable.to_give:  # its settings are complete: a class of another package that fails
+        raise ConfigurationError(usable.to_give)
     by_scores = absent_channels(SCORED, scored)
     parts = (
-        (found.missing.to_train, to_train),
-        (found.missing.to_estimate, to_estimate),
+        (usable.missing.to_train, to_train),
+        (usable.missing.to_estimate, to_estimate),
         (by_scores.to_estimate, scored),
     )
-    lacking = list(
+    incomplete = list(
         dict.fromkeys(
-            own.id for wanted, part in parts for own in part if not own.channels.issuperset(wanted)
+            summary.id
+            for channels, part in parts
+            for summary in part
+            if not summary.channels.issuperset(channels)
         )
     )
-    if lacking:
-        others = f" and {len(lacking) - 1} more lack" if len(lacking) > 1 else " lacks"
-        reasons = Missing([], [], by_scores.supplies | found.missing.supplies).in_words()
-        without = [found.without] if found.settings else []
-        return f"recording '{lacking[0]}'{others} what estimator '{estimator.name}' needs: {'; '.join([*reasons, *without])}"
-    trained = [own.id for own in _recordings(split.train, contents)]
+    if incomplete:
+        and_more = f" and {len(incomplete) - 1} more lack" if len(incomplete) > 1 else " lacks"
+        reasons = Missing([], [], by_scores.supplies | usable.missing.supplies).in_words()
+        without = [usable.without] if usable.settings else []
+        return f"recording '{incomplete[0]}'{and_more} channels that estimator '{estimator.name}' requires: {'; '.join([*reasons, *without])}"
+    trained = [summary.id for summary in _recordings(split.train, contents)]
     patterns = estimator.unmatched_patterns(training, trained) if trained else ()
     return (
-        f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}"
+        f"no training recording has a name that estimator '{estimator.name}' expects; set {', '.join(patterns)}"
         if patterns
         else ""
     )
@@ -339,8 +346,8 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
 
 def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
     """Those of the channels that some recording lacks."""
-    absent = [name for own in recordings for name in channels if name not in own.channels]
-    return _with_supplies(absent, absent, recordings)
+    missing = [name for summary in recordings for name in channels if name not in summary.channels]
+    return _with_supplies(missing, missing, recordings)
 
 
 def _recordings(
@@ -349,10 +356,10 @@ def _recordings(
     """The recordings of ranges, each once; unknown ones are skipped, and reported where they are read."""
     named = {(span.dataset, span.recording) for span in spans}
     return [
-        own
+        summary
         for dataset, recordings in contents.items()
-        for own in recordings
-        if (dataset, own.id) in named
+        for summary in recordings
+        if (dataset, summary.id) in named
     ]
 
 
@@ -367,28 +374,35 @@ def _missing(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> Missing:
-    read = [name for own in to_estimate for name in estimator.channels if name not in own.channels]
+    read = [
+        name
+        for summary in to_estimate
+        for name in estimator.channels
+        if name not in summary.channels
+    ]
     learnt = [
-        name for own in to_train for name in lacking_to_train(estimator, training, own.channels)
+        name
+        for summary in to_train
+        for name in lacking_to_train(estimator, training, summary.channels)
     ]
     return _with_supplies(read, learnt, [*to_train, *to_estimate])
 
 
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
     """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks; none where nothing is learnt."""
-    wanted = (
+    required = (
         (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
     )
-    return [name for name in dict.fromkeys(wanted) if name not in channels]
+    return [name for name in dict.fromkeys(required) if name not in channels]
 
 
 def _with_supplies(
     read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> Missing:
-    held = common_channels(recordings)
-    gappy = frozenset(name for own in recordings for name in own.gappy)
-    rate = min((own.rate_hz for own in recordings), default=0.0)
-    supplies = {name: derivation_of(name, held, gappy, rate) for name in (*read, *learnt)}
+    common = common_channels(recordings)
+    gappy = frozenset(name for summary in recordings for name in summary.gappy)
+    rate = min((summary.rate_hz for summary in recordings), default=0.0)
+    supplies = {name: derivation_of(name, common, gappy, rate) for name in (*read, *learnt)}
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
 
 
@@ -399,7 +413,7 @@ def _settings_without(
     to_estimate: Sequence[RecordingSummary],
 ) -> tuple[tuple[str, ...], str]:
     """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     while missing:
         tried = []
         for key, value in _alternatives(config):
@@ -420,14 +434,18 @@ def _settings_without(
             break
         missing = left
         config = changed
-        found[key] = value
+        changes[key] = value
     settings = tuple(
         f"estimator.{key}="
-        + (f"[{','.join(own)}]" if isinstance(own, list) else str(own).replace("False", "false"))
-        for key, own in found.items()
+        + (
+            f"[{','.join(value)}]"
+            if isinstance(value, list)
+            else str(value).replace("False", "false")
+        )
+        for key, value in changes.items()
     )
-    rest = f"only {', '.join(missing)} of those would be missing" if missing else SUFFICES
-    return settings, f"with {' '.join(settings)} {rest}" if settings else ""
+    outcome = f"only {', '.join(missing)} would be missing" if missing else SUFFICES
+    return settings, f"with {' '.join(settings)} {outcome}" if settings else ""
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -166,13 +165,7 @@ def _names(finding: Finding, touched: Sequence[str]) -> bool:
     """Whether a finding is about one of the channels; ``kinematics`` is about all those that it compares."""
     if finding.check == "kinematics":
         return bool({"ay", "yaw_rate", "vx", "vx_ref", "vy_ref"} & set(touched))
-    alternatives = re.search(r"either (.*) point the other way", finding.message)
-    named = (
-        set()
-        if alternatives is None or finding.channel
-        else set(re.findall(r"\w+", alternatives[1]))
-    )
-    return finding.channel in touched or bool(named & set(touched))
+    return bool({finding.channel, *finding.suspects} & set(touched))
 
 
 def _late(seconds: float, samples: FloatArray, rate_hz: float) -> FloatArray:

@@ -1,4 +1,12 @@
-"""Proposes channels: columns -> speed, yaw rate and ay -> columns that agree with them -> columns by name -> Proposals."""
+"""Proposes a channel, unit and sign for each column of a log.
+
+columns -> candidates
+        -> speed, yaw rate and lateral acceleration, by ay ≈ vx·yaw_rate (`turning`)
+        -> columns related to these three: ax, steering, lateral velocity, sideslip (`fitting`)
+        -> other columns, by name and unit alone
+        -> questions: single evidence, world axes, wrong speed, left and right
+        -> Proposals
+"""
 
 from __future__ import annotations
 
@@ -21,7 +29,7 @@ from vehest.alignment.proposals.columns import (
     without_axes,
 )
 from vehest.alignment.proposals.fitting import (
-    CLEAR,
+    CLEAR_CORRELATION,
     REFERENCES,
     Agreement,
     fitting_channels,
@@ -32,10 +40,9 @@ from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.turning import (
-    CLOSE,
-    FAR,
-    RARE,
-    SAME_QUANTITY,
+    CLOSE_MISMATCH,
+    FAR_MISMATCH,
+    UNIT_PENALTIES,
     Search,
     Turning,
     find_turning,
@@ -55,42 +62,25 @@ from vehest.alignment.proposals.wheels import (
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
-STANDING = 0.5  # m/s; the car did not move
-NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
-MOST_COMPARED = 40  # columns
-FITTING_SPEED = (0.97, 1.08)
-FITTING_SPEED_ALONE = (0.92, 1.08)  # where d(vy)/dt is not known
-MISREAD = (
-    0.9,
-    1.35,
-)  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
-WHEELS_AGREE = 0.02
-WORLD_AGREEING = 0.98  # correlation of a velocity with the derivative of a position
-WORLD_CROSSING = 0.05  # of the position's other axis over it, so that the car turned
-DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
-RATES = (
-    5.0,
-    10.0,
-    20.0,
-    25.0,
-    40.0,
-    50.0,
-    60.0,
-    100.0,
-    125.0,
-    200.0,
-    250.0,
-    400.0,
-    500.0,
-    1000.0,
-    2000.0,
-)
-NOMINAL_RATE = 50.0  # Hz, where there are no times
-FEWEST = 50  # samples of a course
-COURSE_SPEED = 0.2  # of the top speed, below which a course over positions is noise
-SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
-MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
-USUAL = {  # 99th percentile of the motion's channels, SI
+MAX_STANDSTILL_SPEED = 0.5  # m/s; a car whose speed never exceeds it did not move
+SCORE_MARGIN = 4.0  # below the best triple, within which an agreement with ax decides
+AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's score
+MAX_AX_CANDIDATES = 40
+SPEED_GAIN_RANGE = (0.97, 1.08)  # of ay over d(vy)/dt + vx·yaw_rate, with a right speed
+SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # where d(vy)/dt is not known
+MISREAD_SPEED_GAIN_RANGE = (0.9, 1.35)  # beyond, it is not the speed that is wrong
+MAX_WHEEL_GAIN_DIFFERENCE = 0.02  # of the wheels' speed from ay/yaw_rate
+MIN_WORLD_CORRELATION = 0.98  # of a velocity with the derivative of a position
+MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the car turned
+MIN_SIDE_CORRELATION = 0.5  # of wheels or a course, from which they decide left and right
+PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
+NOMINAL_RATE_HZ = 50.0  # of a log without times
+MIN_COURSE_SAMPLES = 50
+MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
+MAX_COURSE_STEP = 1.0  # rad
+SIDESLIP_RANGE = (0.01, 1.0)  # rad, width of 96 % of a sideslip angle's values
+MAX_IMPOSSIBLE_SHARE = 0.002  # share of samples outside the possible range that may be spikes
+USUAL_MAGNITUDES = {  # 99th percentile, SI units
     "vx": (1.0, 90.0),
     "yaw_rate": (0.03, 3.0),
     "ay": (0.5, 25.0),
@@ -100,17 +90,16 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "vy_ref": (0.02, 8.0),
     "sideslip_ref": (0.002, 0.8),
 }
-UNCONFIRMED = "no other column agrees with it"
+UNCONFIRMED = "no other column confirms it"
 SINGLE_EVIDENCE = (
-    "one piece of evidence is not enough: neither unit, name nor another column agrees"
+    "only one piece of evidence, two are needed (relation to other columns, unit, name)"
 )
-AGREEING = {
+CONFIRMING_CHANNELS = {
     "vx": {"ax"},
     "yaw_rate": {"steer", "handwheel", *REFERENCES},
     "ay": {*REFERENCES},
 }
-"""Channel -> those whose relation confirms it."""
-NEEDS_EVIDENCE = ("vx", "yaw_rate", "ay")  # channels of two pieces of evidence, or none
+"""Channel that needs two pieces of evidence -> channels whose relation to it is one."""
 BY_NAME_ALONE = (
     "motor_current",
     "brake_pressure_front",
@@ -120,7 +109,7 @@ BY_NAME_ALONE = (
     "roll_rate",
     "pitch_rate",
 )
-"""Channels that no relation is known of."""
+"""Channels without a known relation to others."""
 
 
 def propose(
@@ -131,483 +120,567 @@ def propose(
 ) -> Proposals:
     """Propose channels for the columns of a log.
 
-    Args:
-        columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each, and ``car`` or
-            ``reference`` where the file says which of them measured it, else nothing.
-        rate_hz: of that clock; None where it is unknown.
-        is_vbo: whether the column ``heading`` counts clockwise and longitudes to the west, as in a VBOX's log.
+    Parameters
+    ----------
+    columns : sequence of (name, unit, values, device)
+        Unit as vehest spells it, empty where the file has none; values (T,) on an even clock;
+        ``car`` or ``reference`` where the file states which of them measured it, else empty.
+    rate_hz : float or None
+        Sampling rate; None where it is unknown, and then estimated from d(vx)/dt and ax.
+    is_vbo : bool
+        Whether ``heading`` is clockwise and longitudes count to the west, as in a VBOX log.
+
+    Returns
+    -------
+    Proposals
+        At most one proposal for a channel and for a column, with evidence and open questions.
     """
-    rate = rate_hz or NOMINAL_RATE
-    found = candidates(columns, rate)
-    wheels = find_wheels(found)
-    found = [one for one in found if not any(role.startswith("wheel_speed") for role in one.hints)]
-    found += speed_of_wheels(found, wheels, rate)
-    speeds = [one for one in found if "vx" in one.hints and one.unit and one.measures("vx")]
-    stands = bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
-    turning = [] if stands else find_turning(found)
-    if not (turning or stands):
-        by_motion = without_axes(found)
-        turning = find_turning(by_motion)
-        found = by_motion if turning else found
-    guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
-    if guessed is not None:
-        return replace(propose(columns, guessed, is_vbo=is_vbo), rate_hz=guessed)
-    search = None if stands else _search(found, turning, rate)
-    proposals = _assigned(found, search, wheels)
-    notes = [*proposals.notes]
-    known = search.known if search else None
-    if not set(REFERENCES) & set(proposals.by_channel):
-        proposals = replace(proposals, pose=find_pose(found, known))
-        named = [f"'{one.name}'" for one in named_pose(found)]
-        if len(named) == 3 and not proposals.pose:
-            notes.append(
-                f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate"
-            )
-        notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
-    if stands:
-        notes.append("the car stands all the time, by its speed; names alone suggest channels")
-    proposals = _world_axis_asked(proposals, found, rate)
+    clock_hz = rate_hz or NOMINAL_RATE_HZ
+    usable = candidates(columns, clock_hz)
+    wheels = find_wheels(usable)
+    usable = [column for column in usable if not column.is_wheel]
+    usable += speed_of_wheels(usable, wheels, clock_hz)
+    is_standing = _is_standing(usable)
+    usable, turnings = (usable, []) if is_standing else _turnings_of_any_axes(usable)
+    if turnings and rate_hz is None:
+        rate_by_ax = _rate_by_ax(_search_around(turnings[0], usable, clock_hz))
+        if rate_by_ax is not None:
+            return replace(propose(columns, rate_by_ax, is_vbo=is_vbo), rate_hz=rate_by_ax)
+    search = None if is_standing else _best_search(usable, turnings, clock_hz)
+    motion = search.motion if search else None
+    proposals = _assign(usable, search, wheels)
+    proposals = _with_pose(proposals, usable, motion)
+    if is_standing:
+        standstill = f"speed below {MAX_STANDSTILL_SPEED:g} m/s"
+        proposals = proposals.with_notes(
+            f"the car stands still throughout ({standstill}); channels are proposed by name only"
+        )
+    proposals = _ask_about_world_axes(proposals, usable, clock_hz)
     if search is not None:
-        proposals, more = _speedometer(proposals, search, wheels, found)
-        notes += more
-    clues = () if known is None else _clues(found, wheels, known, is_vbo)
-    proposals = _as_most_count(
-        _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
-    )
+        proposals = _ask_about_speed(proposals, search, wheels, usable)
+    clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
+    proposals = _with_left_right(proposals, usable, motion, clues)
     proposals = possible(
-        proposals, {column.name: column.values for column in (*found, *wheels.values())}
+        _with_signs_of_majority(proposals),
+        {column.name: column.values for column in (*usable, *wheels.values())},
     )
-    used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
-    unused = tuple(name for name, *_ in columns if name not in used)
-    return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
+    assigned = {proposal.column for proposal in proposals.channels}
+    assigned |= {column for _, column, _ in proposals.pose}
+    unused = tuple(name for name, *_ in columns if name not in assigned)
+    return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE_HZ if rate_hz is None else None)
 
 
 def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
-    """Without channels by name alone whose values no vehicle can have, in columns (T,) of any log of the car; others are asked there."""
-    kept = []
-    notes = list(proposals.notes)
-    for one in proposals.channels:
-        beyond = one.beyond(columns[one.column])
-        share = float(beyond.mean())
-        if share > MOST_BEYOND and one.channel in BY_NAME_ALONE:
-            limits = CHANNELS[one.channel]
-            shown = f"{float(columns[one.column][int(np.argmax(beyond))]):.3g} {one.unit}"
-            text = f"'{one.column}' is named as {one.channel}, but shows {shown} (possible: {limits.low:.3g} to {limits.high:.3g}"
-            notes.append(f"{text} {limits.unit}); it is left out")
-        elif share > MOST_BEYOND and not one.asked:
-            kept.append(
-                replace(
-                    one,
-                    asked=f"{100.0 * share:.2g} % of its samples are beyond what a vehicle can do in {one.unit}",
-                )
+    """Leave out or question channels whose values no vehicle can have.
+
+    Parameters
+    ----------
+    proposals : Proposals
+        Of any log of the car.
+    columns : mapping of str to (T,)
+        Values of the columns of a log, in the units of the file.
+
+    Returns
+    -------
+    Proposals
+        Without such channels of `BY_NAME_ALONE`, each with a note; other such channels with a
+        question.
+    """
+    channels = []
+    notes = []
+    for proposal in proposals.channels:
+        values = columns[proposal.column]
+        is_beyond = proposal.is_impossible(values)
+        share = float(is_beyond.mean())
+        if share <= MAX_IMPOSSIBLE_SHARE:
+            channels.append(proposal)
+        elif proposal.channel in BY_NAME_ALONE:
+            limits = CHANNELS[proposal.channel]
+            value = f"{float(values[int(np.argmax(is_beyond))]):.3g} {proposal.unit}"
+            notes.append(
+                f"'{proposal.column}' is left out: it is named like {proposal.channel}, but its "
+                f"value {value} is outside the possible range "
+                f"({limits.low:.3g} to {limits.high:.3g} {limits.unit})"
             )
         else:
-            kept.append(one)
-    return replace(proposals, channels=tuple(kept), notes=tuple(notes))
+            question = (
+                f"{100.0 * share:.2g} % of its samples are outside the possible range of "
+                f"{proposal.channel} if its unit is {proposal.unit}"
+            )
+            channels.append(proposal.questioned(question))
+    return replace(proposals, channels=tuple(channels)).with_notes(*notes)
 
 
-def _world_axis_asked(
-    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
-) -> Proposals:
-    """The velocities asked where one is the derivative of a position along an axis of the world."""
-    speed = proposals.by_channel.get("vx")
-    positions = [
-        next(one.slow for one in columns if role in one.hints)
-        for role in ("position_x", "position_y")
-        if any(role in one.hints for one in columns)
-    ]
-    if speed is None or speed.asked or len(positions) < 2:
-        return proposals
-    along, across = (np.gradient(samples) for samples in positions)
-    by_name = {one.name: one for one in columns}
-    slow = by_name[speed.column].slow if speed.column in by_name else along
-    crossing = float(np.std(across)) > WORLD_CROSSING * float(np.std(along))
-    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
-    of_path = abs(correlation(slow, np.hypot(along, across)))
-    if not (crossing and of_axis > WORLD_AGREEING and of_axis > of_path):
-        return proposals
-    doubt = "it is the derivative of a position: of an axis of the world, not of the car?"
-    return replace(
-        proposals,
-        channels=tuple(
-            replace(one, asked=one.asked or doubt, is_weak=True)
-            if one.channel in ("vx", "vy_ref")
-            else one
-            for one in proposals.channels
-        ),
+# --- the motion ------------------------------------------------------------------------------
+
+
+def _is_standing(columns: Sequence[Candidate]) -> bool:
+    speeds = [column for column in columns if "vx" in column.hints and column.unit]
+    speeds = [column for column in speeds if column.measures("vx")]
+    limit = MAX_STANDSTILL_SPEED
+    return bool(speeds) and all(
+        column.size * si_factor(column.unit, "vx") < limit for column in speeds
     )
 
 
-def _speedometer(
-    proposals: Proposals, search: Search, wheels: Wheels, columns: Sequence[Candidate]
-) -> tuple[Proposals, list[str]]:
-    """The speed asked where ay over the yaw rate and the wheels agree that it misreads.
-
-    A note where ay alone says so: by d(vy)/dt + vx·yaw_rate where a reference gives vy. Without
-    one, d(vy)/dt makes up some per cent, so that only more than these count.
-    """
-    own = proposals.by_channel.get("vx")
-    turning = search.turning
-    if "ay" not in turning.columns or own is None:
-        return proposals, []
-    expected, usual = _expected_ay(proposals, search.known, columns)
-    ay = slow_of(search.known["ay"], search.known.rate_hz)
-    scale = float(np.std(ay) / np.std(expected))
-    agreeing = abs(correlation(ay, expected))
-    if not MISREAD[0] < scale < MISREAD[1] or usual[0] <= scale <= usual[1]:
-        return proposals, []
-    by_wheels = wheels_over_speed(
-        wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx")
-    )
-    if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
-        bounds = scale / agreeing, scale * agreeing  # by regression either way
-        if any(usual[0] <= bound <= usual[1] for bound in bounds):
-            return proposals, []
-        other = "little" if scale < 1.0 else "much, as in a body that rolls"
-        return proposals, [
-            f"'{own.column}' reads {_excess(*bounds)} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
-        ]
-    scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
-    doubt = (
-        own.asked
-        or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
-    )
-    changed = replace(own, asked=doubt, others=(*own.others, scaled))
-    return replace(
-        proposals, channels=tuple(changed if one is own else one for one in proposals.channels)
-    ), []
+def _turnings_of_any_axes(
+    columns: Sequence[Candidate],
+) -> tuple[list[Candidate], list[Turning]]:
+    """Triples, best first, with x, y and z as named or, where it explains more, along any axes."""
+    as_named = list(columns)
+    any_axes = without_axes(columns)
+    turnings = find_turning(as_named)
+    if any_axes == as_named:
+        return as_named, turnings
+    alternative = find_turning(any_axes)
+    best_score = turnings[0].score if turnings else 0.0
+    if alternative and alternative[0].score > best_score:
+        return any_axes, alternative
+    return as_named, turnings
 
 
-def _expected_ay(
-    proposals: Proposals, known: Motion, columns: Sequence[Candidate]
-) -> tuple[FloatArray, tuple[float, float]]:
-    """ay by the motion, (S,), and the range of ay over it by which the speed is right."""
-    for name in REFERENCES:
-        reference = proposals.by_channel.get(name)
-        if reference is None:
-            continue
-        samples = next(one.values for one in columns if one.name == reference.column)
-        factor = reference.sign * si_factor(reference.unit, name)
-        channels = {**known.channels, name: np.where(known.moving, samples * factor, 0.0)}
-        motion = replace(known, channels=channels, velocity=name)
-        return slow_of(motion.turning + motion.sliding, known.rate_hz), FITTING_SPEED
-    return slow_of(known.turning, known.rate_hz), FITTING_SPEED_ALONE
+def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: float) -> Search:
+    chosen = turning.columns.values()
+    free = [column for column in columns if column not in chosen and not column.is_wheel_mean]
+    return Search(turning, turning.motion(rate_hz), free)
 
 
-def _excess(*scales: float) -> str:
-    sizes = sorted(abs(100.0 * (1.0 / scale - 1.0)) for scale in scales)
-    size = " to ".join(dict.fromkeys(f"{size:.0f}" for size in sizes))
-    return f"{size} % too {'much' if scales[0] < 1.0 else 'little'}"
-
-
-def _search(
-    columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float
+def _best_search(
+    columns: Sequence[Candidate], turnings: Sequence[Turning], rate_hz: float
 ) -> Search | None:
-    """The triple that agrees best with a longitudinal acceleration among the best ones; speed and yaw rate by name where there is none."""
-    if not turning:
-        named = turning_by_names(columns)
-        return (
-            None if named is None else _of(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
-        )
-    near = [
-        _of(columns, one, rate_hz) for one in turning if one.score > turning[0].score - NEAR_SCORE
+    """Around the triple, among the best ones, that agrees best with an ax; else around names."""
+    if not turnings:
+        turning = turning_by_names(columns)
+        if turning is None:
+            return None
+        return _search_around(_with_speed_by_ax(turning, columns, rate_hz), columns, rate_hz)
+
+    def score(search: Search) -> float:
+        strengths = [agreement.strength for agreement in _agreements_with_ax(search)]
+        return search.turning.score + AX_WEIGHT * max(strengths, default=0.0)
+
+    best_score = turnings[0].score
+    near = [turning for turning in turnings if turning.score > best_score - SCORE_MARGIN]
+    return max((_search_around(turning, columns, rate_hz) for turning in near), key=score)
+
+
+def _agreements_with_ax(search: Search, unit: str = "") -> list[Agreement]:
+    """Agreements of d(vx)/dt with possible columns of ax, in ``unit`` where they have none."""
+    columns = [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
+    return [
+        longitudinal(search.motion, column, [column.unit or unit] if unit else ())
+        for column in columns
     ]
-    return max(
-        near,
-        key=lambda one: (
-            one.turning.score + 4.0 * max((by_ax.strength for by_ax in _by_ax(one)), default=0.0)
-        ),
-    )
 
 
-def _of(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Search:
-    used = turning.columns.values()
-    return Search(
-        turning,
-        turning.motion(rate_hz),
-        [one for one in columns if one not in used and not one.is_made],
-    )
-
-
-def _by_ax(search: Search, unit: str = "") -> list[Agreement]:
-    """Agreements of d(vx)/dt with columns that may be a longitudinal acceleration, in a unit where the header is silent, or the best."""
-    columns = [one for one in search.free if may_be_ax(one)][:MOST_COMPARED]
-    return [longitudinal(search.known, one, [one.unit or unit] if unit else ()) for one in columns]
-
-
-def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
-    """The same with the speed's unit by d(vx)/dt, where a column that may be a longitudinal acceleration decides it."""
-    found = [(CLOSE, named)]
+def _with_speed_by_ax(named: Turning, columns: Sequence[Candidate], rate_hz: float) -> Turning:
+    """With the unit of speed in which d(vx)/dt agrees best with an ax, where one decides it."""
+    ranked = [(CLOSE_MISMATCH, named)]
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
-        agreeing = [
-            one.mismatch for one in _by_ax(_of(columns, turning, rate_hz)) if one.strength >= CLEAR
+        ranked += [
+            (agreement.mismatch + UNIT_PENALTIES.get(unit, 0.0), turning)
+            for agreement in _agreements_with_ax(_search_around(turning, columns, rate_hz))
+            if agreement.strength >= CLEAR_CORRELATION
         ]
-        found += [(mismatch + RARE.get(unit, 0.0), turning) for mismatch in agreeing]
-    return min(found, key=lambda one: one[0])[1]
+    return min(ranked, key=lambda entry: entry[0])[1]
 
 
 def _rate_by_ax(search: Search) -> float | None:
-    """The plain rate at which some column, in the unit of ay, is d(vx)/dt; None where none is."""
+    """The plain rate at which a column, in the unit of ay, is d(vx)/dt; None where none is."""
     best = max(
-        _by_ax(search, search.turning.units["ay"]), key=lambda one: one.strength, default=None
+        _agreements_with_ax(search, search.turning.units["ay"]),
+        key=lambda agreement: agreement.strength,
+        default=None,
     )
-    if best is None or best.strength < CLEAR:
+    if best is None or best.strength < CLEAR_CORRELATION:
         return None
-    exact = search.known.rate_hz * best.scale
-    return min(RATES, key=lambda plain: abs(math.log(plain / exact)))
+    rate_hz = search.motion.rate_hz * best.scale
+    return float(min(PLAIN_RATES_HZ, key=lambda plain: abs(math.log(plain / rate_hz))))
 
 
-def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheels) -> Proposals:
-    """Proposals with signs that hold where the yaw rate counts as it does in the file."""
-    found: dict[str, Proposal] = {}
+# --- channels --------------------------------------------------------------------------------
+
+
+def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels) -> Proposals:
+    """Proposals whose signs are right if that of the yaw rate's column is."""
+    channels: dict[str, Proposal] = {}
     radius: float | None = None
     notes: tuple[str, ...] = ()
-    free = [one for one in columns if not one.is_made]
+    free = [column for column in columns if not column.is_wheel_mean]
     if search is not None:
-        for own in (*_turning_proposals(search.turning), *repeated(search)):
-            before = found.get(own.channel)
-            if before is not None and before.column == own.column:
-                evidence = (*before.evidence, *own.evidence)
-                asked = own.asked or before.asked
-                others = own.others or before.others
-                own = replace(own, evidence=evidence, asked=asked, others=others)
-            found[own.channel] = own
+        for proposal in (*_turning_proposals(search.turning), *repeated(search)):
+            channels[proposal.channel] = proposal.merged_with(channels.get(proposal.channel))
         fitting, notes = fitting_channels(search)
-        found |= fitting
-        found = _unconfirmed(search.turning, reference_speed(found) if wheels else found)
+        channels |= fitting
+        channels = reference_speed(channels) if wheels else channels
+        channels = _ask_for_second_evidence(search.turning, channels)
         free = search.free
     if wheels:
-        is_made = any(one.is_made for one in columns)
-        made, radius = wheel_proposals(
-            wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made
+        wheel_channels, radius = wheel_proposals(
+            wheels,
+            search.motion if search else None,
+            has_speed="vx" in channels,
+            is_wheel_mean=any(column.is_wheel_mean for column in columns),
         )
-        found |= {one.channel: one for one in made}
-    found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
-    proposals = Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
+        channels |= {proposal.channel: proposal for proposal in wheel_channels}
+    channels |= _channels_by_name(free, channels, is_moving=search is not None)
+    proposals = Proposals(tuple(channels.values()), wheel_radius=radius, notes=notes)
     return proposals.with_tilt_signs()
-
-
-def _named_channels(
-    columns: Sequence[Candidate], held: Collection[str], *, moves: bool
-) -> list[Proposal]:
-    """Channels that only names suggest, of columns that are left beside the channels that are held; ``moves``: the motion is known.
-
-    Channels of the motion are asked: had they agreed with the others, they would not be left. `BY_NAME_ALONE` are taken where
-    the header gives their unit, or where only one is known.
-    """
-    found: dict[str, Proposal] = {}
-    has_wheels = any(name.startswith("wheel_speed") for name in held)
-    for channel in USUAL:
-        least = STRONG if moves else WEAK
-        named = [
-            one for one in columns if one.hints.get(channel, 0.0) >= least and one.measures(channel)
-        ]
-        needless = (channel == "steer" and "handwheel" in {*held, *found}) or (
-            channel == "vx" and has_wheels and moves
-        )
-        if not named or channel in held or needless:
-            continue
-        best = max(
-            named,
-            key=lambda one: (one.hints[channel], not is_filtered(one.name), not one.is_reference),
-        )
-        if best.name not in {one.column for one in found.values()}:
-            found[channel] = _by_name(best, channel)
-    for column in columns:
-        for channel in BY_NAME_ALONE:
-            is_sure = (column.unit or channel == "motor_current") and column.measures(channel)
-            if is_sure and channel in column.hints and channel not in {*held, *found}:
-                evidence = "its name and unit" if column.unit else "its name"
-                found[channel] = Proposal(
-                    column.name, channel, column.unit or CHANNELS[channel].unit, 1, (evidence,)
-                )
-    return list(found.values())
-
-
-def _by_name(column: Candidate, channel: str) -> Proposal:
-    """With the header's unit, or the first in which the column is of a usual size, or at least of a possible one."""
-    if column.unit:
-        return Proposal(
-            column.name,
-            channel,
-            column.unit,
-            1,
-            ("its name and unit",),
-            f"sign: {UNCONFIRMED}",
-            others=UNITS[channel],
-        )
-    size = largest(column.values)
-    (low, high) = USUAL[channel]
-    sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
-    fitting = [unit for unit, own in sizes.items() if low <= own <= high]
-    fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]
-    evidence = f"its name, and {size:.3g} for its 99th percentile"
-    return Proposal(
-        column.name,
-        channel,
-        (*fitting, *sizes)[0],
-        1,
-        (evidence,),
-        f"unit and sign: {UNCONFIRMED}",
-        others=UNITS[channel],
-        is_weak=channel in NEEDS_EVIDENCE,
-    )
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
     """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
-    is_close = abs(math.log(turning.scale)) < FAR
+    is_close = abs(math.log(turning.scale)) < FAR_MISMATCH
+    question = ""
     if "ay" in turning.columns:
-        evidence = (
-            f"ay vs. vx·yaw_rate: correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"
-        )
-        asked = "" if turning.decided else "other units explain the scale as well"
+        figures = f"correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"
+        evidence = f"ay vs. vx·yaw_rate: {figures} in these units"
         if not is_close:
-            asked = f"ay vs. vx·yaw_rate: gain {turning.scale:.2g} in these units: one of the three is in another unit"
+            question = (
+                f"the gain of ay to vx·yaw_rate is {turning.scale:.2g} instead of 1: "
+                "one of the three is in another unit"
+            )
+        elif not turning.decided:
+            question = "other units explain the gain equally well"
     else:
-        evidence = "its name and unit" if turning.decided else "its name and size"
-        asked = (
-            ""
-            if turning.decided
-            else "unit: no lateral acceleration ties speed and yaw rate together"
-        )
+        evidence = "name and unit" if turning.decided else "name and magnitude"
+        if not turning.decided:
+            question = "unit: without a lateral acceleration, speed and yaw rate cannot be compared"
     for channel, column in turning.columns.items():
-        if not column.is_made:
-            doubt = "" if column.unit and "ay" in turning.columns and is_close else asked
-            if channel == "ay" and not is_evident(column, turning.scale):
-                doubt = (
-                    doubt
-                    or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
-                )
-            if column.hint(channel) <= -STRONG:
-                doubt = doubt or "the motion contradicts its name"
-            unit = turning.units[channel]
-            if column.unit not in ("", unit):
-                doubt = f"by ay over vx·yaw_rate it is in {unit}, by its header in {column.unit}"
-            others = (f"{channel} {column.unit}",) if column.unit not in ("", unit) else ()
-            yield Proposal(
-                column.name,
-                channel,
-                unit,
-                turning.signs[channel],
-                (evidence,),
-                doubt,
-                others=others,
+        if column.is_wheel_mean:
+            continue
+        unit = turning.units[channel]
+        has_sure_unit = bool(column.unit) and "ay" in turning.columns and is_close
+        doubts = ["" if has_sure_unit else question]
+        alternatives: tuple[str, ...] = ()
+        if channel == "ay" and not is_evident(column, turning.scale):
+            doubts.append(
+                f"its gain to vx·yaw_rate is {turning.scale:.2g}, and it has no unit or clear "
+                "name: it may be a velocity"
+            )
+        if column.hint(channel) <= -STRONG:
+            doubts.append("its values contradict its name")
+        if column.unit not in ("", unit):
+            alternatives = (f"{channel} {column.unit}",)
+            doubts = [
+                f"its unit is {unit} according to the gain of ay to vx·yaw_rate, "
+                f"but {column.unit} according to the header"
+            ]
+        yield Proposal(
+            column.name,
+            channel,
+            unit,
+            turning.signs[channel],
+            (evidence,),
+            next(filter(None, doubts), ""),
+            alternatives=alternatives,
+        )
+
+
+def _ask_for_second_evidence(
+    turning: Turning, channels: Mapping[str, Proposal]
+) -> dict[str, Proposal]:
+    """Question speed, yaw rate and lateral acceleration with a single piece of evidence.
+
+    Pieces are the relation ay ≈ vx·yaw_rate, a relation to another channel, a second measurement,
+    the unit of the header and the name. yaw_rate ≈ steer·vx/wheelbase and a lateral velocity
+    follow a turn alike.
+    """
+    is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR_MISMATCH
+    sure = {name for name, proposal in channels.items() if not proposal.question}
+    columns = {column.name: (role, column) for role, column in turning.columns.items()}
+    checked = dict(channels)
+    for name, proposal in channels.items():
+        if proposal.column not in columns:
+            continue
+        role, column = columns[proposal.column]
+        confirming = CONFIRMING_CHANNELS[role]
+        confirming = confirming | CONFIRMING_CHANNELS["vx"] if is_related else confirming
+        evidence = [is_related, bool(sure & confirming), proposal.is_repeated]
+        evidence += [bool(column.unit), role in column.hints]
+        if sum(evidence) < 2:
+            checked[name] = replace(proposal.questioned(SINGLE_EVIDENCE), is_weak=True)
+    return checked
+
+
+def _channels_by_name(
+    columns: Sequence[Candidate], assigned: Collection[str], *, is_moving: bool
+) -> dict[str, Proposal]:
+    """Channels that only names suggest, of columns that remain.
+
+    Channels of the motion are questioned: had they agreed with the others, they would not remain.
+    `BY_NAME_ALONE` are accepted where the header gives their unit, or where only one is known.
+    """
+    channels: dict[str, Proposal] = {}
+    has_wheels = any(name.startswith("wheel_speed") for name in assigned)
+    min_hint = STRONG if is_moving else WEAK
+    for channel in USUAL_MAGNITUDES:
+        named = [
+            column
+            for column in columns
+            if column.hints.get(channel, 0.0) >= min_hint and column.measures(channel)
+        ]
+        is_second_angle = channel == "steer" and "handwheel" in {*assigned, *channels}
+        is_second_speed = channel == "vx" and has_wheels and is_moving
+        if not named or channel in assigned or is_second_angle or is_second_speed:
+            continue
+        best = max(
+            named,
+            key=lambda column: (
+                column.hints[channel],
+                not is_filtered(column.name),
+                not column.is_reference,
+            ),
+        )
+        if best.name not in {proposal.column for proposal in channels.values()}:
+            channels[channel] = _proposal_by_name(best, channel)
+    for column in columns:
+        for channel in BY_NAME_ALONE:
+            is_sure = (column.unit or channel == "motor_current") and column.measures(channel)
+            if is_sure and channel in column.hints and channel not in {*assigned, *channels}:
+                evidence = "name and unit" if column.unit else "name"
+                unit = column.unit or CHANNELS[channel].unit
+                channels[channel] = Proposal(column.name, channel, unit, 1, (evidence,))
+    return channels
+
+
+def _proposal_by_name(column: Candidate, channel: str) -> Proposal:
+    """In the header's unit, or the first in which its magnitude is usual, or at least possible."""
+    unit = column.unit
+    evidence = "name and unit"
+    if not unit:
+        size = largest(column.values)
+        low, high = USUAL_MAGNITUDES[channel]
+        sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
+        usual = [unit for unit, si_size in sizes.items() if low <= si_size <= high]
+        allowed = [unit for unit, si_size in sizes.items() if si_size <= CHANNELS[channel].high]
+        unit = (*usual, *allowed, *sizes)[0]
+        evidence = f"name, and magnitude {size:.3g} (99th percentile)"
+    return Proposal(
+        column.name,
+        channel,
+        unit,
+        1,
+        (evidence,),
+        f"{'sign' if column.unit else 'unit and sign'}: {UNCONFIRMED}",
+        alternatives=UNITS[channel],
+        is_weak=not column.unit and channel in CONFIRMING_CHANNELS,
+        is_by_name=True,
+    )
+
+
+# --- pose and further notes ------------------------------------------------------------------
+
+
+def _with_pose(
+    proposals: Proposals, columns: Sequence[Candidate], motion: Motion | None
+) -> Proposals:
+    """With a pose that supplies a missing reference, or notes of what could supply one."""
+    if set(REFERENCES) & set(proposals.by_channel):
+        return proposals
+    proposals = replace(proposals, pose=find_pose(columns, motion))
+    notes = []
+    named = [f"'{column.name}'" for column in named_pose(columns)]
+    if len(named) == 3 and not proposals.pose:
+        notes.append(
+            f"no reference is derived from {', '.join(named)}: "
+            "their derivatives do not match speed and yaw rate"
+        )
+    if motion is not None and not proposals.pose:
+        notes += _possible_sideslip_angles(columns, motion)
+    return proposals.with_notes(*notes)
+
+
+def _possible_sideslip_angles(columns: Sequence[Candidate], motion: Motion) -> Iterator[str]:
+    """Notes of two angles, such as course and heading, whose difference may be the sideslip."""
+    angles = [column for column in columns if "heading" in column.hints]
+    for first, second in combinations(angles, 2):
+        difference = first.values - second.values
+        if np.ptp(first.values) > 2.1 * math.pi:
+            difference = np.radians(difference)
+        wrapped = np.angle(np.exp(1j * difference))[motion.moving]
+        low, high = np.quantile(wrapped, [0.02, 0.98]) if len(wrapped) else (0.0, 0.0)
+        if SIDESLIP_RANGE[0] < high - low < SIDESLIP_RANGE[1]:
+            yield (
+                f"the difference '{first.name}' - '{second.name}' may be the missing reference "
+                "of the sideslip angle; if so, save it as a column"
             )
 
 
-def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:
-    """Speed, yaw rate and lateral acceleration asked where one piece of evidence is all.
+# --- doubts ----------------------------------------------------------------------------------
 
-    Pieces are the relation ay ≈ vx·yaw_rate, another column that agrees, the unit of the header
-    and the name. yaw_rate ≈ steer·vx / wheelbase and a lateral velocity follow a turn alike.
+
+def _ask_about_world_axes(
+    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
+) -> Proposals:
+    """Question velocities where the speed is the derivative of a coordinate of a position."""
+    speed = proposals.by_channel.get("vx")
+    positions = [_first_named(columns, role) for role in ("position_x", "position_y")]
+    if speed is None or speed.question or None in positions:
+        return proposals
+    along, across = (np.gradient(column.slow) for column in positions if column is not None)
+    by_name = {column.name: column for column in columns}
+    slow = by_name[speed.column].slow if speed.column in by_name else along
+    is_turning = float(np.std(across)) > MIN_WORLD_CROSSING * float(np.std(along))
+    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
+    of_path = abs(correlation(slow, np.hypot(along, across)))
+    if not (is_turning and of_axis > MIN_WORLD_CORRELATION and of_axis > of_path):
+        return proposals
+    question = (
+        "it is the derivative of a position: "
+        "is it a velocity along an axis of the world, not of the car?"
+    )
+    return proposals.changed(
+        {
+            proposal.channel: replace(proposal.questioned(question), is_weak=True)
+            for proposal in proposals.channels
+            if proposal.channel in ("vx", "vy_ref")
+        }
+    )
+
+
+def _ask_about_speed(
+    proposals: Proposals, search: Search, wheels: Wheels, columns: Sequence[Candidate]
+) -> Proposals:
+    """Question the speed where ay/yaw_rate and the wheels agree on another; a note by ay alone.
+
+    ay is compared with d(vy)/dt + vx·yaw_rate where a reference gives vy. Without one, d(vy)/dt
+    makes up some per cent, so that only more than these count.
     """
-    is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR
-    sure = {name for name, one in found.items() if not one.asked}
-    roles = {column.name: channel for channel, column in turning.columns.items()}
-    changed = {}
-    for name, one in found.items():
-        channel = roles.get(one.column)
-        if channel is None:
-            continue
-        column = turning.columns[channel]
-        others = column.name != one.column or any(
-            text.startswith(SAME_QUANTITY) for text in one.evidence[1:]
+    speed = proposals.by_channel.get("vx")
+    turning = search.turning
+    if "ay" not in turning.columns or speed is None:
+        return proposals
+    expected_ay, (low, high) = _expected_ay(proposals, search.motion, columns)
+    ay = slow_of(search.motion["ay"], search.motion.rate_hz)
+    gain = float(np.std(ay) / np.std(expected_ay))
+    is_misread = MISREAD_SPEED_GAIN_RANGE[0] < gain < MISREAD_SPEED_GAIN_RANGE[1]
+    if not is_misread or low <= gain <= high:
+        return proposals
+    speed_si = turning.columns["vx"].slow * si_factor(speed.unit, "vx")
+    wheel_gain = wheels_over_speed(wheels, proposals, speed_si)
+    if wheel_gain is not None and abs(wheel_gain - turning.scale) <= MAX_WHEEL_GAIN_DIFFERENCE:
+        corrected = f"vx {speed.unit} {speed.sign:+d} {speed.factor * wheel_gain:.3f}"
+        question = (
+            f"it is {_excess(wheel_gain)} compared with the wheel speeds and with ay/yaw_rate, "
+            f"as usual for a speedometer; the answer '{corrected}' corrects it"
         )
-        confirming = AGREEING[channel] | (AGREEING["vx"] if is_related else set())
-        pieces = [is_related, bool(sure & confirming), others]
-        pieces += [bool(column.unit), channel in column.hints]
-        if sum(pieces) < 2:
-            changed[name] = replace(one, asked=one.asked or SINGLE_EVIDENCE, is_weak=True)
-    return {**found, **changed}
+        questioned = speed.questioned(question)
+        alternatives = (*speed.alternatives, corrected)
+        return proposals.changed({"vx": replace(questioned, alternatives=alternatives)})
+    agreement = abs(correlation(ay, expected_ay))
+    bounds = (gain / agreement, gain * agreement)  # by regression either way
+    if any(low <= bound <= high for bound in bounds):
+        return proposals
+    cause = "low" if gain < 1.0 else "high, for example by body roll"
+    return proposals.with_notes(
+        f"'{speed.column}' is {_excess(*bounds)} compared with ay/yaw_rate, or ay is too {cause}; "
+        "if the speed is wrong, set its factor in the data set"
+    )
 
 
-def _left_and_right(
+def _expected_ay(
+    proposals: Proposals, motion: Motion, columns: Sequence[Candidate]
+) -> tuple[FloatArray, tuple[float, float]]:
+    """ay by the motion, (S,), and the range of ay over it with a right speed."""
+    for name in REFERENCES:
+        reference = proposals.by_channel.get(name)
+        if reference is None:
+            continue
+        column = next(column for column in columns if column.name == reference.column)
+        samples = column.values * reference.sign * si_factor(reference.unit, name)
+        channels = {**motion.channels, name: np.where(motion.moving, samples, 0.0)}
+        motion = replace(motion, channels=channels, velocity=name)
+        return slow_of(motion.turning + motion.sliding, motion.rate_hz), SPEED_GAIN_RANGE
+    return slow_of(motion.turning, motion.rate_hz), SPEED_GAIN_RANGE_WITHOUT_VY
+
+
+def _excess(*gains: float) -> str:
+    """For example ``2 to 6 % too high``, of a speed by which ay is these times as large."""
+    percents = [f"{abs(100.0 * (1.0 / gain - 1.0)):.0f}" for gain in gains]
+    return f"{' to '.join(dict.fromkeys(percents))} % too {'high' if gains[0] < 1.0 else 'low'}"
+
+
+# --- left and right --------------------------------------------------------------------------
+
+
+def _with_left_right(
     proposals: Proposals,
     columns: Sequence[Candidate],
-    known: Motion | None,
+    motion: Motion | None,
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
-    """Signs by the first clue that decides, else by a pose; else those of most columns, the yaw rate's own where they are even."""
-    for text, agreeing in clues:
-        if abs(agreeing) > DECIDING:
-            turned = proposals if agreeing > 0.0 else proposals.mirrored()
-            return replace(
-                turned,
-                left_right=f"{text.format('+1' if agreeing > 0.0 else '-1')} ({abs(agreeing):.2f})",
-            )
-    if proposals.pose and known is not None:
+    """With signs by the first clue that decides, else by a pose, else as most columns count."""
+    for text, agreement in clues:
+        if abs(agreement) > MIN_SIDE_CORRELATION:
+            sign = "+1" if agreement > 0.0 else "-1"
+            evidence = f"{text.format(sign)} (correlation {abs(agreement):.2f})"
+            proposals = proposals if agreement > 0.0 else proposals.mirrored()
+            return replace(proposals, left_right=evidence)
+    if proposals.pose and motion is not None:
         _, name, unit = proposals.pose[-1]
-        yaw = next(one for one in columns if one.name == name)
-        return proposals if turning_of(yaw, unit, known) >= 0.0 else proposals.mirrored()
-    counts = [one.sign for one in proposals.channels if one.channel in LATERAL]
-    return proposals.mirrored() if sum(counts) < 0 else proposals
+        yaw = next(column for column in columns if column.name == name)
+        is_mirrored = turning_of(yaw, unit, motion) < 0.0
+    else:
+        signs = [proposal.sign for proposal in proposals.channels if proposal.channel in LATERAL]
+        is_mirrored = sum(signs) < 0
+    return proposals.mirrored() if is_mirrored else proposals
 
 
-def _sideslip_to_save(columns: Sequence[Candidate], known: Motion) -> Iterator[str]:
-    """Notes of two angles, such as course and heading, whose difference may be a sideslip angle."""
-    for one, other in combinations((column for column in columns if "heading" in column.hints), 2):
-        apart = one.values - other.values
-        apart = np.angle(
-            np.exp(1j * (np.radians(apart) if np.ptp(one.values) > 2.1 * math.pi else apart))
-        )[known.moving]
-        low, high = np.quantile(apart, [0.02, 0.98]) if len(apart) else (0.0, 0.0)
-        if SIDESLIP[0] < high - low < SIDESLIP[1]:
-            yield f"'{one.name}' less '{other.name}' may be the sideslip angle that is missing as a reference; save it as a column"
-
-
-def _as_most_count(proposals: Proposals) -> Proposals:
-    """With channels whose sign nothing but a name suggests counting to the side to which most of the others do."""
+def _with_signs_of_majority(proposals: Proposals) -> Proposals:
+    """With signs that nothing but a name suggests set to that of most lateral channels."""
+    lateral = [proposal for proposal in proposals.channels if proposal.channel in LATERAL]
     by_name = [
-        one
-        for one in proposals.channels
-        if one.channel in LATERAL - {"yaw_rate", "ay"} and one.evidence[0].startswith("its name")
+        proposal
+        for proposal in lateral
+        if proposal.is_by_name and proposal.channel not in ("yaw_rate", "ay")
     ]
-    others = [
-        one.sign for one in proposals.channels if one.channel in LATERAL and one not in by_name
-    ]
-    changed = (
-        {one.channel: replace(one, sign=1 if sum(others) >= 0 else -1) for one in by_name}
-        if others
-        else {}
-    )
-    return replace(
-        proposals, channels=tuple(changed.get(one.channel, one) for one in proposals.channels)
+    signs = [proposal.sign for proposal in lateral if proposal not in by_name]
+    if not signs:
+        return proposals
+    sign = 1 if sum(signs) >= 0 else -1
+    return proposals.changed(
+        {proposal.channel: replace(proposal, sign=sign) for proposal in by_name}
     )
 
 
-def _clues(
-    columns: Sequence[Candidate], wheels: Wheels, known: Motion, is_vbo: bool
+def _left_right_clues(
+    columns: Sequence[Candidate], wheels: Wheels, motion: Motion, is_vbo: bool
 ) -> Iterator[tuple[str, float]]:
-    """Texts with a place for the sign of the yaw rate, and correlations with the sign by which it counts to the left."""
-    yield "right wheels are faster where yaw_rate, sign {}, counts up", turning_left(wheels, known)
+    """Texts with a place for the sign of the yaw rate by which a turn to the left is positive.
+
+    Each with the correlation of its evidence: negative where that sign is -1.
+    """
+    yield (
+        "the right wheels are faster than the left ones when yaw_rate with sign {} is positive",
+        turning_left(wheels, motion),
+    )
     for column in columns:
         if is_vbo and column.name == "heading":
             yield (
-                "'heading', clockwise by its format, runs against yaw_rate, sign {}",
-                -turning_of(column, "deg", known),
+                "'heading', clockwise by its format, decreases when yaw_rate with sign {} is positive",
+                -turning_of(column, "deg", motion),
             )
-    latitude, longitude = (
-        next((one.slow for one in columns if role in one.hints), None)
-        for role in ("latitude", "longitude")
-    )
+    latitude = _first_named(columns, "latitude")
+    longitude = _first_named(columns, "longitude")
     if latitude is None or longitude is None:
         return
-    east = (
-        longitude
-        * (-1.0 if is_vbo else 1.0)
-        * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
-    )
-    rate = slow_of(known["yaw_rate"], known.rate_hz)
-    speed = slow_of(np.abs(known.vx), known.rate_hz)
-    steps = np.gradient(east), np.gradient(latitude)
-    course = np.arctan2(*steps)
-    turned = np.angle(np.exp(-1j * np.gradient(np.unwrap(course))))
-    moving = speed > COURSE_SPEED * float(speed.max())  # noise of positions turns a slow course
-    usual = moving & (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
-    if usual.sum() > FEWEST:
+    cosine = math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
+    east = longitude.slow * (-1.0 if is_vbo else 1.0) * cosine
+    yaw_rate = slow_of(motion["yaw_rate"], motion.rate_hz)
+    speed = slow_of(np.abs(motion.vx), motion.rate_hz)
+    steps = np.gradient(east), np.gradient(latitude.slow)
+    course = np.unwrap(np.arctan2(*steps))  # clockwise from north
+    turned = np.angle(np.exp(-1j * np.gradient(course)))
+    is_moving = speed > MIN_COURSE_SPEED_SHARE * float(speed.max())
+    is_sound = is_moving & (np.abs(turned) < MAX_COURSE_STEP) & (np.hypot(*steps) > 0.0)
+    if is_sound.sum() > MIN_COURSE_SAMPLES:
         yield (
-            "the course over latitude and longitude runs against yaw_rate, sign {}",
-            correlation(turned[usual], rate[usual]),
+            "the course over latitude and longitude turns left when yaw_rate with sign {} is positive",
+            correlation(turned[is_sound], yaw_rate[is_sound]),
         )
+
+
+def _first_named(columns: Sequence[Candidate], role: str) -> Candidate | None:
+    return next((column for column in columns if role in column.hints), None)

@@ -17,14 +17,14 @@ from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 
 SLOW_HZ = 1.0  # below, a delay of a tenth of a second and vibration matter little
-KEPT_HZ = 5.0
-MOST_SLOW = 4000  # samples
-MOST_MISSING = 0.5  # of a column's samples, which a line then bridges
-STRAY = 20.0  # times the spread of nearly all samples; beyond lies no sample of a motion
-MOST_STRAY = 0.002
-LONG = 1000  # samples
+SLOW_RATE_HZ = 5.0
+MAX_SLOW_SAMPLES = 4000  # samples
+MAX_MISSING_SHARE = 0.5  # of a column's samples, which a line then bridges
+STRAY_DISTANCE = 20.0  # times the spread of nearly all samples; beyond lies no sample of a motion
+MAX_STRAY_SHARE = 0.002
+MIN_CLOCK_SAMPLES = 1000  # samples
 HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
-FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
+MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
     "vx": ("m/s", "km/h", "mph", "knots"),
@@ -45,9 +45,9 @@ class Candidate:
     name: str  # in its log
     unit: str  # by the header, as vehest spells it; empty where unknown
     values: FloatArray  # in the file's unit, without gaps, (T,)
-    slow: FloatArray  # low-passed, at `KEPT_HZ` or less, (S,)
+    slow: FloatArray  # low-passed, at `SLOW_RATE_HZ` or less, (S,)
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
-    is_made: bool = False  # whether it is the mean of wheels, and no column of the log
+    is_wheel_mean: bool = False  # whether it is the mean of wheels, and no column of the log
     device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
 
     @cached_property
@@ -66,6 +66,11 @@ class Candidate:
         return self.device == "car" or (
             not self.device and is_of_bus(self.name) and not is_reference(self.name)
         )
+
+    @property
+    def is_wheel(self) -> bool:
+        """Whether its name suggests the speed of a wheel."""
+        return any(role.startswith("wheel_speed") for role in self.hints)
 
     def hint(self, role: str) -> float:
         """Strength with which the name suggests a role; negative where it suggests others only."""
@@ -92,29 +97,31 @@ def candidates(
     columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float
 ) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
-    found = []
+    usable = []
     for name, unit, values, device in columns:
-        known = np.isfinite(values) & (np.abs(values) < 1e15)
+        is_measured = np.isfinite(values) & (np.abs(values) < 1e15)
         if (
-            1.0 - known.mean() > MOST_MISSING
-            or not np.ptp(values[known]) > 0.0
-            or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS
+            1.0 - is_measured.mean() > MAX_MISSING_SHARE
+            or not np.ptp(values[is_measured]) > 0.0
+            or len(np.unique(values[is_measured][:200_000])) < MIN_LEVELS
         ):
             continue
         roles = hints(name, unit)
-        only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
+        only_grows = len(values) > MIN_CLOCK_SAMPLES and np.min(np.diff(values[is_measured])) >= 0.0
         if "other" in roles or (
             only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(roles)
         ):
             continue
-        known[known] = ~_stray(values[known])
-        whole = (
+        is_measured[is_measured] = ~_stray(values[is_measured])
+        bridged = (
             values
-            if known.all()
-            else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+            if is_measured.all()
+            else np.interp(np.arange(len(values)), np.flatnonzero(is_measured), values[is_measured])
         )
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), roles, device=device))
-    return found
+        usable.append(
+            Candidate(name, unit, bridged, slow_of(bridged, rate_hz), roles, device=device)
+        )
+    return usable
 
 
 def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
@@ -131,17 +138,19 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     for family in families.values():
         roles = {role for column in family for role in column.hints}
         for column in family if len(family) == 3 else ():
-            named = dict.fromkeys(column.hints, HINT_OF_LETTER)
-            others = {"yaw_rate", "ax", "ay", "vx", "vy_ref"} & roles
-            changed[column.name] = replace(column, hints={**dict.fromkeys(others, WEAK), **named})
+            named_roles = dict.fromkeys(column.hints, HINT_OF_LETTER)
+            roles_of_motion = {"yaw_rate", "ax", "ay", "vx", "vy_ref"} & roles
+            changed[column.name] = replace(
+                column, hints={**dict.fromkeys(roles_of_motion, WEAK), **named_roles}
+            )
     return [changed.get(column.name, column) for column in columns]
 
 
 def _stray(values: FloatArray) -> NDArray[np.bool_]:
     """Samples that lie far outside of nearly all others, (T,); none where they are not few."""
-    low, middle, high = np.quantile(values, [MOST_STRAY, 0.5, 1.0 - MOST_STRAY])
-    stray = np.abs(values - middle) > STRAY * max(high - low, 1e-300)
-    return stray if stray.mean() <= MOST_STRAY else np.zeros(len(values), dtype=bool)
+    low, middle, high = np.quantile(values, [MAX_STRAY_SHARE, 0.5, 1.0 - MAX_STRAY_SHARE])
+    stray = np.abs(values - middle) > STRAY_DISTANCE * max(high - low, 1e-300)
+    return stray if stray.mean() <= MAX_STRAY_SHARE else np.zeros(len(values), dtype=bool)
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
@@ -149,8 +158,8 @@ def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
     if rate_hz > 4.0 * SLOW_HZ and len(values) > 30:
         sections = signal.butter(2, SLOW_HZ, fs=rate_hz, output="sos")
         values = np.asarray(signal.sosfiltfilt(sections, values), dtype=np.float64)
-    every = max(round(rate_hz / KEPT_HZ), -(-len(values) // MOST_SLOW), 1)
-    return values[::every]
+    step = max(round(rate_hz / SLOW_RATE_HZ), -(-len(values) // MAX_SLOW_SAMPLES), 1)
+    return values[::step]
 
 
 def correlation(left: FloatArray, right: FloatArray) -> float:

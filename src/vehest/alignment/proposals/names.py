@@ -12,11 +12,12 @@ _STRONG = {  # over the name without blanks
     "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
     r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
-    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|crosstrack|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
+    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc|"
+    r"crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$",
     "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|"
-    r"accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
+    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|"
+    r"quera(?!bw)|accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
     "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle|accel?forward",
     "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
@@ -55,6 +56,7 @@ _REFERENCE = re.compile(
 _BUS = re.compile(
     r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d"
 )
+_WORLD_FRAME = re.compile(r"\b(world|global|map|utm|earth)\b")
 _WORLD_AXIS = re.compile(
     r"\b(east|north|down|ost|nord|ned|enu|ecef)(ward)?\b|(east|north|ecef)|"
     r"\b(v|vel|velocity|speed|spd|acc|acceleration)( ?[en]| d| up)$"
@@ -131,9 +133,12 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it, says of what quantity it is."""
     words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
-    alone = _WITHOUT_UNIT.sub("", words).replace(" ", "")
+    without_unit = _WITHOUT_UNIT.sub("", words).replace(" ", "")
     texts = "\n".join(
-        [compact, *([alone, alone + _QUANTITIES[unit]] if unit in _QUANTITIES else [])]
+        [
+            compact,
+            *([without_unit, without_unit + _QUANTITIES[unit]] if unit in _QUANTITIES else []),
+        ]
     )
     corner = _corner(words)
     if corner:
@@ -141,19 +146,20 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     if re.search(r"brake|brems", words) and re.search(r"press|druck|^p ?brake|bar$", words):
         axle = next((axle for axle, pattern in _AXLES.items() if re.search(pattern, words)), "")
         return {f"brake_pressure_{axle}" if axle else "other": STRONG}
-    found = {
+    roles = {
         role: WEAK
         for role, pattern in _WEAK.items()
         if re.search(pattern, texts, re.MULTILINE)
         or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
     }
-    found |= {
+    roles |= {
         role: STRONG
-        for role, own in _STRONG.items()
-        if re.search(own, texts, re.MULTILINE) or role in words.split()
+        for role, pattern in _STRONG.items()
+        if re.search(pattern, texts, re.MULTILINE) or role in words.split()
     }
-    strong = {role for role, strength in found.items() if strength == STRONG}
-    if _WORLD_AXIS.search(words):
+    strong = {role for role, strength in roles.items() if strength == STRONG}
+    is_in_world = _WORLD_FRAME.search(words) and {"vx", "vy_ref", "ax", "ay"} & set(roles)
+    if is_in_world or _WORLD_AXIS.search(words):
         return {"other": STRONG}
     is_other = "other" in strong and not strong & {
         "yaw_rate",
@@ -179,7 +185,7 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
             else ()
         ),
     }
-    return {role: strength for role, strength in found.items() if role not in parts}
+    return {role: strength for role, strength in roles.items() if role not in parts}
 
 
 def _corner(words: str) -> str:
@@ -188,8 +194,10 @@ def _corner(words: str) -> str:
         return ""
     for corner, pattern in _CORNERS.items():
         joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$"
-        apart = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(words)
-        if apart or re.search(joined, words.replace(" ", "")):
+        is_separate = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(
+            words
+        )
+        if is_separate or re.search(joined, words.replace(" ", "")):
             return corner
     return ""
 
@@ -197,9 +205,9 @@ def _corner(words: str) -> str:
 def is_pair(longitudinal: str, lateral: str) -> bool:
     """Whether two names differ by x and y, u and v, or long and lat alone."""
     ahead = bare(longitudinal)
-    aside = bare(lateral)
-    return ahead != aside and any(
-        re.sub(rf"{one}(?![a-z]*{one})", other, ahead) == aside for one, other in _PAIRS
+    across = bare(lateral)
+    return ahead != across and any(
+        re.sub(rf"{first}(?![a-z]*{first})", second, ahead) == across for first, second in _PAIRS
     )
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,27 +37,33 @@ class Proposal:
     column: str  # its name in the log
     channel: str  # as `vehest data channels` lists it
     unit: str  # of the column, as vehest spells it
-    sign: int = 1  # -1 where it counts the other way round than ISO 8855
+    sign: int = 1  # -1 where its positive direction is opposite to ISO 8855
     evidence: tuple[str, ...] = ()  # for people
-    asked: str = ""  # question that the log leaves open; empty where it decides all
+    question: str = ""  # that the log leaves open; empty where it decides all
     factor: float = 1.0  # by which the column is multiplied to be in ``unit``
     offset: float = 0.0  # value of the column at zero, in its own unit
-    others: tuple[str, ...] = ()  # channels or units that would do as well
+    alternatives: tuple[str, ...] = ()  # channels, units or columns that fit equally well
     delay: float = 0.0  # by which it is late, as far as it is known [s]
-    is_weak: bool = (
-        False  # whether one piece of evidence is all: left out unless an answer takes it
-    )
+    is_weak: bool = False  # whether it is left out unless an answer confirms it
+    is_by_name: bool = False  # whether its name is all that supports it, and no relation to others
+    is_repeated: bool = False  # whether another column measures the same
 
-    @property
-    def in_words(self) -> str:
-        """For example ``yaw_rate: column Gyro, deg/s, sign -1: ay vs. vx·yaw_rate: correlation 0.97``."""
-        parts = [f"column {self.column}", self.unit]
+    def describe(self) -> str:
+        """For example ``yaw_rate: column 'Gyro', deg/s, sign -1: name and unit``."""
+        parts = [f"column '{self.column}'", self.unit]
         parts += [f"sign {self.sign}"] if self.sign != 1 else []
         parts += [f"factor {self.factor:.5g}"] if self.factor != 1.0 else []
-        parts += [f"less {self.offset:.4g}"] if self.offset else []
-        return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence) or 'nothing but the order of columns'}"
+        parts += [f"zero at {self.offset:.4g}"] if self.offset else []
+        return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence)}"
 
-    def beyond(self, values: FloatArray) -> NDArray[np.bool_]:
+    def as_plain(self) -> dict[str, Any]:
+        """For JSON."""
+        plain = asdict(self)
+        plain["asked"] = plain.pop("question") or None
+        plain["others"] = plain.pop("alternatives")
+        return plain
+
+    def is_impossible(self, values: FloatArray) -> NDArray[np.bool_]:
         """Which values of the column no vehicle can have, (T,)."""
         channel = CHANNELS[self.channel]
         samples = (
@@ -64,9 +71,24 @@ class Proposal:
         )
         return np.asarray((samples < channel.low) | (samples > channel.high))
 
-    def with_evidence(self, *more: str) -> Proposal:
-        """The same with more of it."""
-        return replace(self, evidence=(*self.evidence, *more))
+    def with_evidence(self, *evidence: str) -> Proposal:
+        """The same with further evidence."""
+        return replace(self, evidence=(*self.evidence, *evidence))
+
+    def questioned(self, question: str) -> Proposal:
+        """The same with a question, unless it has one."""
+        return replace(self, question=self.question or question)
+
+    def merged_with(self, earlier: Proposal | None) -> Proposal:
+        """The same with the evidence and questions of an earlier proposal for this column."""
+        if earlier is None or earlier.column != self.column:
+            return self
+        return replace(
+            self,
+            evidence=(*earlier.evidence, *self.evidence),
+            question=self.question or earlier.question,
+            alternatives=self.alternatives or earlier.alternatives,
+        )
 
 
 @dataclass(frozen=True)
@@ -74,17 +96,11 @@ class Proposals:
     """Proposals for a log."""
 
     channels: tuple[Proposal, ...]
-    left_right: str = ""  # evidence of which way is left; empty where a log has none, and signs hold against each other only
-    wheel_radius: float | None = (
-        None  # rolling radius by which the wheels make the speed [m]; None where the speed has a column
-    )
-    rate_hz: float | None = (
-        None  # of a log without times, as far as accelerations decide it [Hz]; None where it has times
-    )
+    left_right: str = ""  # evidence of which way is left; empty where the log has none
+    wheel_radius: float | None = None  # for vx from the wheels [m]; None where vx has a column
+    rate_hz: float | None = None  # of a log without times, by the accelerations; else None
     unused: tuple[str, ...] = ()  # columns that belong to no channel
-    pose: tuple[
-        tuple[str, str, str], ...
-    ] = ()  # part (``x``, ``y``, ``yaw``), column and unit, of which a reference can be made
+    pose: tuple[tuple[str, str, str], ...] = ()  # part (``x``, ``y``, ``yaw``), column and unit
     notes: tuple[str, ...] = ()  # further remarks
 
     @property
@@ -92,48 +108,50 @@ class Proposals:
         """Channel -> its proposal."""
         return {proposal.channel: proposal for proposal in self.channels}
 
+    def with_notes(self, *notes: str) -> Proposals:
+        """The same with further remarks."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def changed(self, changes: Mapping[str, Proposal]) -> Proposals:
+        """The same with other proposals for some channels."""
+        channels = tuple(changes.get(proposal.channel, proposal) for proposal in self.channels)
+        return replace(self, channels=channels)
+
     def keeping(self, channels: Sequence[Proposal], notes: Sequence[str] = ()) -> Proposals:
-        """The same with these of its channels and further remarks; a radius stays only beside a wheel's speed."""
-        radius = (
-            self.wheel_radius
-            if any(one.channel.startswith("wheel_speed") for one in channels)
-            else None
-        )
-        return replace(
-            self, channels=tuple(channels), wheel_radius=radius, notes=(*self.notes, *notes)
-        )
+        """The same with these of its channels and further remarks.
+
+        A radius stays only with a wheel's speed.
+        """
+        has_wheel = any(proposal.channel.startswith("wheel_speed") for proposal in channels)
+        radius = self.wheel_radius if has_wheel else None
+        return replace(self, channels=tuple(channels), wheel_radius=radius).with_notes(*notes)
 
     def mirrored(self) -> Proposals:
-        """The same for a car seen in a mirror: signs of `LATERAL` channels and of pitch reversed."""
-        turned = (
-            replace(one, sign=-one.sign)
-            if one.channel in LATERAL or TILT.get(one.channel) == "ay"
-            else one
-            for one in self.channels
+        """The same for a mirrored car: signs of `LATERAL` channels and of pitch reversed."""
+        return self.changed(
+            {
+                proposal.channel: replace(proposal, sign=-proposal.sign)
+                for proposal in self.channels
+                if proposal.channel in LATERAL or TILT.get(proposal.channel) == "ay"
+            }
         )
-        return replace(self, channels=tuple(turned))
 
     def with_tilt_signs(self) -> Proposals:
         """The same with the signs of roll and pitch by the axes that other channels reveal.
 
-        Roll counts about the axis of ax, pitch about that of ay; asked unless ax, ay and the yaw
-        rate are along the axes of one right-handed set, as forward-left-up or forward-right-down.
+        Roll counts about the axis of ax, pitch about that of ay; a question unless ax, ay and the
+        yaw rate are along the axes of one right-handed set, as forward-left-up or
+        forward-right-down.
         """
-        signs = {name: one.sign for name, one in self.by_channel.items()}
+        signs = {name: proposal.sign for name, proposal in self.by_channel.items()}
         axes = [signs.get("ax", signs.get("vx")), signs.get("ay"), signs.get("yaw_rate")]
         axis_signs = [sign for sign in axes if sign is not None]
         is_right_handed = len(axis_signs) == len(axes) and math.prod(axis_signs) == 1
-        doubt = (
-            ""
-            if is_right_handed
-            else "sign: ax, ay and yaw_rate reveal no right-handed set of axes"
-        )
-        changed = [
-            replace(
-                one, sign=signs.get(TILT[one.channel], 1), asked=one.asked or doubt
-            ).with_evidence("sign by the axes of ax, ay and yaw_rate")
-            if one.channel in TILT
-            else one
-            for one in self.channels
-        ]
-        return replace(self, channels=tuple(changed))
+        doubt = "sign: ax, ay and yaw_rate do not form a right-handed set of axes"
+        changes = {}
+        for proposal in self.channels:
+            if proposal.channel in TILT:
+                signed = replace(proposal, sign=signs.get(TILT[proposal.channel], 1))
+                signed = signed.with_evidence("sign from the axes of ax, ay and yaw_rate")
+                changes[proposal.channel] = signed.questioned("" if is_right_handed else doubt)
+        return self.changed(changes)

@@ -16,20 +16,20 @@ from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_re
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
 
-LEAST_CORRELATION = 0.75
-RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
-CLOSE = 0.3
-FAR = 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
-EVIDENT = 0.1  # likewise: within, the scale alone indicates an acceleration
-APART = 0.2  # by which the next best units must be worse
+MIN_CORRELATION = 0.75
+UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
+CLOSE_MISMATCH = 0.3
+FAR_MISMATCH = 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
+MAX_EVIDENT_MISMATCH = 0.1  # likewise: within, the scale alone indicates an acceleration
+MIN_COST_MARGIN = 0.2  # by which the next best units must be worse
 RANGES = {
     "vx": (0.5, 110.0),
     "yaw_rate": (0.02, 8.0),
     "ay": (0.3, 60.0),
 }  # of the 99th percentile, SI
-MOST_COLUMNS = 60
-MOST_KEPT = 8
-LEAST_SCORE = 6.0
+MAX_COLUMNS = 60
+MAX_TURNINGS = 8
+MIN_SCORE = 6.0
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a clear name decides."""
 NO_RATE_OR_ACCELERATION = (
@@ -37,17 +37,21 @@ NO_RATE_OR_ACCELERATION = (
     *("latitude", "longitude", "position_x", "position_y"),
 )
 """Roles of speeds, angles and positions, none of which is a yaw rate or an acceleration."""
-UNNAMED = 3.0  # of score, for a column that no name speaks for where one speaks for another
-EXACT = 0.9995  # correlation beyond which ay was computed of vx·yaw_rate, and not measured
-COMPUTED = 6.0  # of score, for that, where another column is named as ay
-NAMELESS = 0.5  # rank of a column whose name suggests nothing
-STANDING = 0.02  # of the top speed; below, the car may stand
-SAME = 0.97  # correlation of one quantity measured twice
-SAME_NAMED = {"vx": 0.7, "yaw_rate": 0.9}  # of columns that are named alike; wheels slip
-SAME_AY = 0.99
-SAME_SCALE = 0.35  # logarithm
-SAME_QUANTITY = "same quantity as"  # start of the evidence that a second column measures it
-LIKELY = 2  # units to try; a speed that seems to be in others may be in counts
+UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
+MIN_COMPUTED_CORRELATION = (
+    0.9995  # correlation beyond which ay was computed of vx·yaw_rate, and not measured
+)
+COMPUTED_PENALTY = 6.0  # of score, for that, where another column is named as ay
+NAMELESS_RANK = 0.5  # rank of a column whose name suggests nothing
+STANDSTILL_SPEED_SHARE = 0.02  # of the top speed; below, the car may stand
+MIN_REPEAT_CORRELATION = 0.97  # correlation of one quantity measured twice
+MIN_NAMED_REPEAT_CORRELATION = {
+    "vx": 0.7,
+    "yaw_rate": 0.9,
+}  # of columns that are named alike; wheels slip
+MIN_AY_REPEAT_CORRELATION = 0.99
+MAX_REPEAT_MISMATCH = 0.35  # logarithm
+MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,7 @@ class Turning:
             name: column.values * signs[name] * si_factor(self.units[name], name)
             for name, column in self.columns.items()
         }
-        moving = np.abs(channels["vx"]) > STANDING * largest(channels["vx"])
+        moving = np.abs(channels["vx"]) > STANDSTILL_SPEED_SHARE * largest(channels["vx"])
         return Motion(rate_hz, channels, "vx", "", moving)
 
 
@@ -85,59 +89,92 @@ class Search:
     """A motion, and the columns that are left beside it."""
 
     turning: Turning  # speed, yaw rate and lateral acceleration
-    known: Motion  # by these, ay = +vx·yaw_rate
+    motion: Motion  # by these, ay = +vx·yaw_rate
     free: list[
         Candidate
     ]  # columns without a channel that repeat none; those that get one are removed
 
 
 def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
-    """Triples that may be speed, yaw rate and lateral acceleration, the best first."""
+    """Find triples that may be speed, yaw rate and lateral acceleration, by ay ≈ vx·yaw_rate.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        With signals (S,) below 1 Hz, on one clock.
+
+    Returns
+    -------
+    list of Turning
+        At most `MAX_TURNINGS` with a score of `MIN_SCORE` or more, the best first.
+    """
     speeds, rates, accelerations = (_pool(columns, channel) for channel in RANGES)
     if not (speeds and rates and accelerations):
         return []
-    found = []
-    shown, sizes = _centred(np.stack([one.slow for one in accelerations]))
+    turnings = []
+    centred_ay, ay_scales = _centred(np.stack([column.slow for column in accelerations]))
     for speed in speeds:
-        turning, scales = _centred(np.stack([one.slow for one in rates]) * speed.slow)
+        centred_turning, scales = _centred(np.stack([column.slow for column in rates]) * speed.slow)
         with np.errstate(all="ignore"):
-            agreeing = np.nan_to_num(
-                (turning @ shown.T) / shown.shape[1] / np.outer(scales, sizes),
+            correlations = np.nan_to_num(
+                (centred_turning @ centred_ay.T)
+                / centred_ay.shape[1]
+                / np.outer(scales, ay_scales),
                 posinf=0.0,
                 neginf=0.0,
             )
-        for i, j in zip(*np.nonzero(np.abs(agreeing) >= LEAST_CORRELATION), strict=True):
-            if len({id(one) for one in (speed, rates[i], accelerations[j])}) == 3:
+        for i, j in zip(*np.nonzero(np.abs(correlations) >= MIN_CORRELATION), strict=True):
+            if len({id(column) for column in (speed, rates[i], accelerations[j])}) == 3:
                 named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
-                found.append(
-                    _scored(columns, named, float(agreeing[i, j]), float(sizes[j] / scales[i]))
+                turnings.append(
+                    _scored(
+                        columns, named, float(correlations[i, j]), float(ay_scales[j] / scales[i])
+                    )
                 )
     return [
-        one
-        for one in sorted(found, key=lambda one: -one.score)[:MOST_KEPT]
-        if one.score >= LEAST_SCORE
+        turning
+        for turning in sorted(turnings, key=lambda turning: -turning.score)[:MAX_TURNINGS]
+        if turning.score >= MIN_SCORE
     ]
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, where no lateral acceleration ties them together; None without one of them."""
-    named = {}
+    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing."""
+    columns_by_channel = {}
     units = {}
     for channel in ("vx", "yaw_rate"):
-        pool = [one for one in _pool(columns, channel) if channel in one.hints]
-        if not pool:
+        candidates_for = [
+            candidate for candidate in _pool(columns, channel) if channel in candidate.hints
+        ]
+        if not candidates_for:
             return None
-        ahead = [one for one in pool if channel == "vx" and _is_forward(one.slow)]
-        named[channel] = column = max(
-            ahead or pool,
-            key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)),
+        forward = [
+            candidate
+            for candidate in candidates_for
+            if channel == "vx" and _is_forward(candidate.slow)
+        ]
+        columns_by_channel[channel] = column = max(
+            forward or candidates_for,
+            key=lambda candidate: (
+                candidate.hints[channel],
+                not is_filtered(candidate.name),
+                bool(candidate.unit),
+            ),
         )
         offered = column.units(channel)
         units[channel] = next(
             (unit for unit in offered if _is_plausible(column, channel, unit)), offered[0]
         )
-    is_one = named["vx"] is named["yaw_rate"]
-    return None if is_one else Turning(named, units, all(one.unit for one in named.values()))
+    is_same_column = columns_by_channel["vx"] is columns_by_channel["yaw_rate"]
+    return (
+        None
+        if is_same_column
+        else Turning(
+            columns_by_channel,
+            units,
+            all(candidate.unit for candidate in columns_by_channel.values()),
+        )
+    )
 
 
 def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -148,24 +185,28 @@ def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     """Columns that could be a channel, those whose names suggest it first."""
-    own = [
-        one
-        for one in columns
-        if channel in one.hints
+    pool = [
+        column
+        for column in columns
+        if channel in column.hints
         or STRONG
         not in {
-            one.hints.get(role)
+            column.hints.get(role)
             for role in (*FOLLOWING, *(NO_RATE_OR_ACCELERATION if channel != "vx" else ()))
         }
     ]
-    own = [
-        one
-        for one in own
-        if one.measures(channel) and (channel != "vx" or "vx" in one.hints or _is_forward(one.slow))
+    pool = [
+        column
+        for column in pool
+        if column.measures(channel)
+        and (channel != "vx" or "vx" in column.hints or _is_forward(column.slow))
     ]
     return sorted(
-        own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS))
-    )[:MOST_COLUMNS]
+        pool,
+        key=lambda column: (
+            -(column.hints.get(channel) or (-1.0 if column.hints else NAMELESS_RANK))
+        ),
+    )[:MAX_COLUMNS]
 
 
 def _is_forward(slow: FloatArray) -> bool:
@@ -175,8 +216,13 @@ def _is_forward(slow: FloatArray) -> bool:
 
 
 def is_evident(ay: Candidate, scale: float) -> bool:
-    """Whether a unit, a clear name or a scale near 1 over vx·yaw_rate indicates a lateral acceleration; a velocity follows a turn alike."""
-    return bool(ay.unit) or ay.hints.get("ay") == STRONG or abs(math.log(scale)) < EVIDENT
+    """Whether a unit, a clear name or a gain near 1 to vx·yaw_rate indicates an acceleration.
+
+    A lateral velocity follows a turn alike.
+    """
+    return (
+        bool(ay.unit) or ay.hints.get("ay") == STRONG or abs(math.log(scale)) < MAX_EVIDENT_MISMATCH
+    )
 
 
 def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
@@ -185,62 +231,81 @@ def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
 
 
 def _scored(
-    columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float
+    columns: Sequence[Candidate],
+    named: Mapping[str, Candidate],
+    correlation_with_ay: float,
+    file_gain: float,
 ) -> Turning:
-    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, others than by the header only where these
-    are far from it, and the score of all evidence."""
+    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all evidence.
+
+    Units other than the header's are chosen only where these are far from the gain.
+    """
     ranked = []
     tried = [
-        {*column.units(channel), *(() if column.is_made else UNITS[channel])}
+        {*column.units(channel), *(() if column.is_wheel_mean else UNITS[channel])}
         for channel, column in named.items()
     ]
     for units in product(*tried):
         speed, rate, acceleration = (
             si_factor(unit, channel) for unit, channel in zip(units, named, strict=True)
         )
-        left = scale / (speed * rate / acceleration)
-        implausible = sum(
+        gain = file_gain / (speed * rate / acceleration)
+        n_implausible = sum(
             not _is_plausible(column, channel, unit)
             for (channel, column), unit in zip(named.items(), units, strict=True)
         )
-        rare = 0.0 if named["vx"].unit == units[0] else RARE.get(units[0], 0.0)
-        against = sum(
+        rarity = 0.0 if named["vx"].unit == units[0] else UNIT_PENALTIES.get(units[0], 0.0)
+        n_contradicted = sum(
             column.unit not in ("", unit)
             for column, unit in zip(named.values(), units, strict=True)
         )
         ranked.append(
             (
-                abs(math.log(left)) + rare + implausible + against,
-                abs(math.log(left)),
+                abs(math.log(gain)) + rarity + n_implausible + n_contradicted,
+                abs(math.log(gain)),
                 units,
-                left,
-                implausible,
-                against,
+                gain,
+                n_implausible,
+                n_contradicted,
             )
         )
     ranked.sort()
-    cost, mismatch, units, left, implausible, against = ranked[0]
-    decided = mismatch < FAR and (len(ranked) == 1 or ranked[1][0] - cost > APART)
-    score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
-    for channel, one in named.items():
-        score += one.hint(channel) + (1.5 if one.unit else 0.0) - 0.5 * is_filtered(one.name)
-        if channel not in one.hints:
+    cost, mismatch, units, gain, n_implausible, n_contradicted = ranked[0]
+    decided = mismatch < FAR_MISMATCH and (
+        len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
+    )
+    score = 12.0 * (abs(correlation_with_ay) - MIN_CORRELATION) / (1.0 - MIN_CORRELATION)
+    for channel, column in named.items():
+        score += (
+            column.hint(channel) + (1.5 if column.unit else 0.0) - 0.5 * is_filtered(column.name)
+        )
+        if channel not in column.hints:
             score -= (
-                UNNAMED
-                * max((other.hints.get(channel, 0.0) for other in columns), default=0.0)
+                UNNAMED_PENALTY
+                * max((rival.hints.get(channel, 0.0) for rival in columns), default=0.0)
                 / STRONG
             )
-    score -= (3.0 if any(one.is_of_bus and "ay" in one.hints for one in columns) else 0.5) * named[
-        "ay"
-    ].is_reference + 5.0 * implausible
+    score -= (
+        3.0 if any(column.is_of_bus and "ay" in column.hints for column in columns) else 0.5
+    ) * named["ay"].is_reference + 5.0 * n_implausible
     level = np.abs(named["vx"].slow)
     if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
         score -= 2.0
-    score += -5.0 if against or mismatch >= FAR else 3.0 if mismatch < CLOSE else 1.0
-    score -= UNNAMED * (not is_evident(named["ay"], left))
-    others = any("ay" in one.hints for one in columns if one is not named["ay"])
-    score -= COMPUTED * (abs(agreeing) > EXACT and others)
-    return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
+    score += (
+        -5.0
+        if n_contradicted or mismatch >= FAR_MISMATCH
+        else 3.0
+        if mismatch < CLOSE_MISMATCH
+        else 1.0
+    )
+    score -= UNNAMED_PENALTY * (not is_evident(named["ay"], gain))
+    has_other_ay = any("ay" in column.hints for column in columns if column is not named["ay"])
+    score -= COMPUTED_PENALTY * (
+        abs(correlation_with_ay) > MIN_COMPUTED_CORRELATION and has_other_ay
+    )
+    return Turning(
+        named, dict(zip(named, units, strict=True)), decided, correlation_with_ay, gain, score
+    )
 
 
 class Repeat(NamedTuple):
@@ -252,33 +317,44 @@ class Repeat(NamedTuple):
 
 
 def repeated(search: Search) -> Iterator[Proposal]:
-    """Proposals for speeds, yaw rates and lateral accelerations that are measured twice, those of the motion among them."""
-    for channel in SAME_NAMED:
+    """Propose channels for speeds, yaw rates and lateral accelerations that are measured twice.
+
+    Parameters
+    ----------
+    search : Search
+        Columns that repeat one of its motion are removed from ``search.free``.
+
+    Yields
+    ------
+    Proposal
+        The car's own and the reference's, also for the column of the motion itself.
+    """
+    for channel in MIN_NAMED_REPEAT_CORRELATION:
         first = Repeat(
             search.turning.columns[channel],
             search.turning.units[channel],
             search.turning.signs[channel],
         )
-        same = []
+        repeats = []
         scaled = []
         for column in search.free:
-            agreeing = correlation(column.slow, first.column.slow)
-            unit = _unit(column, first, channel, agreeing)
+            agreement = correlation(column.slow, first.column.slow)
+            unit = _unit(column, first, channel, agreement)
             if unit:
-                same.append(Repeat(column, unit, -first.sign if agreeing < 0.0 else first.sign))
+                repeats.append(Repeat(column, unit, -first.sign if agreement < 0.0 else first.sign))
             elif (
                 channel == "vx"
                 and column.hints.get("vx") == STRONG
                 and not column.unit
-                and abs(agreeing) > SAME_NAMED["vx"]
+                and abs(agreement) > MIN_NAMED_REPEAT_CORRELATION["vx"]
             ):
                 scaled.append(
                     column
                 )  # named as a speed, and one but for its scale, as a motor's speed is
-        for one in same:
-            search.free.remove(one.column)
-        family = [*(() if first.column.is_made else (first,)), *same]
-        if same:
+        for repeat in repeats:
+            search.free.remove(repeat.column)
+        family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
+        if repeats:
             yield from _separated(family, channel)
         elif scaled and family:
             search.free.remove(scaled[0])
@@ -287,115 +363,165 @@ def repeated(search: Search) -> Iterator[Proposal]:
     for column in list(search.free):
         if (
             ay is not None
-            and abs(correlation(column.slow, ay.slow)) > SAME_AY
+            and abs(correlation(column.slow, ay.slow)) > MIN_AY_REPEAT_CORRELATION
             and column.hint("ay") >= 0.0
         ):
             search.free.remove(column)
-            text = f"{SAME_QUANTITY} '{column.name}', of another place or filtered: correlation {abs(correlation(column.slow, ay.slow)):.3f}"
-            yield Proposal(
-                ay.name, "ay", search.turning.units["ay"], search.turning.signs["ay"], (text,)
-            )
+            text = f"'{column.name}': correlation {abs(correlation(column.slow, ay.slow)):.3f}, measured at another point or filtered"
+            unit = search.turning.units["ay"]
+            sign = search.turning.signs["ay"]
+            yield Proposal(ay.name, "ay", unit, sign, (text,), is_repeated=True)
 
 
-def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
-    """With a speed that is named as a reference, or like the lateral velocity, as the reference's, where wheels can give the car's own."""
-    own = found.get("vx")
-    lateral = found.get("vy_ref")
-    if own is None or lateral is None or "vx_ref" in found:
-        return found
+def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
+    """With the speed as vx_ref where it is named as a reference, or like the lateral velocity.
+
+    Wheels supply the car's own speed.
+    """
+    speed = channels.get("vx")
+    lateral = channels.get("vy_ref")
+    if speed is None or lateral is None or "vx_ref" in channels:
+        return channels
     evidence = "named as a reference"
-    asked = own.asked
-    if not is_reference(own.column):
-        evidence = f"named like '{lateral.column}', and wheels are there for vx"
-        asked = asked or "whether it is the car's own speed or the reference's"
-        if not is_pair(own.column, lateral.column):
-            return found
-    reference = replace(own, channel="vx_ref", others=("vx",), asked=asked).with_evidence(evidence)
-    return {name: one for name, one in found.items() if name != "vx"} | {"vx_ref": reference}
+    question = speed.question
+    if not is_reference(speed.column):
+        evidence = f"named like '{lateral.column}', and the wheel speeds supply vx"
+        question = question or "is it the car's own speed or that of the reference?"
+        if not is_pair(speed.column, lateral.column):
+            return channels
+    reference = replace(
+        speed, channel="vx_ref", alternatives=("vx",), question=question
+    ).with_evidence(evidence)
+    return {name: proposal for name, proposal in channels.items() if name != "vx"} | {
+        "vx_ref": reference
+    }
 
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
-    least = SAME_NAMED[channel] if channel in column.hints else SAME
-    if abs(agreeing) < least or column.hint(channel) < 0.0 or not column.measures(channel):
+    min_correlation = (
+        MIN_NAMED_REPEAT_CORRELATION[channel] if channel in column.hints else MIN_REPEAT_CORRELATION
+    )
+    if (
+        abs(agreeing) < min_correlation
+        or column.hint(channel) < 0.0
+        or not column.measures(channel)
+    ):
         return ""
     size = rms(first.column.slow) * si_factor(first.unit, channel)
     ranked = [
         (abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit)
-        for unit in column.units(channel)[:LIKELY]
+        for unit in column.units(channel)[:MAX_REPEAT_UNITS]
     ]
-    return min(ranked)[1] if min(ranked)[0] < SAME_SCALE else ""
+    return min(ranked)[1] if min(ranked)[0] < MAX_REPEAT_MISMATCH else ""
 
 
 def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[Proposal]:
-    """The car's own speed in counts, and the reference's by which it is scaled; the first one's unit may be ``decided`` by the motion."""
+    """The car's own speed in counts, and the reference's by which it is scaled.
+
+    ``decided``: whether the motion decides the unit of ``first``.
+    """
     if column.is_reference and not (first.column.is_reference or first.column.unit or decided):
         column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
     speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)
-    evidence = f"follows '{name}' ({correlation(column.slow, first.column.slow):.2f}), no unit of speed explains its scale"
-    asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{name}' is then the reference's"
+    evidence = f"correlation with '{name}' {correlation(column.slow, first.column.slow):.2f}; no unit of speed explains the gain"
+    question = f"is it the car's own speed with factor {abs(factor):.5g} m/s, so that '{name}' is the reference's, or another quantity?"
     sign = -1 if factor < 0.0 else 1
     yield Proposal(
-        column.name, "vx", "m/s", sign, (evidence,), asked, factor=float(f"{abs(factor):.5g}")
+        column.name, "vx", "m/s", sign, (evidence,), question, factor=float(f"{abs(factor):.5g}")
     )
-    asked = f"the reference's speed, or the car's own ('{column.name}' in counts)"
-    yield Proposal(name, "vx_ref", first.unit, first.sign, (f"'{column.name}' follows it",), asked)
+    question = (
+        f"is it the reference's speed, or the car's own ('{column.name}' being another quantity)?"
+    )
+    yield Proposal(
+        name, "vx_ref", first.unit, first.sign, (f"proportional to '{column.name}'",), question
+    )
 
 
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
-    """The car's own and the reference's of columns that measure the same; more than these two are left out."""
-    plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
-    own = [one for one in plain if one.column.is_of_bus] or [
-        one for one in plain if not one.column.is_reference
+    """The car's own and the reference's of columns that measure the same; others are left out."""
+    plain = [repeat for repeat in family if not is_filtered(repeat.column.name)] or list(family)
+    of_car = [repeat for repeat in plain if repeat.column.is_of_bus] or [
+        repeat for repeat in plain if not repeat.column.is_reference
     ]
-    own = own or [one for one in family if not one.column.is_reference]  # filtered, but the car's
-    references = [one for one in plain if one.column.is_reference] or [
-        one for one in plain if one not in own
+    of_car = of_car or [
+        repeat for repeat in family if not repeat.column.is_reference
+    ]  # filtered, but the car's
+    references = [repeat for repeat in plain if repeat.column.is_reference] or [
+        repeat for repeat in plain if repeat not in of_car
     ]
-    smallest = min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain)
-    text = f"{SAME_QUANTITY} the other {channel}: correlation {smallest:.2f}"
+    text = f"correlation with the other {channel} {min(abs(correlation(repeat.column.slow, family[0].column.slow)) for repeat in plain):.2f}"
 
     def proposal(
-        one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()
+        repeat: Repeat,
+        name: str,
+        *more: str,
+        question: str = "",
+        alternatives: tuple[str, ...] = (),
     ) -> Proposal:
+        evidence = (text, *more)
         return Proposal(
-            one.column.name, name, one.unit, one.sign, (text, *more), asked, others=others
+            repeat.column.name,
+            name,
+            repeat.unit,
+            repeat.sign,
+            evidence,
+            question,
+            alternatives=alternatives,
+            is_repeated=True,
         )
 
     reference = f"{channel}_ref"
-    if own and references:
-        own.sort(key=lambda one: -max(one.column.hints.values(), default=0.0))
-        asked = f"{len(own)} columns could be the car's own {channel}" if len(own) > 1 else ""
+    if of_car and references:
+        of_car.sort(key=lambda repeat: -max(repeat.column.hints.values(), default=0.0))
+        question = (
+            f"{len(of_car)} columns could be the car's own {channel}" if len(of_car) > 1 else ""
+        )
         first = proposal(
-            own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:])
+            of_car[0],
+            channel,
+            question=question,
+            alternatives=tuple(repeat.column.name for repeat in of_car[1:]),
         )
-        other = references[0].column
-        why = (
+        reference_column = references[0].column
+        reason = (
             "named as a reference"
-            if other.is_reference
-            else "the other one is of the car's own bus"
+            if reference_column.is_reference
+            else "the other one is from the car's bus"
         )
-        asked = (
+        question = (
             ""
-            if other.is_reference or channel in other.hints
-            else f"whether it is the reference's {channel}: no name says so"
+            if reference_column.is_reference or channel in reference_column.hints
+            else f"is it the reference's {channel}? Its name does not say so"
         )
-        return [first, proposal(references[0], reference, why, asked=asked)]
+        return [first, proposal(references[0], reference, reason, question=question)]
     if len(plain) < 2:
         return [
-            Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",))
-            for one in plain
+            Proposal(
+                repeat.column.name,
+                channel,
+                repeat.unit,
+                repeat.sign,
+                ("the other columns are filtered",),
+            )
+            for repeat in plain
         ]
-    asked = f"the car's {channel} or that of the reference sensor: the names do not decide"
+    question = (
+        f"which column is the car's own {channel}, and which the reference's? No name decides"
+    )
     roughness = {
-        id(one): float(np.std(np.diff(one.column.values, 2)))
-        / max(float(np.std(one.column.values)), 1e-12)
-        for one in plain
+        id(repeat): float(np.std(np.diff(repeat.column.values, 2)))
+        / max(float(np.std(repeat.column.values)), 1e-12)
+        for repeat in plain
     }
-    rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]
+    rough, smooth = sorted(plain, key=lambda repeat: roughness[id(repeat)], reverse=True)[:2]
     return [
-        proposal(rough, channel, "the noisier of the two", asked=asked, others=(reference,)),
-        proposal(smooth, reference, "the less noisy of the two", asked=asked, others=(channel,)),
+        proposal(
+            rough, channel, "the noisier of the two", question=question, alternatives=(reference,)
+        ),
+        proposal(
+            smooth, reference, "the smoother of the two", question=question, alternatives=(channel,)
+        ),
     ]

@@ -17,15 +17,15 @@ from vehest.constants import FloatArray
 
 USUAL_RADIUS = 0.31  # m, of cars
 NOMINAL_RADIUS = 0.3  # m, by which a speed at the rim is brought to rad/s and back
-RADII = (0.2, 0.55)
-SMALL_RADIUS = 0.02  # of models, which are not fast
-FASTEST_MODEL = 20.0
-FASTEST = 110.0  # m/s
-SLOWEST = 1.0
+RADIUS_RANGE = (0.2, 0.55)
+MIN_MODEL_RADIUS = 0.02  # of models, which are not fast
+MAX_MODEL_SPEED = 20.0
+MAX_SPEED = 110.0  # m/s
+MIN_TOP_SPEED = 1.0
 AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
-APART = 0.25
-SAME = (
+MIN_COST_MARGIN = 0.25
+SPEEDOMETER_GAIN_RANGE = (
     0.98,
     1.08,
 )  # a speedometer over the wheels' speed at the rim: none reads too little, many too much
@@ -35,17 +35,17 @@ Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its sp
 
 def find_wheels(columns: Sequence[Candidate]) -> Wheels:
     """Columns that are named for a wheel each; of several for one, the first."""
-    found: dict[str, Candidate] = {}
+    wheels: dict[str, Candidate] = {}
     for column in columns:
         for role in column.hints:
             if role.startswith("wheel_speed_") and column.unit in ("", *UNITS):
-                found.setdefault(role.removeprefix("wheel_speed_"), column)
-    return found
+                wheels.setdefault(role.removeprefix("wheel_speed_"), column)
+    return wheels
 
 
-def turning_left(wheels: Wheels, known: Motion) -> float:
+def turning_left(wheels: Wheels, motion: Motion) -> float:
     """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is missing."""
-    rate = slow_of(known["yaw_rate"], known.rate_hz)
+    rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     axles = [
         (wheels[left].slow, wheels[right].slow)
         for left, right in (("fl", "fr"), ("rl", "rr"))
@@ -63,19 +63,19 @@ def speed_of_wheels(
     mean = _mean(wheels)
     rate, ay = (_named(columns, channel) for channel in ("yaw_rate", "ay"))
     ranked = []
-    for unit, of_rate, of_ay in product(
+    for unit, rate_unit, ay_unit in product(
         _units(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]
     ):
         implausible = False
         scale = None
         if rate:
-            turning = rate.slow * si_factor(of_rate, "yaw_rate")
+            turning = rate.slow * si_factor(rate_unit, "yaw_rate")
             implausible = not RANGES["yaw_rate"][0] <= largest(turning) <= RANGES["yaw_rate"][1]
         if rate and ay:
-            every = max(round(len(mean) / max(len(rate.slow), 1)), 1)
-            size = float(np.std(mean[::every][: len(turning)] * turning))
+            step = max(round(len(mean) / max(len(rate.slow), 1)), 1)
+            size = float(np.std(mean[::step][: len(turning)] * turning))
             scale = (
-                float(np.std(ay.slow)) * si_factor(of_ay, "ay") / size if size > 0.0 else math.nan
+                float(np.std(ay.slow)) * si_factor(ay_unit, "ay") / size if size > 0.0 else math.nan
             )
         cost, radius = _cost(unit, scale, mean)
         ranked.append((cost + 3.0 * implausible, unit, radius))
@@ -85,71 +85,78 @@ def speed_of_wheels(
     )
     return [
         Candidate(
-            "mean of the wheels", "m/s", speed, slow_of(speed, rate_hz), {"vx": WEAK}, is_made=True
+            "mean of the wheels",
+            "m/s",
+            speed,
+            slow_of(speed, rate_hz),
+            {"vx": WEAK},
+            is_wheel_mean=True,
         )
     ]
 
 
 def wheel_proposals(
-    wheels: Wheels, known: Motion | None, *, has_speed: bool, is_made: bool
+    wheels: Wheels, motion: Motion | None, *, has_speed: bool, is_wheel_mean: bool
 ) -> tuple[list[Proposal], float | None]:
     """A channel each, and the rolling radius by which they make the speed, if it has no column; of it, the motion's may be made."""
     mean = _mean(wheels)
     units = _units(wheels)
-    evidence = ["its name"]
+    evidence = ["name"]
     radius = NOMINAL_RADIUS
-    if known is None:
-        unit, asked = (
-            ("rad/s", "nothing to compare the wheels with") if len(units) > 1 else (units[0], "")
+    if motion is None:
+        unit, question = (
+            ("rad/s", "unit: there is no speed to compare it with")
+            if len(units) > 1
+            else (units[0], "")
         )
     else:
-        scale = rms(known.vx) / (rms(mean) or 1.0)
+        scale = rms(motion.vx) / (rms(mean) or 1.0)
         ranked = sorted((*_cost(unit, scale, mean), unit) for unit in units)
         cost, radius, unit = ranked[0]
-        asked = (
-            f"could be in {ranked[1][2]} as well"
-            if len(ranked) > 1 and ranked[1][0] - cost < APART
+        question = (
+            f"unit: {ranked[1][2]} fits equally well"
+            if len(ranked) > 1 and ranked[1][0] - cost < MIN_COST_MARGIN
             else ""
         )
-        if unit in AT_RIM and not is_made:
+        if unit in AT_RIM and not is_wheel_mean:
             radius = NOMINAL_RADIUS * scale / si_factor(unit, "vx")
-        by = "ay over the yaw rate" if is_made else "the speed"
+        source = "ay/yaw_rate" if is_wheel_mean else "the speed"
         evidence += [
-            f"{unit} at the rim by {by}"
+            f"circumferential speed in {unit}, compared with {source}"
             if unit in AT_RIM
-            else f"a radius of {radius:.3g} m by {by} in {unit}"
+            else f"in {unit} with a radius of {radius:.3g} m, compared with {source}"
         ]
     factor = 1.0
     if unit in AT_RIM:
         factor = float(f"{si_factor(unit, 'vx') / NOMINAL_RADIUS:.7g}")
         unit = "rad/s"
-    others = UNITS if asked else ()
-    found = [
+    alternatives = UNITS if question else ()
+    proposals = [
         Proposal(
             column.name,
             f"wheel_speed_{corner}",
             unit,
             1,
             tuple(evidence),
-            asked,
+            question,
             factor=factor,
-            others=others,
+            alternatives=alternatives,
         )
         for corner, column in sorted(wheels.items())
     ]
-    return found, None if has_speed else float(f"{radius:.3g}")
+    return proposals, None if has_speed else float(f"{radius:.3g}")
 
 
 def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -> float | None:
     """Speed of the wheels at the rim over a speed [m/s]; None where they are in no unit of a speed at the rim."""
-    found = [
-        (one.slow, proposals.by_channel.get(f"wheel_speed_{corner}"))
-        for corner, one in wheels.items()
+    pairs = [
+        (wheel.slow, proposals.by_channel.get(f"wheel_speed_{corner}"))
+        for corner, wheel in wheels.items()
     ]
     at_rim = [
-        slow * NOMINAL_RADIUS * own.factor
-        for slow, own in found
-        if own is not None and own.factor != 1.0
+        slow * NOMINAL_RADIUS * proposal.factor
+        for slow, proposal in pairs
+        if proposal is not None and proposal.factor != 1.0
     ]
     return rms(np.mean(at_rim, axis=0)) / rms(speed) if at_rim else None
 
@@ -167,7 +174,7 @@ def _units(wheels: Wheels) -> Sequence[str]:
 
 def _named(columns: Sequence[Candidate], channel: str) -> Candidate | None:
     named = [column for column in columns if channel in column.hints and column.measures(channel)]
-    return max(named, key=lambda one: one.hints[channel], default=None)
+    return max(named, key=lambda column: column.hints[channel], default=None)
 
 
 def _cost(unit: str, scale: float | None, mean: FloatArray) -> tuple[float, float]:
@@ -176,14 +183,17 @@ def _cost(unit: str, scale: float | None, mean: FloatArray) -> tuple[float, floa
     if unit in AT_RIM:
         factor = si_factor(unit, "vx")
         mismatch = 0.5 if scale is None else abs(math.log(scale / factor))
-        if scale is not None and SAME[0] < scale / factor < SAME[1]:
+        if (
+            scale is not None
+            and SPEEDOMETER_GAIN_RANGE[0] < scale / factor < SPEEDOMETER_GAIN_RANGE[1]
+        ):
             mismatch = 0.0
-        return mismatch + 3.0 * (not SLOWEST <= top * factor <= FASTEST), NOMINAL_RADIUS
+        return mismatch + 3.0 * (not MIN_TOP_SPEED <= top * factor <= MAX_SPEED), NOMINAL_RADIUS
     factor = si_factor(unit, "wheel_speed_fl")
     radius = USUAL_RADIUS if scale is None else scale / factor
     if not math.isfinite(radius) or radius <= 0.0:
         return 10.0, USUAL_RADIUS
     speed = top * factor * radius
-    low, high = RADII if speed > FASTEST_MODEL else (SMALL_RADIUS, RADII[1])
-    odd = 3.0 * (not low <= radius <= high) + 3.0 * (not SLOWEST <= speed <= FASTEST)
+    low, high = RADIUS_RANGE if speed > MAX_MODEL_SPEED else (MIN_MODEL_RADIUS, RADIUS_RANGE[1])
+    odd = 3.0 * (not low <= radius <= high) + 3.0 * (not MIN_TOP_SPEED <= speed <= MAX_SPEED)
     return 0.15 * abs(math.log(radius / USUAL_RADIUS)) + odd, radius

@@ -20,13 +20,14 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
 from vehest.data.derived import speed_of_reference
-from vehest.data.errors import ConfigurationError, DataError, VehestError, counted
+from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
 from vehest.data.transforms import MOST_BRIDGED
 from vehest.data.units import factor_to_si
-from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, TABLES, Examined, rate_of
+from vehest.run.own_car.inspect import EVIDENCE_HZ, MAX_BRIDGED_SECONDS, TABLES, Examined, rate_of
+from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
 from vehest.sources.surveys import Log, RawColumn
@@ -39,8 +40,8 @@ POLICIES = {
 }
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
-LEAST_GAP = 0.05  # s
-GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
+MIN_GAP_SECONDS = 0.05  # s
+GAPS = "it has missing samples, which are interpolated, or cut out beyond one second, only in a table with a time column"
 CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
 CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
@@ -48,11 +49,11 @@ POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
-GAIN_APART = (
+MIN_GAIN_FACTOR = (
     1.15  # factor between the gains of two files, of which each half is beyond the other file's
 )
-LEAST_TURN = 0.05
-TURNING_SECONDS = 5.0  # rad/s, and how long a half of a file turns as fast [s]
+MIN_TURN_RATE = 0.05
+MIN_TURNING_SECONDS = 5.0  # rad/s, and how long a half of a file turns as fast [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,22 +83,28 @@ class Draft:
 
 
 def draft(examined: Examined) -> Draft:
-    """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
-    whole = [
-        one
-        for one in examined.proposals.channels
-        if not any(_has_gaps(examined, own, one.column) for own in examined.logs)
+    """Make a data set of the proposals, and read it as an ingest does.
+
+    Raises
+    ------
+    VehestError
+        It cannot be read.
+    """
+    complete = [
+        proposal
+        for proposal in examined.proposals.channels
+        if not any(_has_gaps(examined, recording, proposal.column) for recording in examined.logs)
     ]
-    gaps = [
-        f"'{one.column}' ({one.channel}) is left out: {GAPS}"
-        for one in examined.proposals.channels
-        if one not in whole
+    left_out = [
+        f"'{proposal.column}' ({proposal.channel}) is left out: {GAPS}"
+        for proposal in examined.proposals.channels
+        if proposal not in complete
     ]
-    examined = replace(examined, proposals=examined.proposals.keeping(whole, gaps))
+    examined = replace(examined, proposals=examined.proposals.keeping(complete, left_out))
     proposals = examined.proposals
     vehicle = examined.vehicle
     if not proposals.channels:
-        raise ConfigurationError("no column is left that would be a channel")
+        raise ConfigurationError("no column with complete samples remains for a channel")
     dataset = _dataset(examined)
     speed = (
         [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}]
@@ -110,22 +117,22 @@ def draft(examined: Examined) -> Draft:
     if bridging:
         recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
         notes.append(
-            "a few samples beyond what a vehicle can do are bridged by lines (bridge_impossible)"
+            "a few samples outside the possible range are interpolated (bridge_impossible)"
         )
-    longest = max(recordings, key=lambda own: own.duration)
+    longest = max(recordings, key=lambda recording: recording.duration)
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"written twice, names repeated, or {BRIDGED:g} s and more without a sample"
+        causes = f"duplicates, repeated names, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
         notes.append(
-            f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}"
+            f"data rows of '{stem}' left out by drop_rows ({causes}): {counted([str(row) for row in rows])}"
         )
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
-            found = align(
+            estimate = align(
                 longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"])
             )["steering_ratio"]
-            ratio = (found.value, found.uncertainty)
+            ratio = (estimate.value, estimate.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
     notes += _cuts(dataset, recordings)
@@ -134,33 +141,35 @@ def draft(examined: Examined) -> Draft:
     )
     if ratio and used_ratio is None:
         notes.append(
-            f"'steer' is left out: the steering ratio by slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
-            f"less certain than {MAX_RATIO_UNCERTAINTY:.0%}; --steering-ratio with your car's adds it"
+            f"'steer' is left out: the steering ratio estimated from slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
+            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by --steering-ratio to add it"
         )
     crawl_speed = max(map(_crawl_speed, recordings))
     if crawl_speed:
         notes.append(
-            f"sideslip has no meaning below {crawl_speed:g} m/s, where it is beyond "
-            f"{np.degrees(MAX_CRAWL_SIDESLIP):.0f}°, and is taken as 0 there"
+            f"the sideslip angle is set to 0 below {crawl_speed:g} m/s, where it exceeds "
+            f"{np.degrees(MAX_CRAWL_SIDESLIP):.0f}° and has no meaning"
         )
-    made = _transforms(examined, longest, late, speed, used_ratio, crawl_speed)
-    dataset |= {"transforms": [*bridging, *made]}
+    transforms = _transforms(examined, longest, late, speed, used_ratio, crawl_speed)
+    dataset |= {"transforms": [*bridging, *transforms]}
     recordings = _recordings(dataset)
     channels = tuple(
-        replace(one, delay=late[one.channel].delay).with_evidence(late[one.channel].evidence)
-        if one.channel in late
-        else one
-        for one in proposals.channels
+        replace(proposal, delay=late[proposal.channel].delay).with_evidence(
+            late[proposal.channel].evidence
+        )
+        if proposal.channel in late
+        else proposal
+        for proposal in proposals.channels
     )
     return Draft(
         replace(examined, proposals=replace(proposals, channels=channels)),
         dataset,
         late,
-        [summary_of(own) for own in recordings],
+        [summary_of(recording) for recording in recordings],
         _remarks(longest, recordings),
         ratio,
         notes,
-        {own.id: own.duration for own in recordings},
+        {recording.id: recording.duration for recording in recordings},
     )
 
 
@@ -168,13 +177,15 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
     """The data set with the strictest clock that all files keep and that has a plain rate, as a downsampling needs; its recordings."""
     for policy in POLICIES.get(dataset["source"], ()):
         with suppress(DataError):
-            own = dataset | {"clock": policy}
-            recordings = _recordings(own)
+            with_clock = dataset | {"clock": policy}
+            recordings = _recordings(with_clock)
             if all(
-                math.isclose(one.rate_hz, plain_rate(one.rate_hz, INTERPOLATED_TOLERANCE))
-                for one in recordings
+                math.isclose(
+                    recording.rate_hz, plain_rate(recording.rate_hz, INTERPOLATED_TOLERANCE)
+                )
+                for recording in recordings
             ):
-                return own, recordings
+                return with_clock, recordings
     return dataset, _recordings(dataset)
 
 
@@ -197,8 +208,8 @@ def _crawl_speed(recording: Recording) -> float:
 def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
     """Notes of files that are cut into several recordings, and why."""
     pause = dataset.get("max_gap")
-    causes = [f"pauses for more than {pause:g} s"] if pause else []
-    causes += ["has times that go back"] if dataset.get("time_restarts") else []
+    causes = [f"pauses of more than {pause:g} s"] if pause else []
+    causes += ["times that go back"] if dataset.get("time_restarts") else []
     if not causes:
         return
     durations: dict[str, list[float]] = {}
@@ -207,66 +218,78 @@ def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterat
     for file, seconds in durations.items():
         if len(seconds) > 1:
             yield (
-                f"'{file}' {' and '.join(causes)} and makes {len(seconds)} recordings; "
-                f"a command on one recording takes the longest, {max(seconds):.0f} of {sum(seconds):.0f} s"
+                f"'{file}' is split into {len(seconds)} recordings at {' and '.join(causes)}; "
+                f"a command on a single recording uses the longest, {max(seconds):.0f} of {sum(seconds):.0f} s"
             )
 
 
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
     """Findings of the longest recording, and contradictions in the longest one of each other file."""
-    found = [("", one) for one in checks_of_recording(longest) if one.check in REMARKS]
+    findings = [
+        ("", finding) for finding in checks_of_recording(longest) if finding.check in REMARKS
+    ]
     by_file = {
-        own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)
+        recording.provenance.get("file"): recording
+        for recording in sorted(recordings, key=lambda recording: recording.duration)
     }
     by_file.pop(longest.provenance.get("file"), None)
     unlike = []
     gains = _gains(longest)
-    for own in by_file.values():
-        found += [
-            (f"in '{own.id}', ", one)
-            for one in checks_of_recording(own)
-            if one.check in CONTRADICTIONS
+    for recording in by_file.values():
+        findings += [
+            (f"in '{recording.id}', ", finding)
+            for finding in checks_of_recording(recording)
+            if finding.check in CONTRADICTIONS
         ]
-        for name, (low, high) in _gains(own).items():
-            least, most = gains.get(name, (low, high))
-            if low > GAIN_APART * most or least > GAIN_APART * high:
-                what = f"{math.sqrt(low * high / (least * most)):.2g} times as large in the same turn as in '{longest.id}'"
+        for name, (low, high) in _gains(recording).items():
+            low_of_longest, high_of_longest = gains.get(name, (low, high))
+            if low > MIN_GAIN_FACTOR * high_of_longest or low_of_longest > MIN_GAIN_FACTOR * high:
+                factor = math.sqrt(low * high / (low_of_longest * high_of_longest))
                 unlike.append(
-                    f"{name}: in '{own.id}', {what}; is it of another car? Then make a data set of each"
+                    f"{name}: in '{recording.id}' its gain in turns is {factor:.2g} times that in '{longest.id}'; "
+                    "if it is another car, create a data set for each"
                 )
     worded = [
-        f"{one.channel}: {where}{one.message}" if one.channel else where + one.message
-        for where, one in found
-        if one.level != "note"
+        f"{finding.channel}: {place}{finding.message}"
+        if finding.channel
+        else place + finding.message
+        for place, finding in findings
+        if finding.level != "note"
     ]
     return worded + unlike
 
 
 def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
     """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over yaw_rate/vx beside understeer."""
-    found: dict[str, list[float]] = {}
+    gains: dict[str, list[float]] = {}
     if not {"vx", "yaw_rate"} <= set(recording.channels):
         return {}
     for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
         speed = recording["vx"][half]
         rate = recording["yaw_rate"][half]
-        used = (
+        is_turning = (
             (speed > 0.2 * float(np.quantile(speed, 0.99)))
-            & (np.abs(rate) > LEAST_TURN)
+            & (np.abs(rate) > MIN_TURN_RATE)
             & (speed > 0.0)
         )
-        if np.count_nonzero(used) < TURNING_SECONDS * recording.rate_hz:
+        if np.count_nonzero(is_turning) < MIN_TURNING_SECONDS * recording.rate_hz:
             return {}
-        speed = speed[used]
-        rate = rate[used]
+        speed = speed[is_turning]
+        rate = rate[is_turning]
         turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)
         if "ay" in recording:
-            found.setdefault("ay", []).append(rms(recording["ay"][half][used]) / rms(turn[:, 1]))
-        for name in {"handwheel", "steer"} & set(recording.channels):
-            found.setdefault(name, []).append(
-                abs(float(np.linalg.lstsq(turn, recording[name][half][used], rcond=None)[0][0]))
+            gains.setdefault("ay", []).append(
+                rms(recording["ay"][half][is_turning]) / rms(turn[:, 1])
             )
-    return {name: (min(own), max(own)) for name, own in found.items() if min(own) > 0.0}
+        for name in {"handwheel", "steer"} & set(recording.channels):
+            gains.setdefault(name, []).append(
+                abs(
+                    float(
+                        np.linalg.lstsq(turn, recording[name][half][is_turning], rcond=None)[0][0]
+                    )
+                )
+            )
+    return {name: (min(halves), max(halves)) for name, halves in gains.items() if min(halves) > 0.0}
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
@@ -276,7 +299,7 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset: dict[str, Any] = {
         "name": name,
         "title": f"Recordings of {name}",
-        "kind": "real",
+        "kind": examined.kind,
         "vehicle": UNNAMED_VEHICLE,
     }
     if car := {key: value for key, value in examined.vehicle.items() if value is not None}:
@@ -298,12 +321,15 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset["clock"] = "strict"
     if log.source in TABLES:
         gaps = {
-            own.file.stem: np.array(
-                [_gaps(examined, own, one.column) for one in proposals.channels]
+            surveyed.file.stem: np.array(
+                [_gaps(examined, surveyed, proposal.column) for proposal in proposals.channels]
             )
-            for own in examined.logs
+            for surveyed in examined.logs
         }
-        short = max(float(own[own <= BRIDGED].max(initial=0.0)) for own in gaps.values())
+        short = max(
+            float(surveyed[surveyed <= MAX_BRIDGED_SECONDS].max(initial=0.0))
+            for surveyed in gaps.values()
+        )
         dataset |= (
             {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0}
             if short
@@ -311,19 +337,21 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         )
         if log.clock is not None:
             holes = {
-                own.file.stem: [
-                    f"{own.file_row(first)}-{own.file_row(last - 1)}"
-                    for first, last in true_runs(gaps[own.file.stem].max(axis=0) > BRIDGED)
+                surveyed.file.stem: [
+                    f"{surveyed.file_row(first)}-{surveyed.file_row(last - 1)}"
+                    for first, last in true_runs(
+                        gaps[surveyed.file.stem].max(axis=0) > MAX_BRIDGED_SECONDS
+                    )
                 ]
-                for own in examined.logs
+                for surveyed in examined.logs
             }
             dropped = {
-                own.file.stem: [
-                    *own.repeated_names,
-                    *holes[own.file.stem],
-                    *map(own.file_row, _rows_written_twice(own)),
+                surveyed.file.stem: [
+                    *surveyed.repeated_names,
+                    *holes[surveyed.file.stem],
+                    *map(surveyed.file_row, _rows_written_twice(surveyed)),
                 ]
-                for own in examined.logs
+                for surveyed in examined.logs
             }
             dataset |= (
                 {"drop_rows": named}
@@ -332,10 +360,12 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             )
             if any(holes.values()) and "runs" not in log.options:
                 dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
-    units = {name: own.unit if log.source == "vbo" else "" for name, own in columns.items()}
+    units = {
+        name: surveyed.unit if log.source == "vbo" else "" for name, surveyed in columns.items()
+    }
     dataset["channels"] = {
-        one.channel: _entry(one, columns[one.column].place, units[one.column])
-        for one in proposals.channels
+        proposal.channel: _entry(proposal, columns[proposal.column].place, units[proposal.column])
+        for proposal in proposals.channels
     }
     if proposals.pose:
         rate = (
@@ -344,7 +374,7 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             else float(examined.rate_hz or EVIDENCE_HZ)
         )
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
-        made = [
+        derived = [
             name
             for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
             if name not in dataset["channels"]
@@ -353,19 +383,22 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             **parts,
             "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5),
             "order": 2,
-            "channels": made,
+            "channels": derived,
         }
     return dataset
 
 
-def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
+def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
     """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
-    unit = one.unit
-    factor = one.factor
-    si = CHANNELS[one.channel].unit
-    if factor == 1.0 and (own := plain_unit(header)) and own != unit:
-        unit, factor = own, float(f"{factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
-    sign = {"sign": one.sign} if one.sign != 1 else {}
+    unit = proposal.unit
+    factor = proposal.factor
+    si = CHANNELS[proposal.channel].unit
+    if factor == 1.0 and (header_unit := plain_unit(header)) and header_unit != unit:
+        unit, factor = (
+            header_unit,
+            float(f"{factor_to_si(unit, si) / factor_to_si(header_unit, si):.7g}"),
+        )
+    sign = {"sign": proposal.sign} if proposal.sign != 1 else {}
     return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 
 
@@ -382,50 +415,58 @@ def _rows_written_twice(log: Log) -> list[int]:
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
     """Whether a column lacks samples that neither lines bridge nor pauses cut out; a recording with such gaps cannot be resampled."""
-    own = next(own for own in log.columns if own.name == column)
-    known = np.flatnonzero(np.isfinite(own.values))
+    signal = next(signal for signal in log.columns if signal.name == column)
+    measured_rows = np.flatnonzero(np.isfinite(signal.values))
     if log.source in TABLES:
-        return not len(known) or (
-            log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED)
+        return not len(measured_rows) or (
+            log.clock is None and bool(_gaps(examined, log, column).max() > MAX_BRIDGED_SECONDS)
         )
-    if log.source != "rosbag" or own.stamps is None or not len(known):
-        return not len(known) or (log.source != "mdf" and len(known) < len(own.values))
-    measured = own.stamps[known]
-    ends = own.stamps[[0, -1]] == measured[[0, -1]]
-    return not ends.all() or bool((np.diff(measured)[np.diff(known) > 1] > BRIDGED).any())
+    if log.source != "rosbag" or signal.stamps is None or not len(measured_rows):
+        return not len(measured_rows) or (
+            log.source != "mdf" and len(measured_rows) < len(signal.values)
+        )
+    measured = signal.stamps[measured_rows]
+    ends = signal.stamps[[0, -1]] == measured[[0, -1]]
+    return not ends.all() or bool(
+        (np.diff(measured)[np.diff(measured_rows) > 1] > MAX_BRIDGED_SECONDS).any()
+    )
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without any, 0 in a row with one."""
-    values = next(own.values for own in log.columns if own.name == column)
+    values = next(signal.values for signal in log.columns if signal.name == column)
     seconds = (
         log.seconds
         if log.seconds is not None
         else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
     )
-    found = np.zeros(len(values))
+    gap_seconds = np.zeros(len(values))
     for run in log.runs:
         times = seconds[run]
-        known = np.isfinite(values[run])
-        edges = np.concatenate([times[:1], times[known], times[-1:]])
-        lengths = np.diff(edges) if known.any() else np.array([math.inf])
-        found[run] = np.where(
-            known, 0.0, lengths[np.clip(np.searchsorted(edges, times) - 1, 0, len(lengths) - 1)]
+        is_measured = np.isfinite(values[run])
+        edges = np.concatenate([times[:1], times[is_measured], times[-1:]])
+        lengths = np.diff(edges) if is_measured.any() else np.array([math.inf])
+        gap_seconds[run] = np.where(
+            is_measured,
+            0.0,
+            lengths[np.clip(np.searchsorted(edges, times) - 1, 0, len(lengths) - 1)],
         )
-    return found
+    return gap_seconds
 
 
 def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
     channels = {}
     rates = []
     paused = False
-    for one in proposals:
-        rate, gap = _rate_and_gap(columns[one.column], BRIDGED)
+    for proposal in proposals:
+        rate, gap = _rate_and_gap(columns[proposal.column], MAX_BRIDGED_SECONDS)
         rates.append(rate)
-        paused |= gap < _rate_and_gap(columns[one.column])[1]
-        channels[one.channel] = _entry(one, columns[one.column].place, columns[one.column].unit)
+        paused |= gap < _rate_and_gap(columns[proposal.column])[1]
+        channels[proposal.channel] = _entry(
+            proposal, columns[proposal.column].place, columns[proposal.column].unit
+        )
         if 3.0 / rate < gap:
-            channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
+            channels[proposal.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
     return {
         "rate_hz": plain_rate(max(rates), INTERPOLATED_TOLERANCE),
@@ -438,22 +479,23 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     topics: dict[str, dict[str, Any]] = {}
     channels: dict[str, dict[str, Any]] = {}
     rates = []
-    for one in proposals:
-        place = columns[one.column].place
+    for proposal in proposals:
+        place = columns[proposal.column].place
         short = str(place["topic"]).strip("/").replace("/", "_")
-        rate, gap = _rate_and_gap(columns[one.column])
+        rate, gap = _rate_and_gap(columns[proposal.column])
         rates.append(rate)
         topic = topics.setdefault(
-            short, {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": LEAST_GAP}
+            short,
+            {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": MIN_GAP_SECONDS},
         )
         topic["max_gap"] = max(topic["max_gap"], math.ceil(150.0 * gap) / 100.0)
-        stamps = columns[one.column].stamps
+        stamps = columns[proposal.column].stamps
         if stamps is not None and (np.diff(stamps) == 0.0).any():  # delivered in batches
             mean_rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
             topic |= {"clock": "uniform", "rate_hz": plain_rate(mean_rate, INTERPOLATED_TOLERANCE)}
-        entry = _entry(one, {"topic": short, "field": place["field"]})
-        channels[one.channel] = entry | (
-            {"offset": float(f"{one.offset:.5g}")} if one.offset else {}
+        entry = _entry(proposal, {"topic": short, "field": place["field"]})
+        channels[proposal.channel] = entry | (
+            {"offset": float(f"{proposal.offset:.5g}")} if proposal.offset else {}
         )
     return {
         "rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE),
@@ -473,18 +515,20 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
     channels = [
-        (CHANNELS[name], samples) for own in recordings for name, samples in own.channels.items()
+        (CHANNELS[name], samples)
+        for recording in recordings
+        for name, samples in recording.channels.items()
     ]
     if not any(
-        0.0 < ((samples < own.low) | (samples > own.high)).mean() <= MOST_BRIDGED
-        for own, samples in channels
+        0.0 < ((samples < limits.low) | (samples > limits.high)).mean() <= MOST_BRIDGED
+        for limits, samples in channels
     ):
         return []
-    used = {one.column for one in examined.proposals.channels}
+    assigned = {proposal.column for proposal in examined.proposals.channels}
     rates = [
-        rate_of(own.stamps)
-        for own in examined.log.columns
-        if own.stamps is not None and own.name in used
+        rate_of(column.stamps)
+        for column in examined.log.columns
+        if column.stamps is not None and column.name in assigned
     ]
     return [
         {
@@ -506,19 +550,19 @@ def _transforms(
 
     A reference that is late is put on the others' clock; a measured channel is not, since an estimator in the car would get it late, too.
     """
-    references = {name: own.delay for name, own in late.items() if CHANNELS[name].is_reference}
-    made: list[dict[str, Any]] = [
-        {"name": "delay_correction", "delay": own, "channels": [name]}
-        for name, own in references.items()
+    references = {name: delay.delay for name, delay in late.items() if CHANNELS[name].is_reference}
+    transforms: list[dict[str, Any]] = [
+        {"name": "delay_correction", "delay": delay, "channels": [name]}
+        for name, delay in references.items()
     ]
     offsets = {
-        one.channel: float(f"{one.factor * one.sign * one.offset:.5g}")
-        for one in examined.proposals.channels
-        if one.offset
+        proposal.channel: float(f"{proposal.factor * proposal.sign * proposal.offset:.5g}")
+        for proposal in examined.proposals.channels
+        if proposal.offset
     }
     if offsets and examined.log.source != "rosbag":  # whose channels have an offset of their own
-        made.append({"name": "offset_correction", "offsets": offsets})
-    made += speed
+        transforms.append({"name": "offset_correction", "offsets": offsets})
+    transforms += speed
     for name in ("vy_ref", "ax"):
         supply = (
             derivation_of(name, longest.channels, (), longest.rate_hz)
@@ -526,10 +570,10 @@ def _transforms(
             else None
         )
         if supply is not None and not supply.meanings:  # no value is unknown
-            made += map(dict, supply.transforms)
-    for entry in made:
+            transforms += map(dict, supply.transforms)
+    for entry in transforms:
         if entry["name"] == "velocity_from_sideslip" and crawl_speed:
             entry["min_speed"] = crawl_speed
     if "handwheel" in longest and "steer" not in longest and ratio:
-        made.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
-    return made
+        transforms.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
+    return transforms

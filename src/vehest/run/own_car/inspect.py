@@ -21,9 +21,11 @@ from vehest.alignment.proposals.proposal import Proposals
 from vehest.configuration.composition import compose_config
 from vehest.configuration.files import choices
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError, counted
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit, limits_from_config, use_limits
+from vehest.data.recording import Kind
 from vehest.data.splits import check_name
+from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate
 from vehest.sources.surveys import Log, survey
@@ -31,13 +33,15 @@ from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.unit_spellings import plain_unit
 
 EVIDENCE_HZ = 50.0
-LONGEST_EVIDENCE = 1200.0  # s
-ENDS = 1.0  # s at either end of a longer drive that do not count
-BRIDGED = 1.0  # s without a sample that straight lines bridge
-MOST_LISTED = 5
-MOST_COMPARED = 4_000
-USUAL = 0.99
-EXACT = 0.999  # rows, share of them, and correlation of a column with another's difference
+MAX_EVIDENCE_SECONDS = 1200.0  # s
+END_SECONDS = 1.0  # s at either end of a longer drive that do not count
+MAX_BRIDGED_SECONDS = 1.0  # s without a sample that straight lines bridge
+MAX_LISTED = 5
+MAX_COMPARED_ROWS = 4_000
+USUAL_STEP_QUANTILE = 0.99
+MIN_DIFFERENCE_CORRELATION = (
+    0.999  # rows, share of them, and correlation of a column with another's difference
+)
 TABLES = ("tabular", "text_log")
 LAYOUT = {
     "delimiter": ",",
@@ -49,9 +53,9 @@ LAYOUT = {
 }
 """Options of a table's layout with their defaults."""
 VEHICLE = {
-    "wheelbase": "wheelbase [m], if you know it (for the filter without a reference, the steering ratio, and baselines of the data sheet)",
-    "mass": "mass [kg], if you know it (with the wheelbase, for single-track filters)",
-    "steering_ratio": "overall steering ratio, if you know it (estimated from slow corners if the wheelbase is known)",
+    "wheelbase": "wheelbase [m], if known (for the self-calibrating filter, the steering ratio and the data_sheet baseline)",
+    "mass": "mass [kg], if known (with the wheelbase, for single-track filters)",
+    "steering_ratio": "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)",
 }
 """Values of the car that no log holds, as questions."""
 
@@ -67,6 +71,7 @@ class Examined:
     place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
     rate_hz: float | None  # sampling rate of logs without times; else None
     vehicle: Mapping[str, float | None]  # values of `VEHICLE`, None where unknown
+    kind: Kind = "real"  # whether a real car or a simulation wrote the logs
 
     @property
     def log(self) -> Log:
@@ -75,11 +80,15 @@ class Examined:
 
     def in_words(self) -> list[str]:
         """Files and proposals for a terminal, a line each."""
-        found = self.proposals
+        proposals = self.proposals
         lines = [f"read {file}" for file in self.files]
-        lines += [f"{'?' if one.asked else ' '} {one.in_words}" for one in found.channels]
-        lines += [f"  left and right: {found.left_right}"] if found.left_right else []
-        return lines + ([f"  no channel: {counted(list(found.unused))}"] if found.unused else [])
+        lines += [
+            f"{'?' if proposal.question else ' '} {proposal.describe()}"
+            for proposal in proposals.channels
+        ]
+        lines += [f"  left/right: {proposals.left_right}"] if proposals.left_right else []
+        unused = [f"  columns without a channel: {counted(list(proposals.unused))}"]
+        return lines + (unused if proposals.unused else [])
 
 
 def inspect(
@@ -89,18 +98,36 @@ def inspect(
     *,
     force: bool = False,
 ) -> Examined:
-    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column.
+    """Read logs and propose a channel, unit and sign for each column.
 
-    Raises `ConfigurationError` for a taken name or several formats or folders, `MissingError` without a file, `DataError` for a bad one.
+    Parameters
+    ----------
+    name : str
+        Of the data set.
+    files : sequence of Path
+        Of one format, with the same columns.
+    vehicle : mapping of str to float or None, optional
+        Values of `VEHICLE`.
+    force : bool
+        Whether the files of the data set may exist.
+
+    Raises
+    ------
+    ConfigurationError
+        The name is taken, or the files are of several formats or folders.
+    MissingError
+        A file does not exist.
+    DataError
+        A file cannot be read.
     """
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
         raise ConfigurationError(
-            f"'{existing[0]}' is there already; take another name, or --force to write it anew"
+            f"'{existing[0]}' exists already; use another name, or --force to overwrite it"
         )
     if name in source_names():
-        raise ConfigurationError(f"'{name}' is a source that comes with vehest; take another name")
+        raise ConfigurationError(f"'{name}' is a built-in source; use another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         logs = [survey(file) for file in files]
     longest = _longest(logs)
@@ -111,50 +138,57 @@ def inspect(
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
     for log in others:
-        held = {column.name: column for column in log.columns}
-        lacking = [one for one in proposals.channels if one.column not in held]
-        notes = [
-            f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it"
-            for one in lacking
+        columns_of_log = {column.name: column for column in log.columns}
+        missing = [
+            proposal for proposal in proposals.channels if proposal.column not in columns_of_log
         ]
-        kept = [one for one in proposals.channels if one not in lacking]
-        if lacking and not kept:
+        notes = [
+            f"'{proposal.column}' ({proposal.channel}) is left out: it is missing or empty in '{log.file}'"
+            for proposal in missing
+        ]
+        remaining = [proposal for proposal in proposals.channels if proposal not in missing]
+        if missing and not remaining:
             raise DataError(
-                f"'{log.file}' has none of the columns that are channels in '{longest.file}'; give files of the same columns"
+                f"'{log.file}' has none of the columns that are channels in '{longest.file}'; use files with the same columns"
             )
-        proposals = proposals.keeping(kept, notes)
-        for own in longest.columns:
-            if own.name in {one.column for one in kept} and held[own.name].unit != own.unit:
-                what = (
-                    f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"
-                )
+        proposals = proposals.keeping(remaining, notes)
+        for column in longest.columns:
+            if (
+                column.name in {proposal.column for proposal in remaining}
+                and columns_of_log[column.name].unit != column.unit
+            ):
+                difference = f"has '{column.name}' in '{columns_of_log[column.name].unit}', '{longest.file}' in '{column.unit}'"
                 raise DataError(
-                    f"'{log.file}' {what}; write both alike, or make a data set of each"
+                    f"'{log.file}' {difference}; use the same unit in both, or create a data set for each"
                 )
-        proposals = possible(proposals, {name: column.values for name, column in held.items()})
+        proposals = possible(
+            proposals, {name: column.values for name, column in columns_of_log.items()}
+        )
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(
             f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}; "
-            "needed are speed, yaw rate and lateral acceleration: name their columns so, with units"
+            "name the columns of speed, yaw rate and lateral acceleration accordingly, with units"
         )
     computed = [
-        f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement"
-        for own, of in differences.items()
+        f"'{column}' is left out: it is the difference of '{of}' from row to row, not a measurement"
+        for column, of in differences.items()
     ]
-    used = {one.column: one.unit for one in proposals.channels}
+    assigned_units = {proposal.column: proposal.unit for proposal in proposals.channels}
     foreign = [
-        own
-        for own in longest.columns
-        if own.name in used and own.unit.strip("-[]() 1") and plain_unit(own.unit) is None
+        column
+        for column in longest.columns
+        if column.name in assigned_units
+        and column.unit.strip("-[]() 1")
+        and plain_unit(column.unit) is None
     ]
     computed += [
-        f"'{own.unit}' of '{own.name}' is no unit that vehest knows; by size and motion it is {used[own.name]}"
-        for own in foreign
+        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and motion it is {assigned_units[column.name]}"
+        for column in foreign
     ]
     shadowed = (
-        [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"]
+        [f"'{name}' is also a built-in data set; in this folder the name refers to yours"]
         if name in choices("dataset")
         else []
     )
@@ -206,23 +240,23 @@ def _longest(logs: Sequence[Log]) -> Log:
     }
     if len(formats) > 1:
         raise ConfigurationError(
-            f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each"
+            f"the files are of several formats ({', '.join(sorted(formats))}); create a data set for each"
         )
     longest = max(
         logs,
         key=lambda log: (
             log.runs[0].stop - log.runs[0].start
             if log.runs
-            else max(len(one.values) for one in log.columns)
+            else max(len(column.values) for column in log.columns)
         ),
     )
     expected = _layout(longest)
     for log in logs:
-        for key, own in _layout(log).items():
-            if own != expected[key]:
-                alike = "write both alike, or make a data set of each"
+        for key, value in _layout(log).items():
+            if value != expected[key]:
                 raise DataError(
-                    f"'{log.file}' has {key} {own!r}, '{longest.file}' {expected[key]!r}; {alike}"
+                    f"'{log.file}' has {key} {value!r}, '{longest.file}' {expected[key]!r}; "
+                    "use the same layout in both, or create a data set for each"
                 )
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
@@ -250,26 +284,29 @@ def _layout(log: Log) -> dict[str, Any]:
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     """Parts of the files that were not read, and gaps that lines bridge."""
-    yield from (f"not read: {text}" for text in longest.skipped[:MOST_LISTED])
-    if len(longest.skipped) > MOST_LISTED:
-        yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
+    yield from (f"not read: {text}" for text in longest.skipped[:MAX_LISTED])
+    if len(longest.skipped) > MAX_LISTED:
+        yield f"not read: {len(longest.skipped) - MAX_LISTED} more"
     for log in logs:
         for run in log.runs:
             stamps = np.empty(0) if log.seconds is None else log.seconds[run]
             steps = np.diff(stamps)
-            if steps.max(initial=0.0) > BRIDGED:
+            if steps.max(initial=0.0) > MAX_BRIDGED_SECONDS:
                 start = stamps[np.argmax(steps)]
-                yield f"'{log.file.name}' has a gap of {steps.max():.3g} s, {start:.4g} s after its start, which lines bridge; cut it there"
+                yield (
+                    f"'{log.file.name}' has a gap of {steps.max():.3g} s at {start:.4g} s after its start, "
+                    "which is interpolated linearly; split the file there"
+                )
                 break
 
 
 def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     """Folder of the files, pattern that they match, and stems of further files that match."""
-    folder, *further = sorted({file.resolve().parent for file in files})
-    if further:
-        listed = ", ".join(map(str, (folder, *further)))
+    folder, *other_folders = sorted({file.resolve().parent for file in files})
+    if other_folders:
+        listed = ", ".join(map(str, (folder, *other_folders)))
         raise ConfigurationError(
-            f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder"
+            f"the files are in several folders ({listed}); put them into one, or create a data set for each folder"
         )
     names = sorted({file.name for file in files})
     for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
@@ -280,22 +317,24 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
-    both = (names, [name[::-1] for name in names])
-    start, end = (os.path.commonprefix(words).rstrip("0123456789") for words in both)  # noqa: RUF071 (of characters)
+    both_ways = (names, [name[::-1] for name in names])
+    start, end = (os.path.commonprefix(words).rstrip("0123456789") for words in both_ways)  # noqa: RUF071 (of characters)
     pattern = (
         f"{glob.escape(start)}*{glob.escape(end[::-1])}"
         if len(names) > 1
         else glob.escape(names[0])
     )
-    beside = sorted(
+    unlisted = sorted(
         file.name for file in folder.iterdir() if file.is_file() and file.name not in names
     )
-    others = [Path(name).stem for name in matching(beside, pattern)]
-    if others and source not in TABLES:
+    unlisted_matches = [Path(name).stem for name in matching(unlisted, pattern)]
+    if unlisted_matches and source not in TABLES:
         raise ConfigurationError(
-            f"'{folder}' holds other files of that name ('{others[0]}'); use a folder of the data set's files alone"
+            f"'{folder}' contains other files of that name ('{unlisted_matches[0]}'); use a folder with the files of the data set only"
         )
-    return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
+    return {"path": path, "files": pattern} | (
+        {"exclude": unlisted_matches} if unlisted_matches else {}
+    )
 
 
 def _evidence(
@@ -305,53 +344,59 @@ def _evidence(
 
     Of a long drive the minutes in which columns change most are taken.
     """
-    samples, rate = _on_one_clock(log)
+    samples, rate = _on_even_clock(log)
     if rate is not None:
         n_rows = samples.shape[1]
-        cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
+        cut = round(END_SECONDS * rate) if n_rows > 20.0 * END_SECONDS * rate else 0
         factor = max(math.floor(rate / EVIDENCE_HZ), 1)
-        whole = (n_rows - 2 * cut) // factor * factor
-        samples = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2)
+        n_used = (n_rows - 2 * cut) // factor * factor
+        samples = samples[:, cut : cut + n_used].reshape(len(samples), -1, factor).mean(axis=2)
         rate = rate / factor
-        samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
+        samples = _busiest(samples, round(MAX_EVIDENCE_SECONDS * rate), max(round(60.0 * rate), 1))
     columns = [
-        (own, values)
-        for own, values in zip(log.columns, samples, strict=True)
-        if own.name not in differences
+        (column, values)
+        for column, values in zip(log.columns, samples, strict=True)
+        if column.name not in differences
     ]
     return [
-        (own.name, plain_unit(own.unit) or "", values, own.device) for own, values in columns
+        (column.name, plain_unit(column.unit) or "", values, column.device)
+        for column, values in columns
     ], rate
 
 
 def _differences(log: Log) -> dict[str, str]:
     """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
-    own = [column for column in log.columns if column.stamps is None]
+    signals = [column for column in log.columns if column.stamps is None]
     middle = (
-        log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MOST_COMPARED) // 2, 0)
-        if own
+        log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MAX_COMPARED_ROWS) // 2, 0)
+        if signals
         else 0
     )
     rows = np.array(
-        [column.values[middle : min(middle + MOST_COMPARED, log.runs[0].stop)] for column in own]
+        [
+            column.values[middle : min(middle + MAX_COMPARED_ROWS, log.runs[0].stop)]
+            for column in signals
+        ]
     )
     velocities = [
         k
-        for k, column in enumerate(own)
+        for k, column in enumerate(signals)
         if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()
     ]
-    found: dict[str, str] = {}
+    differences: dict[str, str] = {}
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
-        usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
+        usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL_STEP_QUANTILE)
         agreeing = [abs(correlation(row[first:last][usual], steps[usual])) for row in rows]
-        found |= {
-            own[j].name: own[k].name for j, one in enumerate(agreeing) if one > EXACT and j != k
+        differences |= {
+            signals[j].name: signals[k].name
+            for j, agreement in enumerate(agreeing)
+            if agreement > MIN_DIFFERENCE_CORRELATION and j != k
         }
-    return found
+    return differences
 
 
-def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
+def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
     timed = [(column.values, column.stamps) for column in log.columns if column.stamps is not None]
     if timed:
         sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
@@ -377,7 +422,7 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
     if log.seconds is None:
         return np.stack([column.values[run] for column in log.columns]), None
     stamps = log.seconds[run]
-    rows = [bridged(column.values[run], stamps, BRIDGED) for column in log.columns]
+    rows = [bridged(column.values[run], stamps, MAX_BRIDGED_SECONDS) for column in log.columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(
         len(stamps) - 1, 1
     )
@@ -389,9 +434,9 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
     return np.stack([np.interp(grid, stamps, values) for values in rows]), rate
 
 
-def _busiest(columns: FloatArray, most: int, minute: int) -> FloatArray:
+def _busiest(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
     """The rows in which the columns change most, (C, at most ``most``)."""
-    if columns.shape[1] <= most:
+    if columns.shape[1] <= max_rows:
         return columns
     starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -400,5 +445,5 @@ def _busiest(columns: FloatArray, most: int, minute: int) -> FloatArray:
             for values in columns
         ]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)
-    first = int(starts[np.argmax(np.convolve(activity, np.ones(most // minute), mode="valid"))])
-    return columns[:, first : first + most]
+    first = int(starts[np.argmax(np.convolve(activity, np.ones(max_rows // minute), mode="valid"))])
+    return columns[:, first : first + max_rows]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import typer
 
-from vehest.alignment.proposals.assign import MOST_BEYOND
+from vehest.alignment.proposals.assign import MAX_IMPOSSIBLE_SHARE
 from vehest.alignment.proposals.proposal import LATERAL, Proposal
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.recording import Kind
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import VEHICLE, Examined
 from vehest.run.printing import echo
@@ -21,13 +22,14 @@ from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import UNITS
 
 LEAVE_OUT = "-"
+KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 
 
 @dataclass(frozen=True)
 class Question:
     """A question about logs or their car."""
 
-    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, a column's name, or a value of the vehicle
+    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, ``kind``, a column, or a value of the vehicle
     text: str  # for people
     proposed: str  # answer that Enter takes; empty where nothing is proposed
     candidates: tuple[str, ...] = ()  # other answers
@@ -40,13 +42,43 @@ class Question:
         return plain | {"candidates": list(self.candidates), "evidence": list(self.evidence)}
 
 
+ORIGIN = Question(
+    "kind",
+    "do the logs come from a real car or from a simulation?",
+    "real",
+    ("simulated",),
+    hint="real or simulated",
+)
+
+
 def ask(
     examined: Examined, answers: Sequence[str] = (), *, interactive: bool
 ) -> tuple[Examined, tuple[Question, ...]]:
-    """Answer logs' open questions, by ``KEY=ANSWER`` or at the terminal; returns logs and questions left; raises `ConfigurationError`."""
+    """Answer the open questions of logs.
+
+    Parameters
+    ----------
+    examined : Examined
+    answers : sequence of str
+        ``KEY=ANSWER`` each.
+    interactive : bool
+        Whether other questions are asked at the terminal; else the proposals are accepted.
+
+    Returns
+    -------
+    examined : Examined
+        With the answers.
+    questions : tuple of Question
+        Those that were answered as proposed.
+
+    Raises
+    ------
+    ConfigurationError
+        An answer is invalid, or no channel remains.
+    """
     questions = list(questions_of(examined))
-    keys = [question.key for question in questions]
-    given: dict[str, str] = {}
+    keys = [*(question.key for question in questions), ORIGIN.key]
+    answers_by_key: dict[str, str] = {}
     for text in answers:
         key, _, answer = text.rpartition("=")
         if not key:
@@ -57,19 +89,20 @@ def ask(
             raise ConfigurationError(
                 f"no question has the key '{key}'; open questions: {', '.join(keys) or 'none'}"
             )
-        given[key] = answer
+        answers_by_key[key] = answer
     if interactive:
-        known = {key for key, value in examined.vehicle.items() if value is not None}
-        known |= set() if "handwheel" in examined.proposals.by_channel else {"steering_ratio"}
+        stated = {key for key, value in examined.vehicle.items() if value is not None}
+        stated |= set() if "handwheel" in examined.proposals.by_channel else {"steering_ratio"}
         questions += [
             Question(key, text, "", hint="a number, or nothing")
             for key, text in VEHICLE.items()
-            if key not in known
+            if key not in stated
         ]
+    questions.append(ORIGIN)
     left = []
     for question in questions:
-        if question.key in given:
-            examined = _answered(examined, question, given[question.key])
+        if question.key in answers_by_key:
+            examined = _answered(examined, question, answers_by_key[question.key])
         elif interactive:
             examined = _ask_at_terminal(question, examined)
         else:
@@ -82,7 +115,7 @@ def ask(
             if question.candidates and question.proposed == LEAVE_OUT
         )
         raise ConfigurationError(
-            f"no column has two pieces of evidence for its channel; add those that are right: {takes}"
+            f"no channel is supported by two pieces of evidence; confirm those that are right: {takes}"
         )
     return examined, tuple(left)
 
@@ -93,65 +126,70 @@ def questions_of(examined: Examined) -> Iterator[Question]:
     clock = examined.log.clock
     rate = examined.rate_hz
     if rate is not None:
-        text = f"'{examined.log.file.name}' has no column of times: at how many Hz was it sampled?"
+        text = f"'{examined.log.file.name}' has no time column: what is its sampling rate [Hz]?"
         evidence = (
-            (f"ax, in the unit of ay, is d(vx)/dt at about {rate:g} Hz",)
+            (f"ax, in the unit of ay, equals d(vx)/dt at about {rate:g} Hz",)
             if "ax" in proposals.by_channel
             else ()
         )
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
-        text = f"is '{clock.column}' the time, in {clock.unit}?"
+        text = f"is '{clock.column}' the time in {clock.unit}?"
         yield Question("time", text, clock.unit, tuple(UNITS), (clock.evidence,), "a unit")
-    for one in proposals.channels:
-        if one.asked:
-            others = tuple(other for other in one.others if other not in (one.unit, one.channel))
-            hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            beyond = max(
-                one.beyond(own.values).mean()
-                for log in examined.logs
-                for own in log.columns
-                if own.name == one.column
+    for proposal in proposals.channels:
+        if proposal.question:
+            alternatives = tuple(
+                alternative
+                for alternative in proposal.alternatives
+                if alternative not in (proposal.unit, proposal.channel)
             )
-            factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
+            hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
+            impossible_share = max(
+                proposal.is_impossible(signal.values).mean()
+                for log in examined.logs
+                for signal in log.columns
+                if signal.name == proposal.column
+            )
+            factor = [f"{proposal.factor:.5g}"] if proposal.factor != 1.0 else []
             declared = [
-                one.channel,
-                one.unit,
-                *([f"{one.sign:+d}"] if factor or one.sign != 1 else []),
+                proposal.channel,
+                proposal.unit,
+                *([f"{proposal.sign:+d}"] if factor or proposal.sign != 1 else []),
                 *factor,
             ]
             proposed = " ".join(declared)
-            text = f"column '{one.column}': {one.asked}"
-            if one.is_weak:
-                others = (proposed, *others)
-                text += f'; left out unless --answer "{one.column}={proposed}" takes it'
-            if one.is_weak or beyond > MOST_BEYOND:
+            text = f"column '{proposal.column}': {proposal.question}"
+            if proposal.is_weak:
+                alternatives = (proposed, *alternatives)
+                text += f'; left out unless confirmed by --answer "{proposal.column}={proposed}"'
+            if proposal.is_weak or impossible_share > MAX_IMPOSSIBLE_SHARE:
                 proposed = LEAVE_OUT
             yield Question(
-                one.column,
+                proposal.column,
                 text,
                 proposed,
-                others,
-                one.evidence,
+                alternatives,
+                proposal.evidence,
                 hint,
             )
     if proposals.wheel_radius is not None:
-        text = "rolling radius of the tyres [m], by which the wheels make vx"
+        text = "rolling radius of the tyres [m], for vx from the wheel speeds"
         yield Question(
             "radius",
             text,
             f"{proposals.wheel_radius:g}",
             (),
-            ("as it fits ay over the yaw rate, or the speed",),
+            ("from ay/yaw_rate or the speed",),
         )
-    lateral = [one for one in proposals.channels if one.channel in LATERAL]
+    lateral = [proposal for proposal in proposals.channels if proposal.channel in LATERAL]
     if lateral and not proposals.left_right:
-        own = next((one for one in lateral if one.channel == "yaw_rate"), lateral[0])
-        text = (
-            f"in a left turn, does column '{own.column}' count {'up' if own.sign == 1 else 'down'}?"
+        signal = next(
+            (proposal for proposal in lateral if proposal.channel == "yaw_rate"), lateral[0]
         )
-        signs = ", ".join(f"{one.column} {one.sign:+d}" for one in lateral)
-        evidence = (f"the signs are mutually consistent, and so is the mirrored set: {signs}",)
+        side = "positive" if signal.sign == 1 else "negative"
+        text = f"is column '{signal.column}' {side} in a left turn?"
+        signs = ", ".join(f"{proposal.column} {proposal.sign:+d}" for proposal in lateral)
+        evidence = (f"the signs are mutually consistent; so is the mirrored set: {signs}",)
         yield Question("left_right", text, "yes", ("no",), evidence, "yes or no")
 
 
@@ -170,9 +208,8 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
         except typer.Abort:
             if sys.stdin is not None and sys.stdin.isatty():
                 raise
-            echo("")  # ends the line of the prompt
             raise ConfigurationError(
-                "no terminal for questions; add --yes to accept all proposals, or --answer KEY=ANSWER"
+                "no terminal for questions; add --yes to accept the proposals, or --answer KEY=ANSWER"
             ) from None
         try:
             return _answered(examined, question, answer)
@@ -186,11 +223,15 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     proposals = examined.proposals
     if answer == question.proposed != LEAVE_OUT:
         return examined
+    if key == "kind":
+        if answer not in KINDS:
+            raise ConfigurationError(f"'{answer}' is neither real nor simulated")
+        return replace(examined, kind=KINDS[answer])
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))
     if key == "time":
         if answer not in UNITS:
-            raise ConfigurationError(f"'{answer}' is none of {', '.join(UNITS)}")
+            raise ConfigurationError(f"'{answer}' is not one of {', '.join(UNITS)}")
         return replace(examined, logs=tuple(_with_time_unit(log, answer) for log in examined.logs))
     if key in VEHICLE:
         return replace(examined, vehicle={**examined.vehicle, key: _number(answer, key)})
@@ -220,39 +261,49 @@ def _with_time_unit(log: Log, unit: str) -> Log:
 
 def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple[Proposal, ...]:
     """A column as declared; where another column had its channel, that one gets the former channel of this one if the unit allows."""
-    own = next((one for one in channels if one.column == column), None)
-    if own is None:  # another answer has given its channel away
+    former = next((proposal for proposal in channels if proposal.column == column), None)
+    if former is None:  # another answer has given its channel away
         return channels
     if answer == LEAVE_OUT:
-        return tuple(one for one in channels if one is not own)
-    now = _parsed(answer, own)
-    freed = own.channel if CHANNELS[now.channel].unit == CHANNELS[own.channel].unit else now.channel
+        return tuple(proposal for proposal in channels if proposal is not former)
+    now = _parsed(answer, former)
+    freed = (
+        former.channel
+        if CHANNELS[now.channel].unit == CHANNELS[former.channel].unit
+        else now.channel
+    )
     declared = [
-        now if one is own else replace(one, channel=freed) if one.channel == now.channel else one
-        for one in channels
+        now
+        if proposal is former
+        else replace(proposal, channel=freed)
+        if proposal.channel == now.channel
+        else proposal
+        for proposal in channels
     ]
-    return tuple(one for one in declared if one is now or one.channel != now.channel)
+    return tuple(
+        proposal for proposal in declared if proposal is now or proposal.channel != now.channel
+    )
 
 
-def _parsed(answer: str, own: Proposal) -> Proposal:
+def _parsed(answer: str, proposal: Proposal) -> Proposal:
     """A column as CHANNEL UNIT [SIGN [FACTOR]] declares it."""
     name, unit, sign, factor = [*answer.split(), "", "", ""][:4]
     try:
         described = channel(name)
-        unit = unit or (own.unit if own.channel == name else described.unit)
+        unit = unit or (proposal.unit if proposal.channel == name else described.unit)
         factor_to_si(unit, described.unit)
     except DataError as error:
         raise ConfigurationError(f"'{answer}': {error}") from None
     if sign not in ("", "1", "+1", "-1"):
         raise ConfigurationError(f"'{answer}': the sign must be 1 or -1, not '{sign}'")
-    factor_of = _number(factor, f"'{answer}': the factor") if factor else own.factor
+    factor_of = _number(factor, f"'{answer}': the factor") if factor else proposal.factor
     return replace(
-        own,
+        proposal,
         channel=name,
         unit=unit,
-        sign=int(sign or own.sign),
+        sign=int(sign or proposal.sign),
         factor=factor_of,
-        asked="",
+        question="",
         is_weak=False,
     ).with_evidence("as answered")
 

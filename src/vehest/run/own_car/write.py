@@ -33,9 +33,9 @@ from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
-LEARNT = 0.7  # of the recordings: training and validation
-LEAST_BLOCK = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
-LEAST_SECONDS = 30.0  # of all recordings, to train at all
+TRAINED_SHARE = 0.7  # of the recordings: training and validation
+MIN_BLOCK_SECONDS = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
+MIN_SECONDS = 30.0  # of all recordings, to train at all
 ROLES_OF_THREE = ("train", "validation", "test")
 ROLES = (
     "train",
@@ -49,7 +49,7 @@ ROLES = (
     "validation",
     "test",
 )  # of whole recordings, in turn
-SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
+MIN_RANKING_SECONDS = 120.0  # s of recordings; below, hardly any comparison separates estimators
 FILTER_CHANNELS = ("vx", "yaw_rate", "ay")  # of the self-calibrating filter, which does without ax
 ASSUMED_WHEELBASE = 2.7  # m, where it is not given
 STIFFNESS = (
@@ -60,31 +60,33 @@ PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
 EVALUATED_HZ = 20  # that every estimate is scored at, where the recordings are sampled as fast
 RATE = "estimator.rate_hz="
-GIVEN = Trial(1, "given by --with")
+ADDED = Trial(1, "added by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
+    "kind": "real | simulated, as which tables and reports list the recordings",
     "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
-    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m] and steering_ratio, where they are known; every command uses them",
-    "time": "unit: s, ms, us or ns; null: no column of times",
-    "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
-    "bridge": "longest time without a sample that a straight line bridges [s]",
-    "channels": "sign: -1 where a column counts the other way than ISO 8855 (x forward, y left)",
-    "pose": "the reference is made of positions and yaw (z up); yaw_offset, lever_x and lever_y where the markers sit askew",
-    "reference_point": "{x: …, y: …} ahead and to the left of the centre of gravity [m], where it is known",
-    "imu_point": "likewise",
+    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m] and steering_ratio, if known; every command uses them",
+    "time": "unit: s, ms, us or ns; null: no time column",
+    "clock": "strict | interpolate (across gaps and jitter) | uniform",
+    "bridge": "longest gap that is interpolated linearly [s]",
+    "channels": "sign: -1 for a column whose positive direction is opposite to ISO 8855 (x forward, y left)",
+    "pose": "the reference is derived from positions and yaw (z up); add yaw_offset, lever_x and lever_y if the markers are offset",
+    "reference_point": "{x: …, y: …} ahead of and to the left of the centre of gravity [m], if known",
+    "imu_point": "likewise for the inertial sensor",
     "accept": "checks whose errors do not stop the ingest",
 }
-SPLIT_HEAD = """of each recording, 50 % for training, then 20 % for validation, then 30 % as test. They are blocks, since neighbouring
-samples are nearly the same, and would reveal the answer. Of several laps the last: tests: {test: last lap}. A few minutes only:
-cross-validate, by report: folds in the pipeline and folds: {number: 5, of: seconds, gap_seconds: 2} here, for the last three keys."""
-WHOLE_HEAD = """whole recordings, since they are too short to be cut: in turn half of them for training, a fifth for
-validation and three tenths as test."""
-PIPELINE_HEAD = """every family that its channels allow, the most promising first, with small budgets. Run it by
+SPLIT_HEAD = """of each recording, the first 50 % for training, the next 20 % for validation, the last 30 % for testing. Neighbouring
+samples are nearly equal, so that randomly drawn ones would reveal the answer. To test on the last lap, write tests: {test: last lap}.
+With a few minutes only, cross-validate: report: folds in the pipeline, and here, instead of the last three keys,
+folds: {number: 5, of: seconds, gap_seconds: 2}."""
+UNDIVIDED_HEAD = """whole recordings, because they are too short to be divided: half of them for training, a fifth for
+validation and three tenths for testing."""
+PIPELINE_HEAD = """every family that the channels allow, fast and promising ones first, with small budgets. Run it by
   vehest run {name} --minutes 15
-which does as much as fits, and goes on when it is run again. Lines may go, budgets may grow (training.max_epochs=1000 is what
-the papers' comparisons use); finished trainings are not repeated. Parts show how many minutes of reference are needed."""
-ASSUMED = """The car's parameters are made of wheelbase and mass: centre of gravity in the middle and at 0.2·L, yaw inertia m·(L/2)²,
-cornering stiffness of an axle 10/rad times its load. Write yours where you know them."""
+The same command continues where it stopped; finished trainings are not repeated. Lines may be deleted, and budgets raised (the papers'
+comparisons use training.max_epochs=1000). The parts show how many minutes of reference are needed."""
+ASSUMED = """The car's parameters are derived from wheelbase L and mass m: centre of gravity in the middle and at the height 0.2·L,
+yaw inertia m·(L/2)², cornering stiffness of an axle 10/rad times its load. Replace them by yours where known."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,9 @@ def registered(word: str) -> str:
     )
     if name not in estimator_names():
         declared = f'[project.entry-points."{ENTRY_POINTS}"], NAME = "{word if ":" in word else "package.module:Class"}"'
-        what = f"no installed package declares the estimator '{word}'"
+        problem = f"no installed package declares the estimator '{word}'"
         raise ConfigurationError(
-            f"{what}; its pyproject.toml needs, under {declared}; then install it with pip"
+            f"{problem}; its pyproject.toml needs, under {declared}; then install it with pip"
         )
     if name not in choices("estimator"):
         raise ConfigurationError(_without_settings_file(name))
@@ -120,32 +122,60 @@ def _without_settings_file(name: str) -> str:
 def write(
     examined: Examined,
     left: Sequence[Question] = (),
-    further: Sequence[str] = (),
+    added: Sequence[str] = (),
     *,
     dry_run: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines.
+    """Write data set, split and pipeline, all or none; the data set alone if nothing can be trained.
 
-    Raises `MissingError` where the disk is full or a folder cannot be written to, `VehestError` where the data set cannot be read.
+    Parameters
+    ----------
+    examined : Examined
+    left : sequence of Question
+        Questions that were answered as proposed.
+    added : sequence of str
+        Estimators that are compared besides the default ones.
+    dry_run : bool
+        Whether nothing is written.
+
+    Returns
+    -------
+    plain : dict
+        The outcome, for JSON.
+    lines : list of str
+        The outcome, for a terminal.
+
+    Raises
+    ------
+    MissingError
+        The disk is full, or a folder cannot be written to.
+    VehestError
+        The data set cannot be read.
     """
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        made = draft(examined)
-    gone = {one.column for one in examined.proposals.channels} - {
-        one.column for one in made.examined.proposals.channels
+        drafted = draft(examined)
+    gone = {proposal.column for proposal in examined.proposals.channels} - {
+        proposal.column for proposal in drafted.examined.proposals.channels
     }
     left = [question for question in left if question.key not in gone]
     plan = (
-        _plan_of(made, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
+        _plan_of(drafted, added)
+        if "vy_ref" in drafted.channels and not _is_too_short(drafted)
+        else Plan()
     )
     plan.lacking.update(
-        {own: "nothing can be compared on these recordings" for own in further if not plan.sweeps}
+        {
+            added_name: "these recordings allow no comparison"
+            for added_name in added
+            if not plan.sweeps
+        }
     )
-    texts = [_dataset_text(made, left)]
+    texts = [_dataset_text(drafted, left)]
     if plan.sweeps:
         texts += [
-            _split_text(made),
-            _pipeline_text(name, plan, LEARNT * made.seconds / 60.0, made.contents),
+            _split_text(drafted),
+            _pipeline_text(name, plan, TRAINED_SHARE * drafted.seconds / 60.0, drafted.contents),
         ]
     files = dict(zip(paths_of(name), texts, strict=False))
     stale = [
@@ -157,8 +187,8 @@ def write(
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
         for file in stale:
             file.unlink()
-    following = _next_commands(made, plan)
-    plain = _plain(made, plan, left) | {
+    following = _next_commands(drafted, plan)
+    plain = _plain(drafted, plan, left) | {
         "written": [str(file) for file in files],
         "removed": [str(file) for file in stale],
         "next": following,
@@ -168,7 +198,7 @@ def write(
         "channels, units and signs of the columns",
         "ranges for training, validation and test",
     )
-    lines = _words(made, plan, left)
+    lines = _words(drafted, plan, left)
     for file, purpose in zip(
         files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False
     ):
@@ -180,31 +210,33 @@ def write(
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
 
 
-def _kept(made: Draft) -> list[str]:
+def _long_enough(drafted: Draft) -> list[str]:
     """Recordings that a split takes; pieces that are too short even whole are left out."""
-    return [own for own, duration in made.durations.items() if duration >= LEAST_BLOCK]
+    return [name for name, duration in drafted.durations.items() if duration >= MIN_BLOCK_SECONDS]
 
 
-def _cut(made: Draft) -> list[str]:
+def _divisible(drafted: Draft) -> list[str]:
     """Recordings that are long enough to be cut; none where most of the time is in short ones."""
     long = {
-        own: duration for own, duration in made.durations.items() if 0.2 * duration >= LEAST_BLOCK
+        name: duration
+        for name, duration in drafted.durations.items()
+        if 0.2 * duration >= MIN_BLOCK_SECONDS
     }
-    return list(long) if sum(long.values()) >= 0.5 * made.seconds else []
+    return list(long) if sum(long.values()) >= 0.5 * drafted.seconds else []
 
 
-def _is_too_short(made: Draft) -> bool:
-    return made.seconds < LEAST_SECONDS or (
-        not _cut(made) and len(_kept(made)) < len(ROLES_OF_THREE)
+def _is_too_short(drafted: Draft) -> bool:
+    return drafted.seconds < MIN_SECONDS or (
+        not _divisible(drafted) and len(_long_enough(drafted)) < len(ROLES_OF_THREE)
     )
 
 
-def _split_text(made: Draft) -> str:
+def _split_text(drafted: Draft) -> str:
     """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
-    name = made.examined.name
-    ids = _kept(made)
-    cut = _cut(made)
-    if len(cut) == len(made.contents):
+    name = drafted.examined.name
+    ids = _long_enough(drafted)
+    cut = _divisible(drafted)
+    if len(cut) == len(drafted.contents):
         blocks = {
             "name": name,
             "dataset": name,
@@ -215,16 +247,19 @@ def _split_text(made: Draft) -> str:
         return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
     if cut:
         train, validation, test = (
-            [{"recording": own, "start": f"{start} %", "stop": f"{stop} %"} for own in cut]
+            [
+                {"recording": recording, "start": f"{start} %", "stop": f"{stop} %"}
+                for recording in cut
+            ]
             for start, stop in pairwise((0, 50, 70, 100))
         )
-        train += [{"recording": own} for own in ids if own not in cut]
+        train += [{"recording": recording} for recording in ids if recording not in cut]
     else:
         order = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
         roles = list(zip(ids, cycle(order), strict=False))
         train, validation, test = (
-            [{"recording": own} for own, role in roles if role == wanted]
-            for wanted in ROLES_OF_THREE
+            [{"recording": recording} for recording, role in roles if role == part]
+            for part in ROLES_OF_THREE
         )
     split: dict[str, Any] = {
         "name": name,
@@ -233,13 +268,13 @@ def _split_text(made: Draft) -> str:
         "validation": validation,
         "tests": {"test": test},
     }
-    return _yaml(split, [f"{name}: {SPLIT_HEAD if cut else WHOLE_HEAD}"])
+    return _yaml(split, [f"{name}: {SPLIT_HEAD if cut else UNDIVIDED_HEAD}"])
 
 
-def _next_commands(made: Draft, plan: Plan) -> list[str]:
-    name = made.examined.name
-    file = made.examined.files[0]
-    longest = max(made.contents, key=lambda own: made.durations[own.id])
+def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
+    name = drafted.examined.name
+    file = drafted.examined.files[0]
+    longest = max(drafted.contents, key=lambda candidate: drafted.durations[candidate.id])
     commands = [f"vehest data check {name}", f"vehest data usable {name}"]
     if plan.sweeps:
         return [*commands, f"vehest run {name} --minutes 15"]
@@ -247,15 +282,18 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
         return commands
     file = next(
         (
-            own
-            for own in made.examined.files
-            if longest.id in (own.stem, f"{own.stem}_run_{longest.id.rpartition('_')[2]}")
+            candidate
+            for candidate in drafted.examined.files
+            if longest.id
+            in (candidate.stem, f"{candidate.stem}_run_{longest.id.rpartition('_')[2]}")
         ),
         file,
     )
     run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
     settings = (
-        [] if made.examined.vehicle["wheelbase"] else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
+        []
+        if drafted.examined.vehicle["wheelbase"]
+        else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
     )
     words = [
         "vehest",
@@ -275,83 +313,84 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
 
 def found_in(examined: Examined) -> dict[str, Any]:
     """What the files hold, for JSON."""
-    found = examined.proposals
+    proposals = examined.proposals
     return {
         "name": examined.name,
         "files": [str(file) for file in examined.files],
         "source": examined.log.source,
         "time": None if examined.log.clock is None else asdict(examined.log.clock),
-        "channels": [asdict(one) | {"asked": one.asked or None} for one in found.channels],
-        "left_right": found.left_right or None,
-        "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
-        "unused": list(found.unused),
+        "channels": [proposal.as_plain() for proposal in proposals.channels],
+        "left_right": proposals.left_right or None,
+        "pose": {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose},
+        "unused": list(proposals.unused),
         "vehicle": dict(examined.vehicle),
     }
 
 
-def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
-    return found_in(made.examined) | {
-        "recordings": [one.id for one in made.contents],
-        "rate_hz": min(one.rate_hz for one in made.contents),
-        "seconds": made.seconds,
+def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
+    return found_in(drafted.examined) | {
+        "recordings": [content.id for content in drafted.contents],
+        "rate_hz": min(content.rate_hz for content in drafted.contents),
+        "seconds": drafted.seconds,
         "open": [question.as_plain() for question in left],
         "steering_ratio_found": None
-        if made.ratio is None
-        else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
-        "has_reference": "vy_ref" in made.channels,
+        if drafted.ratio is None
+        else {"value": drafted.ratio[0], "uncertainty": drafted.ratio[1]},
+        "has_reference": "vy_ref" in drafted.channels,
         "estimators": plan.estimators,
         "lacking": plan.lacking,
-        "limits": _limits(made),
-        "findings": made.remarks,
-        "notes": made.notes,
+        "limits": _limits(drafted),
+        "findings": drafted.remarks,
+        "notes": drafted.notes,
     }
 
 
-def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
+def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines = []
-    if made.ratio is not None:
-        value, spread = made.ratio
+    if drafted.ratio is not None:
+        value, spread = drafted.ratio
         if spread <= MAX_RATIO_UNCERTAINTY * abs(value):
             lines.append(
-                f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase"
+                f"steering ratio {value:.3g} ± {spread:.2g}, estimated from slow corners and the wheelbase"
             )
-    lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
-    lines += [f"note: {note}" for note in made.notes]
-    lines += [f"warning: {remark}" for remark in made.remarks]
+    lines += [f"{name}: {late.evidence}" for name, late in drafted.late.items()]
+    lines += [f"note: {note}" for note in drafted.notes]
+    lines += [f"warning: {remark}" for remark in drafted.remarks]
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in plan.lacking.items():
+        by_reason.setdefault(reason, []).append(name)
     lines += ["open questions, answered as proposed:"] if left else []
     lines += [
-        f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left
+        f"  {question.key}: {question.proposed or 'no answer'} ({question.text})"
+        for question in left
     ]
     return [
         *lines,
-        *_limits(made),
-        *(
-            f"left out: {', '.join(name for name, own in plan.lacking.items() if own == lack)}: {lack}"
-            for lack in dict.fromkeys(plan.lacking.values())
-        ),
+        *_limits(drafted),
+        *(f"not compared: {', '.join(names)}: {reason}" for reason, names in by_reason.items()),
     ]
 
 
-def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
+def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
-    contents = made.contents
-    vehicle = made.examined.vehicle
+    contents = drafted.contents
+    vehicle = drafted.examined.vehicle
     plan = Plan()
     values = _car(vehicle)
-    slowest = min(own.rate_hz for own in contents)
-    cut = _cut(made)
+    slowest = min(recording.rate_hz for recording in contents)
+    cut = _divisible(drafted)
     shares = (
-        [0.2 * made.durations[own] for own in cut]
+        [0.2 * drafted.durations[recording] for recording in cut]
         if cut
-        else [made.durations[own] for own in _kept(made)]
+        else [drafted.durations[recording] for recording in _long_enough(drafted)]
     )
     seconds = min(
         shares, default=0.0
     )  # the shortest of the longest range for training and all those for validation
-    own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
+    added_trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
     trials = sorted(
         [
-            *own,
+            *added_trials,
             *(
                 (trial, name)
                 for name, family in estimator_classes().items()
@@ -377,7 +416,8 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
             for word in words
             if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
         ]
-        of_car = f"the car's {' and '.join(unknown)}" if unknown else ""
+        options = ", ".join(f"--{name}" for name in unknown)
+        of_car = f"requires the car's {' and '.join(unknown)} ({options})" if unknown else ""
         by_settings: dict[tuple[str, ...], list[str]] = {}
         for name in names:
             lack, settings = (
@@ -389,12 +429,14 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
                 by_settings.setdefault(settings, []).append(name)
         for settings, tried in by_settings.items():
             changed = {key_of(setting) for setting in settings}
-            others = [word for word in words if key_of(word) not in changed]
-            plan.sweeps.append(([f"estimator={','.join(tried)}", *others, *settings], about))
+            other_words = [word for word in words if key_of(word) not in changed]
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *other_words, *settings], about))
             plan.estimators.extend(tried)
-    known = {name for names in sweeps.values() for name in names}
-    remaining = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
-    by_default = "none of the families tried by default; --with adds it"
+    tried_names = {name for names in sweeps.values() for name in names}
+    remaining = [
+        name for name in (*choices("estimator"), *estimator_names()) if name not in tried_names
+    ]
+    by_default = "not a default; add it by --with"
     plan.lacking.update(dict.fromkeys(remaining, by_default))
     broken = set(estimator_names()) - set(estimator_classes())
     plan.lacking.update(
@@ -434,18 +476,21 @@ def _lack(
         if not word.startswith("seed=")
     ]
     try:
-        found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
+        usable = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error), ()
-    needed = samples / (found.rate_hz or math.inf)
+    min_seconds = samples / (usable.rate_hz or math.inf)
     short = (
-        [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"]
-        if needed > seconds
+        [
+            f"at least {min_seconds:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"
+        ]
+        if min_seconds > seconds
         else []
     )
-    missing = [] if found.settings_suffice else found.missing.in_words()
-    settings = found.settings if found.settings_suffice else ()
-    return ", ".join([*missing, *short]) or found.to_give, settings
+    missing = [] if usable.settings_suffice else usable.missing.in_words()
+    missing = [f"requires {', '.join(missing)}"] if missing else []
+    settings = usable.settings if usable.settings_suffice else ()
+    return ", ".join([*missing, *short]) or usable.to_give, settings
 
 
 def _pipeline_of(
@@ -465,21 +510,23 @@ def _pipeline_of(
         "estimator.n_hidden=2",
         "training.max_epochs=100",
     ]
-    for own in MINUTES if "ksnn" in plan.estimators else ():
-        if own < 0.8 * minutes:
+    for limit in MINUTES if "ksnn" in plan.estimators else ():
+        if limit < 0.8 * minutes:
             part = {
-                "title": f"{own:g} min of reference",
+                "title": f"{limit:g} min of reference",
                 "split": name,
-                "overrides": [f"++split.minutes={own:g}"],
+                "overrides": [f"++split.minutes={limit:g}"],
             }
-            parts[f"minutes_{own:g}"] = part | {"sweeps": [["estimator=zero,static_map"], scratch]}
+            parts[f"minutes_{limit:g}"] = part | {
+                "sweeps": [["estimator=zero,static_map"], scratch]
+            }
             if any(PRETRAINED in words for words, _ in plan.sweeps):
                 tuned = {
                     "title": f"{part['title']}, trained on",
                     "sweeps": [[*scratch, PRETRAINED]],
                 }
-                parts[f"minutes_{own:g}_tuned"] = part | tuned
-    evaluation = {"rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)])}
+                parts[f"minutes_{limit:g}_tuned"] = part | tuned
+    evaluation = {"rate_hz": min([EVALUATED_HZ, *(content.rate_hz for content in contents)])}
     study = {
         "study": name,
         "title": f"Which estimator to trust on {name}",
@@ -489,68 +536,66 @@ def _pipeline_of(
     return study | {"evaluation": evaluation, "parts": parts}
 
 
-def _limits(own: Draft) -> list[str]:
-    made = {"vy_ref"} if "sideslip_ref" in own.channels else set()  # with vx
-    missing = [name for name in SCORED if name not in own.channels | made]
-    if not missing and _is_too_short(own):
-        lengths = f"{own.seconds:.0f} s in {len(own.durations)} recording{'s' if len(own.durations) > 1 else ''}"
+def _limits(drafted: Draft) -> list[str]:
+    derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
+    missing = [name for name in SCORED if name not in drafted.channels | derived]
+    if not missing and _is_too_short(drafted):
+        lengths = f"{drafted.seconds:.0f} s in {len(drafted.durations)} recording{'s' if len(drafted.durations) > 1 else ''}"
         return [
-            f"{lengths} are too short to train, validate and test on: record two minutes or more with bends, or three drives or more, "
-            f"with the reference; until then {_without_reference(own)}"
+            f"{lengths} are too short for training, validation and a test: record two minutes or more with bends, or three drives or more, "
+            f"with the reference; until then {_without_reference(drafted)}"
         ]
-    if not missing and not _cut(own):
+    if not missing and not _divisible(drafted):
         return [
-            f"the recordings are short, so the split takes whole recordings ({len(_kept(own))}, {own.seconds:.0f} s in all)"
+            f"the recordings are short, so that the split uses whole recordings ({len(_long_enough(drafted))}, {drafted.seconds:.0f} s in all)"
         ]
     if not missing:
-        text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
-        return [text] if own.seconds < SHORT else []
+        text = f"{drafted.seconds:.0f} s in all, a third of it for testing, are hardly enough to rank estimators; record some minutes more"
+        return [text] if drafted.seconds < MIN_RANKING_SECONDS else []
     if "vy_ref" not in missing:
-        return [
-            f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"
-        ]
+        return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
     return [
         "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
-        + _without_reference(own)
+        + _without_reference(drafted)
     ]
 
 
-def _without_reference(own: Draft) -> str:
+def _without_reference(drafted: Draft) -> str:
     """What estimates without a reference."""
-    lacking = ", ".join(name for name in FILTER_CHANNELS if name not in own.channels)
-    if lacking:
-        return f"the self-calibrating filter, which needs no reference, lacks {lacking}"
-    wheelbase = own.examined.vehicle["wheelbase"]
+    missing = ", ".join(name for name in FILTER_CHANNELS if name not in drafted.channels)
+    if missing:
+        return f"the self-calibrating filter, which needs no reference, lacks {missing}"
+    wheelbase = drafted.examined.vehicle["wheelbase"]
     unknown = (
         "" if wheelbase else f", with your car's wheelbase [m] instead of {ASSUMED_WHEELBASE:g}"
     )
-    return (
-        f"the self-calibrating filter needs none and estimates by the last command below{unknown}"
-    )
+    return f"the self-calibrating filter needs none: use the last command below{unknown}"
 
 
-def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
-    examined = made.examined
+def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
+    examined = drafted.examined
     name = examined.name
     head = [
-        f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."
+        f"Recordings of {name}: channels of the columns, with their evidence. `vehest data check {name}` checks them."
     ]
     head += [
-        f"Not decided by the log: {question.text} Answered as proposed: {question.proposed or 'nothing'}."
+        f"Open question: {question.text} Assumed: {question.proposed or 'no answer'}."
         for question in left
     ]
-    for channel, late in made.late.items():
+    for channel, late in drafted.late.items():
         if not CHANNELS[channel].is_reference:
             head += [
-                f"{channel} {late.evidence}.",
-                "An estimator in the car would get it as late; if only the log is, add to transforms:",
+                f"{channel}: {late.evidence}.",
+                "An estimator in the car would receive it with this delay; if only the log has it, add to transforms:",
                 f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{channel}]}}",
             ]
     comments = dict(DATASET_COMMENTS)
-    for one in examined.proposals.channels:
-        evidence = one.evidence[0] if one.evidence else CHANNELS[one.channel].meaning
-        comments[f"  {one.channel}"] = f"asked: {one.asked}; {evidence}" if one.asked else evidence
-    dataset = {key: value for key, value in made.dataset.items() if key != "transforms" or value}
+    for proposal in examined.proposals.channels:
+        evidence = proposal.evidence[0] if proposal.evidence else CHANNELS[proposal.channel].meaning
+        comments[f"  {proposal.channel}"] = (
+            f"open: {proposal.question}; {evidence}" if proposal.question else evidence
+        )
+    dataset = {key: value for key, value in drafted.dataset.items() if key != "transforms" or value}
     return _yaml(
         {**dataset, "reference_point": "unknown", "imu_point": "unknown", "accept": []},
         head,
@@ -565,8 +610,8 @@ def _pipeline_text(
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
     head += [
-        "Left out, and what each lacks:",
-        *(f"  {own}: {lack}" for own, lack in plan.lacking.items()),
+        "Not included, with the reason:",
+        *(f"  {estimator}: {lack}" for estimator, lack in plan.lacking.items()),
     ]
     return _yaml(_pipeline_of(name, plan, minutes, contents), head)
 
@@ -581,11 +626,13 @@ def _yaml(
     for line in lines:
         if "${" in line:
             raise ConfigurationError(
-                f"'{printable(line.strip()[:60])}' holds '${{', which configurations read as a reference; rename it"
+                f"'{printable(line.strip()[:60])}' contains '${{', which configurations read as a reference; rename it"
             )
-    known = {key: printable(comment) for key, comment in (comments or {}).items()}
+    printable_comments = {key: printable(comment) for key, comment in (comments or {}).items()}
     behind = [
-        f"{line:<44} # {known[key]}" if (key := line.partition(":")[0]) in known else line
+        f"{line:<44} # {printable_comments[key]}"
+        if (key := line.partition(":")[0]) in printable_comments
+        else line
         for line in lines
     ]
     return "\n".join(
