@@ -15,6 +15,7 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
+from vehest.data.transforms import Resample
 
 BoolArray = NDArray[np.bool_]
 
@@ -365,6 +366,38 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         nis_dof=held("nis_dof") if innovations else None,
         bands=bands,
     )
+
+
+def score_whole(estimate: Estimate, recording: Recording) -> Scored:
+    """Score an estimate where it has values, after the first `Protocol.skip_seconds` of its recording.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the recording.
+    recording : Recording
+        With ``vx`` and ``vy_ref``; brought to `Protocol.rate_hz` if it has more. Sideslip counts
+        from the speed that follows from its car's wheelbase (`min_sideslip_speed`).
+
+    Raises
+    ------
+    DataError
+        There is no reference or no estimate, they have gaps, or less than two samples in common.
+    """
+    times = estimate.time[np.isfinite(estimate["vy"])]
+    if not len(times):
+        raise DataError(f"estimator '{estimate.estimator}' has no estimate of '{recording.id}'")
+    protocol = Protocol(min_sideslip_speed=min_sideslip_speed(recording.car.wheelbase))
+    protocol = replace(protocol, rate_hz=min(protocol.rate_hz, recording.rate_hz))
+    names = [
+        "vx",
+        "vy_ref",
+        *(name for name in ("ay", "vx_ref", "yaw_rate_ref") if name in recording),
+    ]
+    reference = Resample(protocol.rate_hz)(recording.select(names))
+    start = float(times[0]) - protocol.skip_seconds
+    span = Span("", recording.id, start, float(times[-1]) + 1.0 / estimate.rate_hz)
+    return score(estimate, reference, span, protocol)
 
 
 def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> BoolArray:

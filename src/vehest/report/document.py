@@ -181,9 +181,15 @@ def write_document(
     )
     if page:
         whole = replace(document, blocks=[*document.blocks, *on_page])
-        (folder / f"{name}.html").write_bytes(
-            _page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace")
-        )
+        (folder / f"{name}.html").write_bytes(page_of(whole, images))
+
+
+def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
+    """The self-contained HTML page of a document; ``images``: its figures as SVG by name, if they are drawn already."""
+    drawn = images or {
+        block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
+    }
+    return _page(document, _numbers(document), drawn).encode("utf-8", "backslashreplace")
 
 
 def as_text(name: str) -> str:

@@ -1,0 +1,93 @@
+"""Draws a recording with estimates of it into a picture or a page (`vehest plot`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.files import written_aside
+from vehest.data.recording import Recording
+from vehest.report.document import Document, Figure, as_text, page_of
+from vehest.report.style import paper_style
+from vehest.run.config_files import is_file_name
+from vehest.run.estimate import estimate_file, read_table, split_settings
+from vehest.run.estimate_tables import read_estimate_table
+
+PICTURES = (".png", ".pdf", ".svg")
+PAGE = ".html"
+PNG_DPI = 200
+
+
+def check_plot_name(out: Path) -> None:
+    """Raises `ConfigurationError` for the name of a file that no picture is written to."""
+    if out.suffix.lower() not in (*PICTURES, PAGE):
+        raise ConfigurationError(
+            f"'{out}': pictures are written as {', '.join(PICTURES)} or {PAGE}; name such a file"
+        )
+
+
+def estimate_and_plot(
+    words: Sequence[str], out: Path, picture: Path | None, *, strict: bool, car: Path | None
+) -> dict[str, Any]:
+    """`vehest.run.estimate.estimate_file`, then, where a picture is named, `plot_files` with what it wrote; raises as they do."""
+    if picture is None:
+        return estimate_file(words, out, strict=strict, car=car)
+    check_plot_name(picture)
+    if out.suffix.lower() != ".parquet":
+        raise ConfigurationError(
+            f"--plot needs the estimate as .parquet, which has its bands and health, not as '{out}'"
+        )
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    has_model = len(words) > 1 and is_file_name(words[1])
+    recording, *overrides = words[1:] if has_model else words
+    plot_files([recording, str(out), *overrides], picture)
+    return outcome | {"plot": str(picture)}
+
+
+def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
+    """Draw a recording, and estimates of it, on one page.
+
+    Parameters
+    ----------
+    words : sequence of str
+        File of the recording, files of estimates as `read_estimate_table` reads them, overrides of
+        conf/estimate.yaml.
+    out : Path
+        ``.png``, ``.pdf``, ``.svg`` or ``.html``; appears complete or not at all.
+
+    Raises
+    ------
+    VehestError
+        A file cannot be used or written.
+    """
+    check_plot_name(out)
+    recording_file, *estimate_files = (Path(word) for word in words if is_file_name(word))
+    _, overrides = split_settings([word for word in words if not is_file_name(word)])
+    recording = _with_references_if_any(recording_file, overrides)
+    estimates = [read_estimate_table(file, recording) for file in estimate_files]
+    figure = recording.plot(*estimates)
+    with written_aside(out) as aside:
+        if out.suffix.lower() == PAGE:
+            title = f"Sideslip angle on {as_text(recording.id)}"
+            caption = f"Recording {as_text(recording.id)} with {len(estimates)} estimates."
+            aside.write_bytes(page_of(Document(title, [Figure("drive", caption, figure)])))
+        else:
+            with paper_style():
+                figure.savefig(aside, format=out.suffix.lower()[1:], dpi=PNG_DPI)
+    return {
+        "out": str(out),
+        "recording": recording.id,
+        "seconds": recording.duration,
+        "estimates": [str(file) for file in estimate_files],
+        "has_reference": "vy_ref" in recording,
+    }
+
+
+def _with_references_if_any(file: Path, overrides: Sequence[str]) -> Recording:
+    """A recording with the references that its data set declares; without them where the file lacks one."""
+    try:
+        return read_table(file, overrides, references=True)
+    except DataError:
+        return read_table(file, overrides)
