@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.derived import VelocityFromSideslip
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -376,14 +377,16 @@ def score_whole(estimate: Estimate, recording: Recording) -> Scored:
     estimate : Estimate
         Of the recording.
     recording : Recording
-        With ``vx`` and ``vy_ref``; brought to `Protocol.rate_hz` if it has more. Sideslip counts
-        from the speed that follows from its car's wheelbase (`min_sideslip_speed`).
+        With ``vx`` and ``vy_ref`` or ``sideslip_ref``; brought to `Protocol.rate_hz` if it has
+        more. Sideslip counts from the speed that follows from its car's wheelbase
+        (`min_sideslip_speed`).
 
     Raises
     ------
     DataError
         There is no reference or no estimate, they have gaps, or less than two samples in common.
     """
+    recording = with_vy_ref(recording)
     times = estimate.time[np.isfinite(estimate["vy"])]
     if not len(times):
         raise DataError(f"estimator '{estimate.estimator}' has no estimate of '{recording.id}'")
@@ -398,6 +401,14 @@ def score_whole(estimate: Estimate, recording: Recording) -> Scored:
     start = float(times[0]) - protocol.skip_seconds
     span = Span("", recording.id, start, float(times[-1]) + 1.0 / estimate.rate_hz)
     return score(estimate, reference, span, protocol)
+
+
+def with_vy_ref(recording: Recording) -> Recording:
+    """The recording; with ``vy_ref`` made of ``sideslip_ref`` where it has only that."""
+    channels = recording.channels.keys()
+    if "vy_ref" in channels or not {"vx", "sideslip_ref"} <= channels:
+        return recording
+    return VelocityFromSideslip()(recording)
 
 
 def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> BoolArray:

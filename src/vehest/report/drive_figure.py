@@ -16,7 +16,6 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vehest.constants import FloatArray
-from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -29,12 +28,14 @@ from vehest.evaluation.metrics import (
     is_fast_enough,
     min_sideslip_speed,
     score_whole,
+    with_vy_ref,
 )
 from vehest.report.comparison_figures import Cloud, draw_cloud
 from vehest.report.document import png_of
-from vehest.report.explorer import reckoned_course
+from vehest.report.explorer import in_display_unit, reckoned_course
 from vehest.report.figures import (
     MAX_POINTS,
+    MIN_UNIX_SECONDS,
     Band,
     Traces,
     decimated,
@@ -82,6 +83,7 @@ class Drive:
 
     title: str
     time: FloatArray  # [s]
+    time_label: str
     recording: Recording | None
     reference: Traces | None
     estimates: Sequence[Traces]
@@ -92,11 +94,6 @@ class Drive:
     def has_motion(self) -> bool:
         """Whether there is any v and β to draw."""
         return bool(self.estimates) or self.reference is not None
-
-    @property
-    def time_label(self) -> str:
-        """Label of the time axis."""
-        return "time [s]"
 
 
 def drive_figure(
@@ -114,7 +111,7 @@ def drive_figure(
     Parameters
     ----------
     recording : Recording, optional
-        The drive; its reference is drawn where it has ``vy_ref``.
+        The drive; its reference is drawn where it has ``vy_ref`` or ``sideslip_ref``.
     estimates : sequence of Estimate
         Of this recording.
     start, stop : float, optional
@@ -162,7 +159,7 @@ def _drive_of(
     first = -math.inf if start is None else start
     end = math.inf if stop is None else stop
     if recording is not None:
-        recording = recording.cut(first, end)
+        recording = with_vy_ref(recording.cut(first, end))
         clock = recording
     time = clock.time[(clock.time >= first) & (clock.time < end)]
     if not len(time):
@@ -187,7 +184,11 @@ def _drive_of(
         if "health" in channels:
             health = estimates[0].held_at(time, "health")
     title = recording.id if recording is not None else estimates[0].recording_id
-    return Drive(title, time, recording, _reference_of(recording), traces, band, health)
+    time_label = "time [s]"
+    if time[0] >= MIN_UNIX_SECONDS:
+        time = time - time[0]
+        time_label = "time after the start [s]"
+    return Drive(title, time, time_label, recording, _reference_of(recording), traces, band, health)
 
 
 def _at(time: FloatArray, estimate: Estimate, name: str) -> FloatArray:
@@ -254,14 +255,6 @@ def _draw_channel(drive: Drive, name: str, axes: Axes) -> None:
     values, unit = in_display_unit(name, drive.recording[name])
     axes.plot(*decimated(drive.time, values, MAX_POINTS), color=CHANNEL_COLOUR, linewidth=0.8)
     axes.set_ylabel(f"{CHANNEL_LABELS[name]}\n[{unit}]")
-
-
-def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
-    """Values of a channel and their unit as people read them: angles in degrees."""
-    channel = CHANNELS[name]
-    if channel.is_angular:
-        return np.degrees(values), {"rad": "deg", "rad/s": "deg/s"}[channel.unit]
-    return values, channel.unit
 
 
 def _panels_below(drive: Drive, estimates: Sequence[Estimate]) -> list[Draw]:

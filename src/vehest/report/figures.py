@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STATIC_POINTS = 500
+MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 MAX_POINTS = 2000  # of a line over a whole drive on one page
 LEAST_SAMPLES = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis

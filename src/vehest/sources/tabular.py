@@ -199,27 +199,49 @@ class TabularSource(FileSource):
         if is_stored_recording(file):
             return read_recording(file)
         columns = self._columns_of(file)
-        wanted = [
-            column.column
-            for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))
-        ]
-        extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
-        values = self._values(
-            file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)]))
-        )
+        values = self._values(file, self.columns_read(column_names(file, self.layout)))
         rows = self._runs_of(file)[run]
         return self._made_of(
             file, run, columns, {name: samples[rows] for name, samples in values.items()}
         )
 
-    def _columns_of(self, file: Path) -> Mapping[str, Column]:
+    def columns_read(self, names: Sequence[str]) -> list[str]:
+        """Columns that are read of a table with columns of these names: those of channels, poses, times and runs."""
+        columns = [
+            *self.columns_of(names).values(),
+            *(self.pose.columns.values() if self.pose else ()),
+        ]
+        others = [
+            self.time and self.time.column,
+            self.options.runs,
+            self.held and self.held.updated,
+        ]
+        wanted = [column.column for column in columns]
+        return list(dict.fromkeys([*wanted, *(str(name) for name in others if name is not None)]))
+
+    def recording_of(self, table: Mapping[str, FloatArray], name: str) -> Recording:
+        """A recording of columns in memory, shape (T,) each, as `read_file` makes it of a file's.
+
+        Raises `ConfigurationError`: the data set divides tables into runs, or leaves rows out.
+        """
+        if self._cuts or self.options.runs or self.dropped:
+            raise ConfigurationError(
+                f"{self.where}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
+            )
+        if self.time is not None:
+            table = self.time.in_order(table)
+        return self._prepared(self._made_of(Path(name), None, self.columns_of(list(table)), table))
+
+    def columns_of(self, names: Sequence[str]) -> Mapping[str, Column]:
         """Column of each channel: those of the data set, else those that are named like channels."""
+        if self.columns is not None:
+            return self.columns
+        return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
+
+    def _columns_of(self, file: Path) -> Mapping[str, Column]:
+        """The columns of a file's channels; raises `DataError` where there is none."""
         names = column_names(file, self.layout)
-        columns = self.columns
-        if columns is None:
-            columns = {
-                name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS
-            }
+        columns = self.columns_of(names)
         if not columns:
             what = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(
