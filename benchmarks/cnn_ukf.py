@@ -61,7 +61,7 @@ LEVELS = {
 
 def drives(seconds: float) -> list[Any]:
     """Simulated drives, over and over, of so many seconds in all."""
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
     from vehest.sources.base import open_source
 
     temporary = tempfile.gettempdir()
@@ -333,7 +333,7 @@ def main() -> None:
 
 def measure() -> None:
     """Measure, write, print, on as many threads as torch is allowed."""
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     recordings = drives(HOURS * 3600)
     step, epoch = through_the_filter(recordings)

@@ -32,9 +32,9 @@ def main() -> None:
     """Measure, write, print."""
     from readable_filters import extended_filter, rational_model
 
+    from vehest.artefacts.artefact import library_versions
     from vehest.estimators.rational_ekf import RationalFilter
     from vehest.filters.gaussian import Gaussian
-    from vehest.run.artefacts import library_versions
 
     torch.set_num_threads(1)
     noise = {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003, "tyres": 0.01}

@@ -51,8 +51,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     from vehest.data.errors import VehestError
     from vehest.estimators.model_files import read_description
     from vehest.export.program import exportable
-    from vehest.run.calibrate import trust_of
-    from vehest.run.estimate import SELF_CALIBRATING, pretrained_folder
+    from vehest.inference.models import SELF_CALIBRATING, pretrained_folder, trust_of
 
     found: dict[tuple[str, str, str], Path] = {}
     for folder in sorted((output / "train").glob("[!.]*")):
@@ -140,9 +139,10 @@ def rows_of(
     model: Any, folder: Path, dataset: str, root: str, output: Path
 ) -> dict[str, np.ndarray]:
     """The drive's channels at the model's rate."""
+    from vehest.configuration.composition import compose_config
     from vehest.data.store import read_recording
-    from vehest.run.config import compose_config
-    from vehest.run.estimate import preparation_of, prepared_recording
+    from vehest.inference.estimation import prepared_recording
+    from vehest.inference.models import preparation_of
     from vehest.sources.base import open_source
 
     name, first, last = DRIVES[dataset]
@@ -201,7 +201,7 @@ def measured(
     from vehest.export.folder import refuse_unresolved
     from vehest.export.program import program_files
     from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
-    from vehest.run.calibrate import trust_of
+    from vehest.inference.models import trust_of
     from vehest.trust.contract import GuardedStepper
 
     model = load_model(folder)

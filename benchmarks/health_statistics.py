@@ -26,13 +26,13 @@ import scipy.io
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from vehest.configuration.composition import compose_config
 from vehest.constants import FloatArray
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.data.transforms import Resample
-from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals

@@ -81,7 +81,7 @@ def all_channels(root: Path) -> Callable[[], Any]:
 
 def whole_stage(root: Path) -> Callable[[], Any]:
     """What ``vehest ingest`` does: hash the files, read, check, write Parquet, hash that."""
-    from vehest.run.artefacts import make
+    from vehest.artefacts.artefact import make
     from vehest.run.ingest import plan_ingest, write_ingest
     from vehest.run.signals import StopSignals
 
@@ -99,7 +99,7 @@ def whole_stage(root: Path) -> Callable[[], Any]:
 
 def configuration(root: Path) -> dict[str, Any]:
     """The data set's configuration, one recording long."""
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
 
     overrides = [
         "dataset=revs_targa_2014",
@@ -154,7 +154,7 @@ def case(name: str, baseline: tuple[float, float], ours: tuple[float, float]) ->
 
 def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     return library_versions()
 

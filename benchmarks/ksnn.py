@@ -191,7 +191,7 @@ def measured(
 
 def main() -> None:
     """Measure, write, print the ratios."""
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     with ExitStack() as stack:
         pools = [

@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from vehest.configuration.composition import compose_config
 from vehest.data.files import remove_leftovers
 from vehest.run.comparison import plan_training
-from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group

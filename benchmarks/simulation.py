@@ -36,7 +36,7 @@ def plant_runs() -> tuple[float, float, float]:
     import numpy as np
     from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
     from vehest.simulation.plant.multi_body import MultiBodyPlant
     from vehest.simulation.plant.parameters import library_parameters, vehicle_from_configuration
 
@@ -80,7 +80,7 @@ def plant_runs() -> tuple[float, float, float]:
 
 def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
     """Seconds, peak memory of the largest process [MB], and how many drives there are."""
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
     from vehest.run.console import Messages
     from vehest.run.ingest import outcome_of
     from vehest.run.runner import Runner
@@ -107,7 +107,7 @@ def in_own_process(work: Any, *arguments: object) -> Any:
 
 def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     return library_versions()
 

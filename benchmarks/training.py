@@ -74,7 +74,7 @@ def in_own_process(
 
 def main() -> None:
     """Measure, write, print the ratios."""
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     cases = []
     for structure in STRUCTURES:

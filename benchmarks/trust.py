@@ -72,12 +72,12 @@ def faults_row() -> dict[str, Any]:
     """Every fault in three severities from ten starts, in a drive of 150 s, by the model that comes with vehest."""
     import vehest
     from single_track_drive import linear_drive
-    from vehest.run.estimate import prepared_recording
+    from vehest.inference.estimation import prepared_recording
     from vehest.trust.contract import GuardedRun
     from vehest.trust.faults import KINDS, Fault, inject
 
     model = vehest.load_model()
-    trust = vehest.api._TRUST[model]
+    trust = model.trust
     drive = prepared_recording(model, linear_drive(150.0, 100.0, 0)[0])
     faults = [
         Fault(kind, "vx" if kind == "lost_wheel" else "ay", severity, onset=onset)  # type: ignore[arg-type]
@@ -99,7 +99,7 @@ def main() -> None:
     """Measure, write, print."""
     import vehest
     from single_track_drive import linear_drive
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
     from vehest.trust.contract import GuardedRun, GuardedStepper
 
     torch.set_num_threads(1)
@@ -107,7 +107,7 @@ def main() -> None:
     rows = [bootstrap_row(), faults_row()]
     for name, words in FAMILIES.items():
         model = vehest.train(name, drives[:1], drives[1:2], words)
-        trust = vehest.api._TRUST[model]
+        trust = model.trust
         assert trust.bands is not None
         assert trust.health is not None
         columns = {channel: np.array(drives[2][channel]) for channel in model.channels}

@@ -85,7 +85,7 @@ def dataset() -> str:
 
 def recordings(prefix: str) -> list[Any]:
     """Recordings of the data set of which the names begin so."""
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
     from vehest.sources.base import open_source
 
     root = os.environ.get("VEHEST_DATA", tempfile.gettempdir())
@@ -408,7 +408,7 @@ def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
     from importlib.metadata import version
 
-    from vehest.run.artefacts import library_versions
+    from vehest.artefacts.artefact import library_versions
 
     return {**library_versions(), "torchdiffeq": version("torchdiffeq")}
 

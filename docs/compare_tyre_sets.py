@@ -17,8 +17,8 @@ import pandas as pd
 import yaml
 from scipy import signal
 
+from vehest.configuration.composition import compose_config
 from vehest.data.recording import Recording
-from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
 REAL = ("f1tenth", "iros_hoons_1_with_friction_run_*")

@@ -17,6 +17,8 @@ import numpy as np
 import pandas as pd
 from make_unseen_car import CARS, drives_of
 
+from vehest.configuration.composition import compose_config
+from vehest.data.resampling import resampled
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import (
@@ -26,14 +28,14 @@ from vehest.estimators.model_files import (
     save_model,
 )
 from vehest.estimators.registry import estimator_class
+from vehest.inference.models import find_model, preparation_of
 from vehest.report.style import fixed
-from vehest.run.calibrate import Stretch, learn_trust, plan_calibrate
-from vehest.run.config import compose_config
+from vehest.run.calibrate import plan_calibrate
 from vehest.run.console import Messages
-from vehest.run.downsample import resampled
-from vehest.run.estimate import find_model, model_artefact, preparation_of
+from vehest.run.estimate import model_artefact
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
+from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]

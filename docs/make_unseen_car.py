@@ -19,19 +19,20 @@ import numpy as np
 import scipy.io
 import yaml
 
+from vehest.configuration.composition import compose_config
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.data_sheet import DataSheet
 from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
+from vehest.inference.car_values import LIMITS, calibrated, with_settings
+from vehest.inference.estimation import estimate_recording
+from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.report.style import fixed
-from vehest.run.car_record import LIMITS, calibrated, with_settings
-from vehest.run.config import compose_config
 from vehest.run.console import Messages
-from vehest.run.downsample import resampled
-from vehest.run.estimate import SELF_CALIBRATING, estimate_recording, open_model
 from vehest.run.identify import Normal, posterior_of, record_of
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals

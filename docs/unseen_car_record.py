@@ -35,14 +35,15 @@ from vehest.alignment.motion import motion_of
 from vehest.alignment.standstill import standstill
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.inference.car_values import LIMITS, WIDENING, CarRecord, calibrated, with_settings
+from vehest.inference.estimation import estimate_recording
+from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.report.style import fixed
-from vehest.run.car_record import LIMITS, WIDENING, CarRecord, calibrated, with_settings
 from vehest.run.console import Messages
-from vehest.run.downsample import resampled
-from vehest.run.estimate import SELF_CALIBRATING, estimate_recording, open_model
 from vehest.run.identify import LATENESS, posterior_of, prior_of, record_of, without_prior
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals

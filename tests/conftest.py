@@ -30,7 +30,7 @@ def _composed_once():
 
     A file of ./conf alone that no override and no defaults list can name does not count.
     """
-    from vehest.run import config
+    from vehest.configuration import composition as config
 
     compose = config.compose
     composed = {}

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from vehest.run.config import compose_config
+from vehest.configuration.composition import compose_config
 from vehest.sources.base import open_source
 
 FERRARI = "20140222_01_01_03_250lm"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from vehest.artefacts.artefact import library_versions, provenance
 from vehest.data.files import sha256_of
-from vehest.run.artefacts import library_versions, provenance
 
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "constraints.txt"

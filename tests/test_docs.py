@@ -18,6 +18,8 @@ import vehest
 from example_package import forget_examples, install_examples, write_laps
 from vehest.alignment import checks
 from vehest.cli import app
+from vehest.configuration.composition import compose_config, expand
+from vehest.configuration.files import GROUPS, choices
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.split_files import split_from_config
@@ -25,9 +27,6 @@ from vehest.data.transforms import TRANSFORMS, Resample
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import UNITS
-from vehest.run.config import compose_config, expand
-from vehest.run.config_files import GROUPS, choices
-from vehest.run.estimate import split_settings
 from vehest.run.study import Part, PipelineFile, jobs_of, read_study
 from vehest.sources.base import COMMON_KEYS, open_source, source_class, source_names
 from vehest.studies.artefacts import METRIC_COLUMNS
@@ -289,11 +288,10 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
             assert not given.overrides or jobs_of(pipeline, given.overrides)
     else:
         for root, overrides in overrides_of(given):
-            if root == "estimate":  # beside its configuration it takes settings of the filter
-                settings, overrides = split_settings(overrides)
-                estimator_class("self_calibrating").from_config(settings)
             if not PLACEHOLDER.search(" ".join([root, *overrides])):
-                compose_config(root, overrides)
+                config = compose_config(root, overrides)
+                if root == "estimate":
+                    estimator_class(config["estimator"]["name"]).from_config(config["estimator"])
 
 
 def test_make_targets_exist():

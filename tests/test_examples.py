@@ -16,11 +16,11 @@ import vehest
 from conftest import planar_drive
 from example_package import NAMES, forget_examples, install_examples, write_laps
 from single_track_drive import linear_drive, with_gaps
+from vehest.artefacts.artefact import read_artefact
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run.artefacts import read_artefact
 from vehest.training.context import NoTraining
 
 pytestmark = pytest.mark.apart

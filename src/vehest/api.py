@@ -15,46 +15,38 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from vehest.data.car import UNKNOWN_CAR
 from vehest.data.car import CarValues as CarValues
 from vehest.data.estimate import Estimate as Estimate
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording as Recording
+from vehest.data.resampling import resampled
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span
 from vehest.estimators.base import Estimator as Estimator
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import model_digest
 from vehest.estimators.model_files import save_model as _save_model
+from vehest.estimators.registry import new_estimator
 from vehest.evaluation import metrics
-from vehest.run.calibrate import Stretch, learn_trust
-from vehest.run.car_record import ASSUMED, adapted, with_car_values
-from vehest.run.config import compose_config
-from vehest.run.downsample import resampled
-from vehest.run.estimate import (
-    PRETRAINED,
+from vehest.inference.car_values import ASSUMED, adapted, with_car_values
+from vehest.inference.estimation import (
     estimate_recording,
-    find_model,
-    open_model,
     prepared_recording,
-    read_table,
     require_estimate,
-    write_estimate_table,
 )
-from vehest.run.train import new_estimator
+from vehest.inference.models import PRETRAINED, find_model, open_model
+from vehest.inference.reading import read_checked, without_references
+from vehest.inference.tables import write_estimate_table
+from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
 
-_TRUST: WeakKeyDictionary[Estimator, Trust] = (
-    WeakKeyDictionary()
-)  # what was learnt with the estimators that were trained or loaded here
-
 
 def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:
-    """Load a fitted estimator.
+    """Load a fitted estimator, with its calibration as the attribute `Estimator.trust`.
 
     Args:
         model: its folder, or the start of its name in the output root; by default the one that comes with vehest, which was trained on
@@ -67,8 +59,7 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
     """
     root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
     _, estimator, trust = open_model(str(model), root, partial(warnings.warn, stacklevel=4))
-    if trust is not None:
-        _TRUST[estimator] = trust
+    estimator.trust = trust
     return estimator
 
 
@@ -93,6 +84,8 @@ def train(
         ConfigurationError: an unknown name or setting.
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
+    from vehest.configuration.composition import compose_config  # imports Hydra
+
     config = compose_config("train", [f"estimator={estimator}", *overrides])
     config = with_car_values(config, [recording.car for recording in (*train, *validation)])
     model = new_estimator(config["estimator"])
@@ -113,13 +106,14 @@ def train(
     ]
     model.fit(FitData(*parts), settings)
     learnt, stopped = ([Stretch(own, own.start_time, "", own.id) for own in part] for part in parts)
-    _TRUST[model] = learn_trust(model, learnt, stopped)
+    model.trust = learn_trust(model, learnt, stopped)
     return model
 
 
 def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
-    """Metrics of a model on whole recordings that have ``vy_ref``, over all of them together, on the grid and after the first seconds that
-    conf/eval.yaml names. That the model has not learnt from them is for the caller to see to.
+    """Metrics of a model on whole recordings that have ``vy_ref``, over all of them together, at 20 Hz and after the first 1.5 s.
+
+    That the model was not trained on them is for the caller to see to.
 
     Each recording's car is used as by `estimate`, and its wheelbase gives the speed from which sideslip counts.
 
@@ -129,12 +123,7 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     Raises:
         DataError: a channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
-    from vehest.run.evaluate import protocol_from_config
-
-    evaluation = compose_config("eval")["evaluation"]
-    protocol = protocol_from_config(
-        {**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False}
-    )
+    protocol = metrics.Protocol(warm_up_seconds=0.0)
     parts = []
     for recording in recordings:
         of_car, _ = _for_car(model, recording.car)
@@ -164,8 +153,8 @@ def save_model(model: Estimator, folder: str | Path) -> None:
             aside,
             {"n_parameters": model.n_parameters, "downsample": dict(model.preparation)},
         )
-        if model in _TRUST:
-            write_trust(_TRUST[model], aside, model_digest(aside))
+        if model.trust is not None:
+            write_trust(model.trust, aside, model_digest(aside))
 
 
 def read_recording(
@@ -184,7 +173,11 @@ def read_recording(
         MissingError: there is no such file.
         DataError: it cannot be used as it is.
     """
-    return read_table(Path(path), overrides, references=references)
+    from vehest.configuration.estimate_options import estimate_options  # imports Hydra
+
+    options = estimate_options(overrides)
+    dataset = options.dataset if references else without_references(options.dataset)
+    return read_checked(Path(path), dataset, options.limits)
 
 
 def estimate(
@@ -214,7 +207,7 @@ def estimate(
 
 def _for_car(model: Estimator, car: CarValues) -> tuple[Estimator, Trust | None]:
     """A model and its calibration for a car; warns where the model's wheelbase is an assumption."""
-    of_car, trust, remarks = adapted(model, _TRUST.get(model), car, {})
+    of_car, trust, remarks = adapted(model, model.trust, car, {})
     for remark in remarks:
         if ASSUMED in remark:
             warnings.warn(remark, stacklevel=3)

@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, VehestError, printable
-from vehest.run.config_files import GROUPS, choices, is_file_name, pipeline_names
+from vehest.configuration.files import GROUPS, choices, is_file_name, pipeline_names
+from vehest.data.errors import ConfigurationError, VehestError, counted, printable
 from vehest.run.launchers.base import LAUNCHERS, RunOptions
 from vehest.run.printing import (
     OutputClosed,
     TerminalTable,
     as_json_text,
     complain,
-    counted,
     echo,
     emit,
     note,
@@ -32,7 +31,7 @@ from vehest.run.printing import (
 from vehest.version import __version__
 
 if TYPE_CHECKING:
-    from vehest.run.config import Config
+    from vehest.configuration.composition import Config
 app = typer.Typer(
     name="vehest",
     no_args_is_help=True,
@@ -314,7 +313,7 @@ def downsample(
     quiet: Quiet = False,
 ) -> None:
     """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
-    from vehest.run.config import positive_rate
+    from vehest.configuration.composition import positive_rate
     from vehest.run.study_run import open_runner
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
@@ -656,17 +655,20 @@ def export(
 
     dataset=NAME gives the values of the car, as for `vehest estimate`, and so does dataset.car.wheelbase=2.7 without one.
     """
+    from vehest.api import read_recording
+    from vehest.configuration.estimate_options import estimate_options
     from vehest.export.folder import export_model
-    from vehest.run.estimate import model_for_car, prepared_recording, read_table, split_settings
+    from vehest.inference.estimation import prepared_recording
+    from vehest.run.estimate import model_for_car
 
-    settings, reading = split_settings(overrides or [])
-    folder, fitted, trust, is_other = model_for_car(model, settings, reading, note)
+    options = estimate_options(overrides or [])
+    folder, fitted, trust, is_other = model_for_car(model, options, note)
     if onnx and vectors is not None:
         raise ConfigurationError("--vectors are of C, --onnx writes none; leave one out")
     drive = (
         None
         if vectors is None
-        else prepared_recording(fitted, read_table(vectors, reading), bus_rate)
+        else prepared_recording(fitted, read_recording(vectors, overrides or []), bus_rate)
     )
     if onnx:
         from vehest.export.onnx_model import write_onnx
@@ -883,7 +885,7 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.run.config import GIVEN
+    from vehest.configuration.composition import GIVEN
     from vehest.run.setting_lines import config_as_commented_yaml
 
     config = {
@@ -1226,7 +1228,7 @@ def _run_study(
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
 
     return compose_config(command, overrides)
 

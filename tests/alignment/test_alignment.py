@@ -20,14 +20,14 @@ from real_drives import real_drive, source_of
 from vehest.alignment.align import align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
+from vehest.configuration.composition import compose_config
 from vehest.data.derived import SteeringCurve, SteeringRatio
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled, transforms_of
 from vehest.data.store import write_recording
 from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_from_config
 from vehest.run.align import FILES, override_of
-from vehest.run.config import compose_config
-from vehest.run.downsample import resampled, transforms_of
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.levels import PRESETS, SensorLevel, Tilt

@@ -9,7 +9,7 @@ from broadband_drive import Wave, broadband_drive, without
 from vehest.alignment.bandwidth import held_rate
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.spectra import cross_spectra, lag_of
-from vehest.run.config import compose_config
+from vehest.configuration.composition import compose_config
 from vehest.sources.base import open_source
 
 

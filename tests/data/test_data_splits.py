@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refusal as one_line
 
+from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
@@ -19,7 +20,6 @@ from vehest.data.runs import equal_runs, true_runs
 from vehest.data.split_files import dataset_names, limit_minutes, split_from_config
 from vehest.data.splits import Span, Split, check_name
 from vehest.data.windows import windows_of
-from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True, database=None)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refusal
 
+from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
 from vehest.data.files import file_name, regular_file
 from vehest.data.limits import (
@@ -23,7 +24,6 @@ from vehest.data.limits import (
 )
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import parse_json, parse_yaml, read_text, read_yaml
-from vehest.run.config import compose_config
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from refusals import refusal
 import vehest
 from conftest import flat_weights, planar_drive
 from every_estimator import drive_for, fitted
+from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run.config import compose_config
 from vehest.training.search import DirectSearchSettings
 from vehest.vehicle.parameters import FERRARI_250LM
 
@@ -288,7 +288,7 @@ STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
 def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
-    from vehest.run.estimate import pretrained_folder
+    from vehest.inference.models import pretrained_folder
 
     drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
     started = vehest.train(

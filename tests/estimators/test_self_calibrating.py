@@ -11,7 +11,7 @@ from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
 from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.export.program import method_files
-from vehest.run.estimate import pretrained_folder
+from vehest.inference.models import pretrained_folder
 
 RATE = 20.0
 

@@ -28,8 +28,8 @@ import pandas as pd
 import torch
 
 import vehest
-from vehest.run.config import compose_config
-from vehest.run.downsample import transforms_of
+from vehest.configuration.composition import compose_config
+from vehest.data.resampling import transforms_of
 from vehest.run.table_records import record_tables
 from vehest.sources.base import open_source
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject

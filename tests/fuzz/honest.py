@@ -141,7 +141,7 @@ def import_everything():
     for module in pkgutil.iter_modules(encodings.__path__):
         if module.name not in ("mbcs", "oem", "cp65001"):
             importlib.import_module(f"encodings.{module.name}")
-    from vehest.run.artefacts import commit
+    from vehest.artefacts.artefact import commit
 
     commit()
     load_kernels()

@@ -9,11 +9,11 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import get_args, get_type_hints
 
+from vehest.artefacts.keys import default_of
 from vehest.data.transforms import Preparation
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import Protocol
 from vehest.run.evaluate_faults import FaultSettings
-from vehest.run.keys import default_of
 from vehest.run.versions import FAULTS, VERSIONS
 
 FILE = Path(__file__).with_name("defaults.json")

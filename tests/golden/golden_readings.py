@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from golden_numbers import digest_of, this_machine
 
-from vehest.run.config import compose_config
+from vehest.configuration.composition import compose_config
 from vehest.sources.base import open_source
 
 FILE = Path(__file__).with_name("readings.json")

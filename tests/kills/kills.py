@@ -27,8 +27,8 @@ from glob import glob
 from pathlib import Path
 
 from processes import end_all, is_alive, start
+from vehest.artefacts.artefact import read_artefact
 from vehest.data.errors import VehestError
-from vehest.run.artefacts import read_artefact
 from vehest.run.evaluate import TIMES
 from vehest.run.table_records import record_tables
 

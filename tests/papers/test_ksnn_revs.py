@@ -12,7 +12,7 @@ import yaml
 
 from place import run_vehest, undrawn
 from revs_files import smooth_drive, write_csv, write_vehicle_parameters
-from vehest.run.config import compose_config
+from vehest.configuration.composition import compose_config
 from vehest.run.study import read_study
 from vehest_papers.kit.block_errors import read_blocks, read_training
 from vehest_papers.kit.claim_files import claims_of

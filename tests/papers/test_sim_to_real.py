@@ -10,6 +10,8 @@ from study_parts import metric_rows, part_of
 
 from conftest import planar_drive
 from place import undrawn
+from vehest.configuration.composition import compose_config
+from vehest.configuration.files import choices
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span, Split
@@ -18,8 +20,6 @@ from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
 from vehest.report.document import Table, write_document
-from vehest.run.config import compose_config
-from vehest.run.config_files import choices
 from vehest.sources.base import kind_of, open_source
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest_papers.sim_to_real import documents

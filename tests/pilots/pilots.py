@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from vehest.run.config import compose_config, expand, key_of
+from vehest.configuration.composition import compose_config, expand, key_of
 
 ROOT = Path(__file__).resolve().parents[2]
 ABSENT = {"ksnn_revs"}  # needs the official files of the Revs database

@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 
 from conftest import planar_drive
+from vehest.artefacts.artefact import read_artefact
 from vehest.data.errors import DataError
 from vehest.data.store import read_estimate
-from vehest.run.artefacts import read_artefact
-from vehest.run.calibrate import STAGE, calibration_of, trust_of
+from vehest.inference.models import calibration_of, trust_of
+from vehest.run.calibrate import STAGE
 from vehest.trust.bands import LEVELS
 from vehest.trust.record import About, Trust, write_trust
 

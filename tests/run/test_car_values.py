@@ -16,8 +16,8 @@ from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_estimate
 from vehest.estimators.model_files import load_model
-from vehest.run.car_record import CarRecord, Number, adapted, with_car_values
-from vehest.run.estimate import pretrained_folder
+from vehest.inference.car_values import CarRecord, Number, adapted, with_car_values
+from vehest.inference.models import pretrained_folder
 from vehest.sources.base import car_of
 from vehest.trust.record import describe_band, is_other_vehicle, read_trust
 

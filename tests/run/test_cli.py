@@ -19,10 +19,10 @@ import vehest
 from conftest import planar_drive
 from place import DATASET, PIPELINE, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
+from vehest.artefacts.artefact import read_artefact
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_estimate, read_recording
 from vehest.run import ingest, inspect_data, runner
-from vehest.run.artefacts import read_artefact
 from vehest.run.comparison import NO_TIME
 from vehest.run.signals import TimeLimit
 from vehest.training import supervised

@@ -10,10 +10,11 @@ import yaml
 from refusals import refusal
 
 from place import run_vehest
+from vehest.configuration import composition as config
+from vehest.configuration.composition import compose_config, expand
+from vehest.configuration.estimate_options import estimate_options
+from vehest.configuration.files import GROUPS, choices, packaged
 from vehest.data.errors import ConfigurationError, MissingError
-from vehest.run import config
-from vehest.run.config import compose_config, expand
-from vehest.run.config_files import GROUPS, choices, packaged
 from vehest.run.setting_lines import config_as_commented_yaml
 from vehest.run.study import jobs_of, read_study
 
@@ -272,6 +273,17 @@ def test_jobs_with_the_same_choices_share_what_is_composed_but_no_values(elsewhe
     split.write_text("name: third\n")
     assert compose_config("train", ["split=mine"])["split"] == {"name": "third"}
     assert len(composed) == 2
+
+
+def test_estimate_takes_settings_of_the_filter_by_the_same_grammar_as_other_options(elsewhere):
+    options = estimate_options(
+        ["estimator.wheelbase=2.9", "+estimator.grips=[4.5,9]", "dataset.rate_hz=20"]
+    )
+    assert options.settings == {"wheelbase": 2.9, "grips": [4.5, 9]}
+    assert options.dataset["rate_hz"] == 20
+    assert estimate_options([]).settings == {}
+    with pytest.raises(ConfigurationError, match=r"unknown option 'dataset\.wheelbase'"):
+        estimate_options(["dataset.wheelbase=2.9"])
 
 
 def test_references_of_an_override_are_bounded_too(elsewhere):

@@ -11,10 +11,10 @@ import pytest
 import yaml
 from refusals import refusal
 
+from vehest.configuration.composition import compose_config
+from vehest.configuration.files import choices, packaged
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
-from vehest.run.config import compose_config
-from vehest.run.config_files import choices, packaged
 from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
 from vehest.run.study import jobs_of, read_study
 from vehest.run.versions import code_of

@@ -11,11 +11,12 @@ import yaml
 from refusals import refusal
 from test_self_calibrating import RATE, drive
 
+from vehest.configuration.composition import compose_config
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
-from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
-from vehest.run.config import compose_config
-from vehest.run.estimate import findings_of, pretrained_folder, wheelbase_findings
+from vehest.inference.car_values import LIMITS, Number, calibrated, read_car, with_settings
+from vehest.inference.models import pretrained_folder
+from vehest.run.estimate import findings_of, wheelbase_findings
 from vehest.run.identify import (
     LATENESS,
     Normal,

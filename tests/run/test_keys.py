@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import pytest
 
 from place import PIPELINE, Place, undrawn
+from vehest.artefacts.keys import changed_keys
+from vehest.configuration.composition import compose_config
 from vehest.data.recording_summary import RecordingSummary
 from vehest.estimators.gru import Gru
 from vehest.run.comparison import lower_rate
-from vehest.run.config import compose_config
-from vehest.run.keys import changed_keys
 from vehest.run.train import training_options
 
 STUDY = PIPELINE | {

@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 from refusals import refusal
 
+from vehest.artefacts.artefact import MANIFEST, StagePlan, find, make, read_artefact
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
 from vehest.data.splits import Span, Split
 from vehest.run import console
-from vehest.run.artefacts import MANIFEST, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 import pytest
 
 from processes import start
+from vehest.artefacts.artefact import StagePlan, read_artefact
+from vehest.artefacts.locks import Lock, held
 from vehest.run import group
-from vehest.run.artefacts import StagePlan, read_artefact
 from vehest.run.group import _held
-from vehest.run.locks import Lock, held
 from vehest.run.train import TrainJob
 
 pytestmark = pytest.mark.apart
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.apart
 HOLDER = """
 import sys
 from pathlib import Path
-from vehest.run.locks import Lock
+from vehest.artefacts.locks import Lock
 lock = Lock(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
 print(lock.take(), flush=True)
 sys.stdin.read()

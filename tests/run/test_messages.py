@@ -18,10 +18,10 @@ import yaml
 from safetensors import SafetensorError
 
 from conftest import planar_drive
+from vehest.configuration.composition import as_yaml, compose_config, count, expand, limits_of
 from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
 from vehest.data.files import no_room, written_aside
 from vehest.data.limits import Limits, use_limits
-from vehest.run.config import as_yaml, compose_config, count, expand, limits_of
 from vehest.run.console import Messages
 from vehest.run.failures import failure_of
 from vehest.run.printing import TerminalTable, emit

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from place import DATASET, write_drives
+from vehest.estimators.registry import new_estimator
 from vehest.report.document import Document
 from vehest.run.study import jobs_of, read_study
-from vehest.run.train import new_estimator
 from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of

@@ -1,5 +1,6 @@
 """The model for cars that nobody has trained on, which comes with vehest."""
 
+import copy
 import re
 import subprocess
 import sys
@@ -12,10 +13,10 @@ import yaml
 
 import vehest
 from place import write_csv
+from vehest.configuration.composition import compose_config
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class
-from vehest.run.config import compose_config
-from vehest.run.estimate import pretrained_folder
+from vehest.inference.models import pretrained_folder
 from vehest.sources.base import kind_of, open_source
 from vehest.trust.record import read_trust
 
@@ -93,6 +94,31 @@ def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
         assert kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated"
     assert trust.bands.n_blocks >= 34
     assert "ferrari_250_lm" not in trust.bands.vehicles
+
+
+def test_python_interface_estimates_without_stages_and_hydra():
+    program = (
+        "import sys, numpy, vehest\n"
+        "noise = numpy.random.default_rng(0).normal(0.0, 0.01, (4, 400))\n"
+        "means = {'vx': 20.0, 'yaw_rate': 0.1, 'ay': 2.0, 'ax': 0.0}\n"
+        "channels = {name: mean + values for (name, mean), values in zip(means.items(), noise)}\n"
+        "recording = vehest.Recording('lap', 'car', 20.0, 0.0, channels)\n"
+        "assert numpy.isfinite(vehest.estimate(vehest.load_model(), recording)['band_vy']).any()\n"
+        "print(*sys.modules)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True, check=True
+    )
+    loaded = run.stdout.split()
+    assert "vehest.inference.estimation" in loaded
+    not_needed = {"hydra", "omegaconf", "mlflow", "typer", "vehest.run", "vehest.configuration"}
+    assert not_needed.isdisjoint(loaded)
+
+
+def test_a_copy_of_a_loaded_model_keeps_its_calibration():
+    model = vehest.load_model()
+    assert model.trust.bands is not None
+    assert copy.copy(model).trust is model.trust
 
 
 def bands_on(name, data_root):

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from place import run_vehest
+from vehest.artefacts.artefact import StagePlan, make
 from vehest.data.files import ASIDE_PREFIX
-from vehest.run.artefacts import StagePlan, make
 from vehest.run.ingest import PARTS_PREFIX
 from vehest.run.prune import DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
 from vehest.run.versions import code_of

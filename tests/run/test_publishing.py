@@ -15,8 +15,8 @@ from safetensors import safe_open
 from safetensors.numpy import load, load_file, save_file
 
 from place import PIPELINE, Place, run_vehest, undrawn
+from vehest.artefacts.artefact import TIMINGS, read_artefact
 from vehest.run import published as study_keys
-from vehest.run.artefacts import TIMINGS, read_artefact
 from vehest.run.publishing import PROVENANCE, published_content
 from vehest.run.versions import VERSIONS, code_of
 

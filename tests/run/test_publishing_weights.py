@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from place import write_drives
+from vehest.artefacts.artefact import read_artefact
 from vehest.data.files import ASIDE_PREFIX
 from vehest.run import runner, weights
-from vehest.run.artefacts import read_artefact
 from vehest.run.weights import PublishedWeights, WeightsTooLargeError
 
 GRU = ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"]
@@ -159,7 +159,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from vehest.data import files
-from vehest.run.artefacts import read_artefact
+from vehest.artefacts.artefact import read_artefact
 from vehest.run.weights import PublishedWeights
 weights = PublishedWeights(Path(sys.argv[1]))
 when, replace = sys.argv[3], os.replace

@@ -18,6 +18,8 @@ from refusals import refusal
 from safetensors.numpy import load_file, save_file
 from safetensors.torch import save_file as save_tensors
 
+from vehest.artefacts.artefact import StagePlan, find, make, read_artefact
+from vehest.configuration.composition import Root, compose_config
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -33,11 +35,9 @@ from vehest.data.text_files import read_rows
 from vehest.data.transforms import Preparation
 from vehest.estimators.model_files import Description, load_model, read_description, save_model
 from vehest.estimators.registry import estimator_class
-from vehest.run.artefacts import StagePlan, find, make, read_artefact
-from vehest.run.config import Root, compose_config
+from vehest.inference.models import preparation_of
 from vehest.run.console import Messages
 from vehest.run.downsample import write_downsample
-from vehest.run.estimate import preparation_of
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.ingest import recording_file
 from vehest.run.publishing import PROVENANCE, Publication, Published, publish_study, published_in

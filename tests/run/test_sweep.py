@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 from scipy import stats
 
+from vehest.artefacts.artefact import StagePlan
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.run.artefacts import StagePlan
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts

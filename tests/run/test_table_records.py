@@ -11,8 +11,9 @@ import make_unseen_car
 import pytest
 from make_unseen_car import CARS, chosen_since, raw_files_of
 
+from vehest.artefacts import artefact as artefacts
 from vehest.data.errors import MissingError
-from vehest.run import artefacts, table_records
+from vehest.run import table_records
 from vehest.run.publishing import PROVENANCE, RESULTS
 from vehest.run.table_records import record_tables, today_of
 from vehest.run.versions import VERSIONS, code_of

@@ -17,7 +17,7 @@ from typing import ClassVar
 import pytest
 
 from processes import start, wait_for
-from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
+from vehest.artefacts.artefact import MANIFEST, Artefact, read_artefact
 from vehest.run.tracking import Tracker
 
 pytestmark = pytest.mark.apart

@@ -11,6 +11,7 @@ import yaml
 
 from conftest import planar_drive
 from place import DATASET
+from vehest.configuration.composition import compose_config
 from vehest.data.derivable_channels import MAKES, derivation_of
 from vehest.data.derived import WHEELS
 from vehest.data.errors import DataError
@@ -26,11 +27,9 @@ from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators import registry
 from vehest.estimators.base import FitData
-from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.estimators.registry import estimator_class, estimator_names, new_estimator
 from vehest.export.program import exportable
 from vehest.run.comparison import lower_rate
-from vehest.run.config import compose_config
-from vehest.run.train import new_estimator
 from vehest.run.usable import all_usabilities, lacking_to_train, usability
 from vehest.studies.registry import study_names
 from vehest.training.context import FitContext

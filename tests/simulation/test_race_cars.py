@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.signal import welch
 from test_simulation_sensors import motion_of, only
 
+from vehest.configuration.composition import compose_config
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
-from vehest.run.config import compose_config
 from vehest.simulation.drive import drive
 from vehest.simulation.driving.driver import HIGHEST_CORRECTION, LOWEST_CORRECTION, Hands
 from vehest.simulation.driving.laps import Laps

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from scipy.integrate import solve_ivp
 
+from vehest.configuration.composition import compose_config
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
-from vehest.run.config import compose_config
 from vehest.simulation.driving.freestyle import Freestyle
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.errors import SimulationError

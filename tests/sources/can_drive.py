@@ -116,7 +116,7 @@ def _messages(recording):
 
 def ferrari(start, stop):
     """A stretch of the real Ferrari's drive, as its data set declares it."""
-    from vehest.run.config import compose_config
+    from vehest.configuration.composition import compose_config
     from vehest.sources.base import open_source
 
     source = open_source(compose_config("ingest", ["dataset=ferrari_250lm"])["dataset"])

@@ -8,9 +8,9 @@ import yaml
 from refusals import refusal
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.configuration.composition import compose_config, missing_keys
 from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError
-from vehest.run.config import compose_config, missing_keys
 from vehest.run.ingest import plan_ingest
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration

@@ -7,7 +7,7 @@ import pytest
 from refusals import refusal
 
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_vehicle_parameters
-from vehest.run.config import compose_config
+from vehest.configuration.composition import compose_config
 from vehest.sources.base import open_source
 
 NAME = "20140222_01_01_03_250lm"

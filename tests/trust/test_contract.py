@@ -17,7 +17,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import Stepper
 from vehest.estimators.registry import estimator_names
-from vehest.run.calibrate import Stretch, learn_trust
+from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.contract import GuardedRun, GuardedStepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import RESTART, usual_limits

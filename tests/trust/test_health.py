@@ -16,8 +16,8 @@ from refusals import refusal
 
 from real_drives import real_drive
 from small_car_drive import small_car_drive
+from vehest.data.resampling import transforms_of
 from vehest.data.schema import validated
-from vehest.run.downsample import transforms_of
 from vehest.trust import health_kernel as kernel
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import usual_limits

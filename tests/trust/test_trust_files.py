@@ -11,8 +11,9 @@ from trust_mutations import PLACED, mutations, place
 from vehest.data.errors import VehestError
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import model_digest
-from vehest.run.car_record import with_settings
-from vehest.run.estimate import estimate_recording, open_model, pretrained_folder
+from vehest.inference.car_values import with_settings
+from vehest.inference.estimation import estimate_recording
+from vehest.inference.models import open_model, pretrained_folder
 from vehest.trust.bands import MAX_FACTOR, MAX_TERM, MIN_TERM
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.guard import MAX_TAN_SIDESLIP, MAX_TOP_SPEED

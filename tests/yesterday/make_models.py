@@ -14,8 +14,8 @@ from small_car_drive import small_car_drive
 from vehest.data.store import write_estimate, write_recording
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_names
-from vehest.run.calibrate import Stretch, learn_trust
-from vehest.run.estimate import estimate_recording
+from vehest.inference.estimation import estimate_recording
+from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import write_trust
 
 HERE = Path(__file__).parent

@@ -12,7 +12,8 @@ from place import run_vehest
 from vehest.data.store import read_estimate, read_recording
 from vehest.estimators.model_files import RENAMED, load_model
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run.estimate import estimate_recording, open_model
+from vehest.inference.estimation import estimate_recording
+from vehest.inference.models import open_model
 from vehest.trust.health import INVALID, TOO_WIDE
 from vehest.trust.health_kernel import JUMP
 from vehest.trust.verdict import WIDEST

@@ -50,6 +50,15 @@ def listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
+def counted(names: Sequence[str]) -> str:
+    """Their number, and the first of them."""
+    return (
+        f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
+        if names
+        else "0"
+    )
+
+
 def closest(name: str, choices: Iterable[str]) -> str:
     """The choice that is spelt most like a name; empty if none is close."""
     return next(iter(get_close_matches(name, list(choices), n=1)), "")

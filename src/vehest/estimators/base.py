@@ -112,7 +112,8 @@ class Estimator(ABC):
 
     A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
     attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is
-    how recordings are brought to its rate before it sees them (method, transforms).
+    how recordings are brought to its rate before it sees them (method, transforms), ``trust`` its calibration
+    (`vehest.trust.record.Trust`), None without one.
     """
 
     name: ClassVar[str]  # in conf/estimator and in the registry
@@ -189,6 +190,7 @@ class Estimator(ABC):
         self.settings = settings
         self._seed = 0
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
+        self.trust: Any = None
         self.check()
 
     def check(self) -> None:  # noqa: B027 (most families have nothing to check)

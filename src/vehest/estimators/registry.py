@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import entry_points
+from typing import Any
 
 import vehest.estimators as package
-from vehest.data.errors import ConfigurationError, printable
+from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.text_files import first_line
 from vehest.estimators.base import Estimator
 
@@ -59,6 +61,19 @@ def estimator_classes() -> dict[str, type[Estimator]]:
         with suppress(ConfigurationError):
             classes[name] = estimator_class(name)
     return classes
+
+
+def new_estimator(config: Mapping[str, Any]) -> Estimator:
+    """An estimator before its fit; raises `ConfigurationError` for an unknown name or setting."""
+    name = str(config["name"])
+    try:
+        return estimator_class(name).from_config(config)
+    except VehestError:
+        raise
+    except Exception as error:
+        if is_plugin(name):
+            raise plugin_failure(name, "made", error) from error
+        raise
 
 
 def is_plugin(name: str) -> bool:

@@ -13,13 +13,13 @@ import yaml
 from vehest.alignment.align import READ_AS, Alignment, Parameter, align
 from vehest.alignment.checks import refuse_errors
 from vehest.alignment.settings import AlignmentSettings
-from vehest.data.errors import ConfigurationError
+from vehest.configuration.composition import Config
+from vehest.configuration.files import choices
+from vehest.data.errors import ConfigurationError, counted
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
-from vehest.run.config import Config
-from vehest.run.config_files import choices
 from vehest.run.inspect_data import Lines, reading
-from vehest.run.printing import TerminalTable, counted
+from vehest.run.printing import TerminalTable
 from vehest.sources.base import car_of, open_source, read_single
 
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml")

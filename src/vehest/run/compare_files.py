@@ -15,31 +15,26 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import refuse_errors
+from vehest.configuration.estimate_options import estimate_options
+from vehest.configuration.files import is_file_name
 from vehest.constants import FloatArray
 from vehest.data.car import CarValues
-from vehest.data.errors import ConfigurationError, DataError, listed, printable, suggestion
+from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
-from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.data.schema import validated
 from vehest.data.splits import Span
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
+from vehest.inference.car_values import adapted
+from vehest.inference.estimation import estimate_recording
+from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
-from vehest.run.car_record import adapted
-from vehest.run.config import compose_config
-from vehest.run.config_files import is_file_name
-from vehest.run.downsample import resampled
-from vehest.run.estimate import (
-    estimate_recording,
-    finding_in_words,
-    is_training_recording,
-    open_model,
-    same_vehicle_from_config,
-    split_settings,
-)
+from vehest.run.estimate import finding_in_words
 from vehest.run.estimate_tables import (
     NamedColumn,
     names_of_table,
@@ -47,7 +42,7 @@ from vehest.run.estimate_tables import (
     parse_shift,
     read_estimate_table,
 )
-from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
+from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, note, score_cells
 from vehest.sources.base import read_single
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
@@ -84,16 +79,16 @@ def compare_files(
     named_columns = parse_columns(columns)
     seconds = parse_shift(shift)
     files = [Path(word) for word in words if is_file_name(word)]
-    settings, overrides = split_settings([word for word in words if not is_file_name(word)])
-    config = compose_config("estimate", overrides)
+    options = estimate_options([word for word in words if not is_file_name(word)])
+    settings = options.settings
     notes: list[str] = []
     trained_here: list[str] = []
-    with use_limits(limits_from_config(config["limits"])):
-        drive = read_single(config["dataset"], recording)
+    with use_limits(options.limits):
+        drive = read_single(options.dataset, recording)
         findings = [
             finding_in_words(finding)
             for finding in refuse_errors(
-                drive, config["dataset"].get("accept") or (), f"'{recording}'"
+                drive, options.dataset.get("accept") or (), f"'{recording}'"
             )
             if finding.level != "note"
         ]
@@ -105,14 +100,14 @@ def compare_files(
             file.stem: read_estimate_table(file, drive, named_columns, seconds) for file in files
         }
         for name in models:
-            folder, model, trust = open_model(name, Path(config["output"]), note)
+            folder, model, trust = open_model(name, options.output, note)
             model, trust, remarks = adapted(model, trust, drive.car, settings)
             notes += [f"'{name}': {remark}" for remark in remarks]
             if is_training_recording(folder, drive.id):
                 trained_here.append(name)
                 complain(f"warning: '{name}' was trained on this recording: its row is no test")
             estimates[name] = estimate_recording(
-                model, drive.without_references(), trust, same_vehicle_from_config(config)
+                model, drive.without_references(), trust, options.same_vehicle
             )
         wheelbase = drive.car.wheelbase
         if "wheelbase" in settings:

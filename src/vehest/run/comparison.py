@@ -10,14 +10,16 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vehest.artefacts.artefact import Artefact
+from vehest.configuration.composition import GIVEN, Config
 from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording_summary import RecordingSummary
 from vehest.data.splits import Split
-from vehest.run.artefacts import Artefact
-from vehest.run.car_record import with_car_values
-from vehest.run.config import GIVEN, Config
-from vehest.run.estimate import find_model, model_artefact
+from vehest.estimators.registry import new_estimator
+from vehest.inference.car_values import with_car_values
+from vehest.inference.models import find_model
+from vehest.run.estimate import model_artefact
 from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
@@ -26,7 +28,7 @@ from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
-from vehest.run.train import TrainJob, estimator_rate, new_estimator, plan_train
+from vehest.run.train import TrainJob, estimator_rate, plan_train
 from vehest.run.usable import lack
 from vehest.studies.reference_minutes import start_in_words
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from vehest.artefacts.artefact import library_versions
+from vehest.configuration.files import packaged
 from vehest.data.text_files import first_line
-from vehest.run.artefacts import library_versions
-from vehest.run.config_files import packaged
 
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),

@@ -16,7 +16,6 @@ from vehest.sources.limited import read_limited
 from vehest.trust.health import reason_in_words
 
 PREFIX = "vehest_"
-LOGS = (".mf4", ".mat")
 HEALTH = ("valid", "degraded", "invalid")
 
 
@@ -38,7 +37,7 @@ def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) ->
         estimate: of the recording.
         recording: as it was read from the log.
         log: its file.
-        out: `LOGS`; see `check_log_name`.
+        out: `LOG_SUFFIXES`; see `check_log_name`.
 
     Raises:
         DataError: the log is of an older version of MDF.

@@ -7,12 +7,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.run.config import compose_config
-from vehest.run.estimate_log import LOGS
+from vehest.inference.tables import LOG_SUFFIXES
 
 LABEL_WIDTH = 10
 
@@ -89,7 +89,7 @@ def _valid(outcome: Mapping[str, Any]) -> str:
 
 def _columns(out: Path) -> str:
     """What a table has, after its name; empty for a log with further channels."""
-    if out.suffix.lower() in LOGS:
+    if out.suffix.lower() in LOG_SUFFIXES:
         return ""
     return " (vy [m/s], sideslip [rad], sideslip_deg [deg], half widths of the band, health)"
 

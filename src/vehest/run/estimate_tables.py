@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings
-from vehest.data.errors import ConfigurationError, DataError, listed, printable, suggestion
+from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.data.units import factor_to_si
-from vehest.run.printing import complain, counted, note
+from vehest.run.printing import complain, note
 from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
 from vehest.run.time_shift import Series, estimate_shift
 from vehest.sources.base import read_single

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan
+from vehest.artefacts.keys import changed_options
 from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
@@ -44,9 +46,7 @@ from vehest.evaluation.metrics import (
 )
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
-from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.run.evaluate_faults import FaultSettings, errors_under
-from vehest.run.keys import changed_options
 from vehest.run.train import (
     FIT_METRICS,
     file_digest,

@@ -12,6 +12,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from vehest.artefacts.artefact import Artefact
+from vehest.configuration.composition import Config, compose_config
+from vehest.configuration.files import choices
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
@@ -22,9 +25,6 @@ from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.under_fault import FAULTED, Window, errors_under_fault, flags_under_fault
-from vehest.run.artefacts import Artefact
-from vehest.run.config import Config, compose_config
-from vehest.run.config_files import choices
 from vehest.run.train import recording_file
 from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject

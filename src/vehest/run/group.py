@@ -12,14 +12,14 @@ from pathlib import Path
 
 import torch
 
+from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find, make
+from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.car import CarValues
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
-from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
 from vehest.run.calibrate import plan_calibrate
 from vehest.run.evaluate import Evaluation
-from vehest.run.locks import Lock, Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress

@@ -14,24 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from vehest.api import read_recording
+from vehest.configuration.estimate_options import estimate_options
+from vehest.configuration.files import is_file_name
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
-from vehest.run.config import compose_config, key_of
-from vehest.run.config_files import is_file_name
-from vehest.run.estimate import (
-    SELF_CALIBRATING,
-    finding_in_words,
-    findings_of,
-    open_model,
-    prepared_recording,
-    read_table,
-    split_settings,
-)
+from vehest.inference.car_values import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
+from vehest.inference.estimation import prepared_recording
+from vehest.inference.models import SELF_CALIBRATING, open_model
+from vehest.run.estimate import finding_in_words, findings_of
 from vehest.run.printing import TerminalTable, complain, note
 from vehest.sources.base import car_of
 
@@ -67,19 +62,18 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         )
     if out.exists():
         read_car(out)  # refuses to write over anything else
-    settings, overrides = split_settings(overrides)
-    config = compose_config("estimate", overrides)
-    _, shipped, _ = open_model(SELF_CALIBRATING, Path(config["output"]), lambda _: None)
-    model, _, remarks = adapted(shipped, None, car_of(config["dataset"]), settings)
+    options = estimate_options(overrides)
+    _, shipped, _ = open_model(SELF_CALIBRATING, options.output, lambda _: None)
+    model, _, remarks = adapted(shipped, None, car_of(options.dataset), options.settings)
     assert isinstance(model, SelfCalibrating)
-    if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
-        model.preparation = config["downsample"]
+    if options.preparation is not None:
+        model.preparation = options.preparation
     drives: dict[str, dict[str, Normal]] = {}
     for file in files:
-        drive = read_table(file, overrides)
+        drive = read_recording(file, overrides)
         if drive.id in drives:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
-        for finding in findings_of(drive, model, config["dataset"].get("accept") or ()):
+        for finding in findings_of(drive, model, options.dataset.get("accept") or ()):
             complain(f"warning: {drive.id}: {finding_in_words(finding)}")
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)

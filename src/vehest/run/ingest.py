@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from vehest.alignment.checks import refuse_errors
+from vehest.artefacts.artefact import Artefact, StagePlan
+from vehest.configuration.composition import Config, compose_config, key_of, missing_keys
+from vehest.configuration.files import choices
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
 from vehest.estimators.kernels.compiling import has_to_compile
-from vehest.run.artefacts import Artefact, StagePlan
-from vehest.run.config import Config, compose_config, key_of, missing_keys
-from vehest.run.config_files import choices
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch

@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.artefacts.artefact import find
+from vehest.configuration.composition import Config, compose_config
+from vehest.configuration.files import choices
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError, VehestError
@@ -23,9 +26,6 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, stored_summary, summary_of
 from vehest.data.store import read_recording
-from vehest.run.artefacts import find
-from vehest.run.config import Config, compose_config
-from vehest.run.config_files import choices
 from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.printing import TerminalTable
 from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words

@@ -6,7 +6,7 @@ import os
 import shlex
 from collections.abc import Sequence
 
-from vehest.run.config import Config, key_of, quoted
+from vehest.configuration.composition import Config, key_of, quoted
 
 LOCATION = ("root", "output")  # keys of where raw files come from and results go
 DEFAULT_OUTPUT = "outputs"

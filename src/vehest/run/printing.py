@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vehest.data.errors import MissingError, is_printable, printable
+from vehest.data.errors import counted as counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,15 +136,6 @@ def silence(stream: Any) -> None:
     """Discard the rest of a broken stream, so that leaving does not complain about it."""
     with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
-
-
-def counted(names: Sequence[str]) -> str:
-    """Their number, and the first of them."""
-    return (
-        f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
-        if names
-        else "0"
-    )
 
 
 def as_json_text(outcome: Any) -> str:

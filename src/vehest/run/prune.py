@@ -17,10 +17,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from vehest.artefacts.artefact import MANIFEST, Artefact, read_artefact
 from vehest.data.errors import VehestError
 from vehest.data.files import aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
-from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.ingest import PARTS_PREFIX
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.run_cache import FINISHED

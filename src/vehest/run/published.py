@@ -14,18 +14,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from vehest.artefacts.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
+from vehest.configuration.composition import Config
+from vehest.configuration.files import find_pipeline, pipeline_names
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
 from vehest.data.text_files import read_yaml
 from vehest.data.transforms import Preparation
-from vehest.run.config import Config
-from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
 from vehest.run.evaluate import evaluation_options
 from vehest.run.evaluate_faults import all_of, faults_of
 from vehest.run.ingest import PROSE, plan_ingest
-from vehest.run.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals

@@ -15,14 +15,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from vehest.artefacts.artefact import TIMINGS, Artefact
+from vehest.artefacts.keys import Keys, changed_keys
+from vehest.artefacts.locks import Lock, held
 from vehest.data.errors import ConfigurationError
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json
-from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
-from vehest.run.keys import Keys, changed_keys
-from vehest.run.locks import Lock, held
 
 RESULTS = Path("results")
 PAGE_ENDING = ".html"

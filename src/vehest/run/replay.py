@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,22 +15,15 @@ from vehest.bus.outputs import output_files
 from vehest.bus.outputs import write_dbc as write_dbc_file
 from vehest.bus.replay import Bus, Replay, survey
 from vehest.bus.view import View
+from vehest.configuration.estimate_options import estimate_options
 from vehest.data.car import UNKNOWN_CAR
 from vehest.data.errors import ConfigurationError
 from vehest.data.files import without_links
-from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.limits import use_limits
 from vehest.estimators.base import Estimator
-from vehest.run.car_record import adapted
-from vehest.run.config import Config, compose_config
-from vehest.run.estimate import (
-    PRETRAINED,
-    SHIPPED_NOTES,
-    WITH_VEHEST,
-    open_model,
-    same_vehicle_from_config,
-    split_settings,
-    vehicle_of,
-)
+from vehest.inference.car_values import adapted
+from vehest.inference.models import PRETRAINED, SHIPPED_NOTES, WITH_VEHEST, open_model
+from vehest.inference.reading import vehicle_of
 from vehest.sources.base import car_of
 from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
@@ -70,19 +63,17 @@ def replay_log(
         inputs = [without_links(file) for file in (log, dbc) if file is not None]
         if without_links(path) in inputs:
             raise ConfigurationError(f"'{path}' is an input; name another file")
-    settings, others = split_settings(overrides)
-    config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *others])
-    folder, fitted, trust = open_model(model, Path(config["output"]), say)
-    car = car_of(config["dataset"]) if dataset else UNKNOWN_CAR
-    fitted, trust, remarks = adapted(fitted, trust, car, settings)
+    options = estimate_options([*([f"dataset={dataset}"] if dataset else []), *overrides])
+    folder, fitted, trust = open_model(model, options.output, say)
+    car = car_of(options.dataset) if dataset else UNKNOWN_CAR
+    fitted, trust, remarks = adapted(fitted, trust, car, options.settings)
     for remark in remarks:
         say(remark)
-    vehicle = vehicle_of(config["dataset"])
-    same_vehicle = same_vehicle_from_config(config)
-    elsewhere = is_other_vehicle(trust, vehicle, same_vehicle, car)
-    band = describe_band(trust, vehicle, same_vehicle, car)
-    with use_limits(limits_from_config(config["limits"])):
-        wanted = _signals(config if dataset else None, dbc, signals, fitted)
+    vehicle = vehicle_of(options.dataset)
+    elsewhere = is_other_vehicle(trust, vehicle, options.same_vehicle, car)
+    band = describe_band(trust, vehicle, options.same_vehicle, car)
+    with use_limits(options.limits):
+        wanted = _signals(options.dataset if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
         timing = survey(frames, wanted, bus_rate)
         faster = (
@@ -113,7 +104,7 @@ def replay_log(
 
 
 def _signals(
-    described: Config | None, dbc: Path | None, signals: str, model: Estimator
+    described: Mapping[str, Any] | None, dbc: Path | None, signals: str, model: Estimator
 ) -> BusSignals:
     """The signals of a model's channels: from the configuration of a data set, if any, or by their names in a DBC."""
     named = [word for word in signals.split(",") if word.strip()]
@@ -122,7 +113,7 @@ def _signals(
             raise ConfigurationError(
                 "--dataset and --signals both name the channels; leave one out"
             )
-        return from_dataset(described["dataset"], model.channels, model.skippable, dbc)
+        return from_dataset(described, model.channels, model.skippable, dbc)
     if dbc is None:
         raise ConfigurationError("nothing describes the bus; add --dbc car.dbc, or --dataset NAME")
     return from_names(dbc, model.channels, model.skippable, named)

@@ -16,17 +16,18 @@ from typing import Any
 import pandas as pd
 import torch
 
+from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, provenance
+from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import VALIDATION
 from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
-from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.run.comparison import Comparison, name_in_part
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
-from vehest.run.keys import changed_options
 from vehest.run.next_commands import command_line, location_overrides
 from vehest.run.printing import (
     TerminalSummary,
@@ -38,7 +39,7 @@ from vehest.run.publishing import PROVENANCE, PUBLISHED_WEIGHTS
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
-from vehest.run.train import new_estimator, read_fit_metrics, recording_file
+from vehest.run.train import read_fit_metrics, recording_file
 from vehest.run.versions import code_of
 from vehest.run.weights import (
     FORMAT,

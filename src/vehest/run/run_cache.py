@@ -20,6 +20,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vehest.artefacts.artefact import Artefact, library_versions, valid_artefact
+from vehest.configuration.files import conf_folders, find_pipeline, packaged
 from vehest.data.errors import JobsFailedError, VehestError
 from vehest.data.files import (
     file_name,
@@ -30,8 +32,6 @@ from vehest.data.files import (
 )
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
-from vehest.run.artefacts import Artefact, library_versions, valid_artefact
-from vehest.run.config_files import conf_folders, find_pipeline, packaged
 from vehest.run.console import REUSED, WARNING, Messages
 from vehest.run.launchers.base import RunOptions
 from vehest.run.printing import TerminalSummary

@@ -13,6 +13,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
+from vehest.artefacts.locks import Waiting
+from vehest.configuration.composition import Config, compose_config, missing_keys, quoted
 from vehest.data.car import CarValues
 from vehest.data.errors import DataError
 from vehest.data.recording_summary import RecordingSummary, stored_summary
@@ -22,8 +25,6 @@ from vehest.data.store import read_recording
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol
-from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
-from vehest.run.config import Config, compose_config, missing_keys, quoted
 from vehest.run.console import REUSED, Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.estimate import finding_in_words
@@ -33,7 +34,6 @@ from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
-from vehest.run.locks import Waiting
 from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker

@@ -15,16 +15,17 @@ from typing import Any
 
 import pandas as pd
 
+from vehest.artefacts.keys import hash_of
+from vehest.configuration.composition import Config, key_of
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.data.text_files import number_in, read_rows
+from vehest.estimators.registry import new_estimator
 from vehest.run.comparison import Comparison
-from vehest.run.config import Config, key_of
 from vehest.run.evaluate import COLUMNS, METRICS, evaluation_options
 from vehest.run.evaluate_faults import faults_of
-from vehest.run.keys import hash_of
 from vehest.run.study import Job, Study
-from vehest.run.train import new_estimator, training_options
+from vehest.run.train import training_options
 from vehest.run.versions import code_of
 from vehest.studies.artefacts import Trial, read_frame
 

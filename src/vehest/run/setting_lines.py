@@ -18,10 +18,10 @@ from typing import Any
 
 import yaml
 
+from vehest.configuration.composition import Config, as_yaml
 from vehest.data.errors import VehestError
 from vehest.declared import Declaration, declaration
 from vehest.estimators.registry import estimator_class
-from vehest.run.config import Config, as_yaml
 
 COMMENT_COLUMN = 45
 

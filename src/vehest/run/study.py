@@ -14,14 +14,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.folds import FoldsFile
-from vehest.data.limits import use_limits
-from vehest.data.schema import settings_from_config, validated
-from vehest.data.splits import check_name
-from vehest.data.text_files import read_yaml
-from vehest.evaluation.metrics import UNITS
-from vehest.run.config import (
+from vehest.configuration.composition import (
     GIVEN,
     Config,
     check_jobs,
@@ -36,11 +29,19 @@ from vehest.run.config import (
     parsed,
     value_of,
 )
-from vehest.run.config_files import choices, find_pipeline, pipeline_names
+from vehest.configuration.files import choices, find_pipeline, pipeline_names
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.folds import FoldsFile
+from vehest.data.limits import use_limits
+from vehest.data.schema import settings_from_config, validated
+from vehest.data.splits import check_name
+from vehest.data.text_files import read_yaml
+from vehest.estimators.registry import new_estimator
+from vehest.evaluation.metrics import UNITS
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
 from vehest.run.next_commands import command_line, location_overrides
-from vehest.run.train import TrainJob, new_estimator
+from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, short_names, shown_value
 

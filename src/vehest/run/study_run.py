@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from vehest.artefacts.artefact import Artefact, find
+from vehest.configuration.composition import Config, compose_config, key_of
 from vehest.data.errors import (
     ConfigurationError,
     DataError,
@@ -21,8 +23,8 @@ from vehest.data.errors import (
 )
 from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.run.artefacts import Artefact, find
-from vehest.run.calibrate import calibration_of, plan_calibrate
+from vehest.inference.models import calibration_of, find_model, preparation_of
+from vehest.run.calibrate import plan_calibrate
 from vehest.run.comparison import (
     Comparison,
     lower_rate,
@@ -31,9 +33,8 @@ from vehest.run.comparison import (
     print_notes,
     slowest,
 )
-from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
-from vehest.run.estimate import find_model, model_artefact, preparation_of
+from vehest.run.estimate import model_artefact
 from vehest.run.evaluate import Evaluation, fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.ingest import STAGE as INGEST

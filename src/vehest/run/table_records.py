@@ -15,13 +15,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from vehest.artefacts.artefact import CHECKOUT, provenance
+from vehest.artefacts.keys import hash_of
+from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.text_files import read_json
-from vehest.run.artefacts import CHECKOUT, provenance
-from vehest.run.config import compose_config
 from vehest.run.ingest import plan_ingest
-from vehest.run.keys import hash_of
 from vehest.run.publishing import PROVENANCE, RESULTS, TableRecord
 from vehest.run.versions import code_of
 

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from vehest.artefacts.artefact import MANIFEST, Artefact
+from vehest.artefacts.locks import Lock, held
 from vehest.data.errors import MissingError, printable
 from vehest.data.files import regular_file, remove_leftovers, written_aside
-from vehest.run.artefacts import MANIFEST, Artefact
 from vehest.run.calibrate import calibration_figures
 from vehest.run.evaluate import test_figures
-from vehest.run.locks import Lock, held
 from vehest.run.train import HISTORY, read_fit_metrics
 from vehest.studies.artefacts import read_frame
 

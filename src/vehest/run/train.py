@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.artefacts.artefact import MANIFEST, TIMINGS, Artefact, StagePlan
+from vehest.artefacts.keys import changed_options
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
-from vehest.estimators.registry import estimator_class, is_plugin, plugin_failure
-from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
-from vehest.run.keys import changed_options
+from vehest.estimators.registry import new_estimator
 from vehest.run.versions import code_of
 from vehest.training.context import FitContext
 
@@ -60,19 +60,6 @@ class TrainJob:
             self.split.validation,
             tuple(sorted(self.plan.inputs.items())),
         )
-
-
-def new_estimator(config: Mapping[str, Any]) -> Estimator:
-    """An estimator before its fit; raises `ConfigurationError` for an unknown name or setting."""
-    name = str(config["name"])
-    try:
-        return estimator_class(name).from_config(config)
-    except VehestError:
-        raise
-    except Exception as error:
-        if is_plugin(name):
-            raise plugin_failure(name, "made", error) from error
-        raise
 
 
 def estimator_rate(config: Mapping[str, Any]) -> float:

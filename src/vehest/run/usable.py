@@ -7,6 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from vehest.configuration.composition import Config, compose_config
+from vehest.configuration.files import choices
 from vehest.data.derivable_channels import Derivation, derivation_of, made_by
 from vehest.data.errors import ConfigurationError, VehestError
 from vehest.data.recording_summary import RecordingSummary, common_channels
@@ -17,13 +19,11 @@ from vehest.estimators.registry import (
     estimator_class,
     estimator_names,
     is_plugin,
+    new_estimator,
     plugin_failure,
 )
-from vehest.run.car_record import with_car_values
-from vehest.run.config import Config, compose_config
-from vehest.run.config_files import choices
+from vehest.inference.car_values import with_car_values
 from vehest.run.printing import TerminalTable
-from vehest.run.train import new_estimator
 from vehest.sources.base import car_of
 
 SUFFICES = "it does without"

@@ -16,14 +16,14 @@ from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save, save_file
 
+from vehest.artefacts.artefact import TIMINGS, Artefact
+from vehest.artefacts.keys import hash_of
+from vehest.artefacts.locks import Lock, held
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.text_files import first_line
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
-from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
-from vehest.run.keys import hash_of
-from vehest.run.locks import Lock, held
 from vehest.run.train import FIT_METRICS, HISTORY
 
 MODELS = "models"  # the only entry of the file's metadata

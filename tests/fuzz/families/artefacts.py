@@ -142,8 +142,8 @@ def model(case):
 @template
 def unfinished(folder):
     """An output root with the checkpoint of a training that was killed."""
+    from vehest.artefacts.artefact import StagePlan
     from vehest.run import group
-    from vehest.run.artefacts import StagePlan
 
     drives(folder)
     with patch.object(group, "drop_checkpoint"), patch.object(StagePlan, "drop"):

@@ -6,7 +6,7 @@ from fuzz.case import Command, generator
 from fuzz.honest import KSNN, LUENBERGER, PIPELINE, SPLIT, write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, hostile, spoil_items, spoil_yaml, yaml_of
 from place import DATASET
-from vehest.run.config_files import packaged
+from vehest.configuration.files import packaged
 
 HEAD = "# @package _global_\n"
 ESTIMATORS = [

@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vehest.artefacts.artefact import MANIFEST, commit, library_versions, read_artefact
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.files import remove_leftovers, written_aside
 from vehest.data.limits import Limits, current_limits, use_limits
-from vehest.run.artefacts import MANIFEST, commit, library_versions, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing

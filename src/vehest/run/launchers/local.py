@@ -17,10 +17,10 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from vehest.artefacts.locks import Waiting
 from vehest.data.errors import MissingError
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
-from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit, blocked_signals
 from vehest.training.context import Progress
 

@@ -18,13 +18,12 @@ from vehest.alignment.proposals.assign import possible, propose
 from vehest.alignment.proposals.columns import correlation
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
+from vehest.configuration.composition import compose_config
+from vehest.configuration.files import choices
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, counted
 from vehest.data.limits import check_limit, limits_from_config, use_limits
 from vehest.data.splits import check_name
-from vehest.run.config import compose_config
-from vehest.run.config_files import choices
-from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate
 from vehest.sources.surveys import Log, survey

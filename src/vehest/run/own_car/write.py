@@ -13,6 +13,8 @@ from typing import Any
 
 import yaml
 
+from vehest.configuration.composition import Config, compose_config, key_of
+from vehest.configuration.files import choices
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, VehestError, printable
@@ -26,8 +28,6 @@ from vehest.estimators.registry import (
     estimator_classes,
     estimator_names,
 )
-from vehest.run.config import Config, compose_config, key_of
-from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question

@@ -1,6 +1,6 @@
 """What of a configuration enters keys: options that differ from their defaults.
 
-settings -> `changed_options` -> key of an artefact (`artefacts.StagePlan`) and keys of a published study (`published`)
+settings -> `changed_options` -> key of an artefact (`artefact.StagePlan`) and keys of a published study (`run.published`)
 keys of a published study, keys of today -> `changed_keys` -> what has changed
 
 An option that has its default is left out, so that a new option, and a line of YAML that only repeats a default, change no key. The

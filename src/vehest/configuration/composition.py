@@ -33,13 +33,13 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
+from vehest.configuration.files import GROUPS, choices, conf_folders, packaged
 from vehest.data.errors import ConfigurationError, VehestError, closest, printable
 from vehest.data.files import stamp_of
 from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import check_yaml_size, first_line, read_text
 from vehest.data.transforms import Preparation
-from vehest.run.config_files import GROUPS, choices, conf_folders, packaged
 
 Config = dict[str, Any]
 
@@ -53,6 +53,8 @@ LOCAL_SCHEME = "vehest"  # of the search path, for ./conf
 MAX_CONFIG_VALUES = (
     20_000  # of a file of ./conf, and of what references stand for; OmegaConf takes 0.1 ms for each
 )
+OPEN_GROUPS = {"estimate": "estimator"}
+"""Command -> group to which overrides may add any key: settings of a model that is opened later, which are checked there."""
 VALUES_PER_REFERENCE = 10  # as which the work for a reference counts
 CHARACTERS_PER_VALUE = 100  # as which long text counts
 OWN_SEARCH_PATH = "hydra.searchpath=[]"  # the first one counts; a package named by another, in a file or an override, would be imported
@@ -189,6 +191,8 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     try:
         with _limited_references():
             composed = deepcopy(_composed(command, of_groups, stamp_of(*conf_folders())))
+            if command in OPEN_GROUPS:
+                OmegaConf.set_struct(composed[OPEN_GROUPS[command]], False)
             ConfigLoaderImpl._apply_overrides_to_config(values, composed)
             resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except VehestError as error:

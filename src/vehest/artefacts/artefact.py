@@ -24,12 +24,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from vehest.artefacts.keys import hash_of
+from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import file_name, remove, remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_json
-from vehest.run.keys import hash_of
-from vehest.run.locks import Lock, Waiting, held
 from vehest.version import __version__
 
 CHECKOUT = Path(__file__).resolve().parents[3]

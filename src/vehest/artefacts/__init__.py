@@ -1,0 +1,1 @@
+"""Folders that stages write, with manifests, keys and locks."""

@@ -1,0 +1,1 @@
+"""Configurations: files of conf/ and overrides, composed by Hydra. Nothing else imports Hydra."""

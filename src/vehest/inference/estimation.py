@@ -1,0 +1,67 @@
+"""Estimates of a fitted model on recordings, under the contract that holds online.
+
+recording -> channels of the model at its rate -> `GuardedRun` -> estimate with bands and health
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+
+import numpy as np
+
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
+from vehest.estimators.base import Estimator
+from vehest.trust.contract import GuardedRun
+from vehest.trust.record import Trust, is_other_vehicle
+
+
+def estimate_recording(
+    model: Estimator,
+    recording: Recording,
+    trust: Trust | None = None,
+    same_vehicle: bool | None = None,
+) -> Estimate:
+    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
+    needed = prepared_recording(model, recording)
+    elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle, recording.car)
+    run = GuardedRun(model, trust, elsewhere=elsewhere)
+    return require_estimate(model, recording, run(needed.channels, needed))
+
+
+def estimate_parts(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate]:
+    """The estimates of parts, each made by a thread, in compiled code, while the next part is read, checked and resampled."""
+    with ThreadPoolExecutor(1) as thread:
+        going: list[Future[Estimate]] = []
+        for part in parts:
+            going.append(thread.submit(copy_context().run, run, part.channels, part))
+            if len(going) > 1:
+                yield going.pop(0).result()
+        yield going.pop().result()
+
+
+def prepared_recording(
+    model: Estimator, recording: Recording, rate_hz: float | None = None
+) -> Recording:
+    """The channels that a model reads, at its rate or another one [Hz]; raises as `estimate_recording` does."""
+    return resampled(
+        recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation
+    )
+
+
+def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
+    """The estimate; raises `DataError` where it is empty, since the recording is too short."""
+    if np.isnan(estimate["vy"]).all():
+        raise too_short_error(model, recording.id, recording.duration)
+    return estimate
+
+
+def too_short_error(model: Estimator, recording_id: str, seconds: float) -> DataError:
+    """The error of a recording on which a model has no estimate."""
+    return DataError(
+        f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to estimate anything"
+    )

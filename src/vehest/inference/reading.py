@@ -1,0 +1,69 @@
+"""Reads a file as a recording for a model, whether or not it has references."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vehest.alignment.checks import refuse_errors
+from vehest.data.channels import REFERENCE_SUFFIX
+from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import UNNAMED_VEHICLE, Recording
+from vehest.data.transforms import OF_REFERENCES
+from vehest.sources.base import read_single
+
+
+def read_checked(path: Path, dataset: Mapping[str, Any], limits: Limits) -> Recording:
+    """Read a recording from a file of any format.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    dataset : mapping
+        Options of its data set, by default a table with the channels' names.
+    limits : Limits
+        On what the file may ask for.
+
+    Raises
+    ------
+    VehestError
+        As `read_single`; `DataError` also where a check finds an error that the data set does not accept.
+    """
+    with use_limits(limits):
+        recording = read_single(dataset, path)
+        refuse_errors(recording, dataset.get("accept") or (), f"'{path}'")
+    return recording
+
+
+def without_references(dataset: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a data set without its reference channels; not validated yet."""
+    channels = dataset.get("channels")
+    transforms = dataset.get("transforms")
+    if isinstance(channels, dict):
+        channels = {
+            name: entry
+            for name, entry in channels.items()
+            if not str(name).endswith(REFERENCE_SUFFIX)
+        }
+    if isinstance(transforms, list | tuple):
+        transforms = [
+            entry
+            for entry in transforms
+            if not (isinstance(entry, dict) and str(entry.get("name")) in OF_REFERENCES)
+        ]
+    changed = {
+        "channels": channels or None,
+        "transforms": transforms or None,
+        "reference_point": None,
+        "pose": None,
+    }
+    unchanged = {key: value for key, value in dataset.items() if key not in changed}
+    return unchanged | {key: value for key, value in changed.items() if value}
+
+
+def vehicle_of(dataset: Mapping[str, Any]) -> str:
+    """The name of a data set's car; `UNNAMED_VEHICLE` where it has none."""
+    vehicle = dataset.get("vehicle")
+    return vehicle if isinstance(vehicle, str) and vehicle else UNNAMED_VEHICLE

@@ -1,0 +1,116 @@
+"""Calibrates a fitted estimator: bands, limits of samples and health, from its training and validation ranges.
+
+ranges -> estimates through whole ranges from a start of their own, as on a new drive -> `Trust`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vehest.data.car import UNKNOWN_CAR
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.trust.bands import Piece, band_inputs, calibrated
+from vehest.trust.guard import learn_limits
+from vehest.trust.health import learn_health
+from vehest.trust.record import About, Trust
+
+SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A range to learn from, with the part of its recording before it."""
+
+    recording: Recording  # at the model's rate, from `WARM_UP_SECONDS` before the range if it is that long, references included
+    start: float  # of the range [s]
+    dataset: str  # of the recording; may be empty
+    name: str  # for people
+
+    @property
+    def range(self) -> Recording:
+        """The recording without its warm-up."""
+        return self.recording.cut(self.start, self.recording.end_time)
+
+
+def learn_trust(
+    estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = ""
+) -> Trust:
+    """Bands, limits of samples and health of a fitted estimator.
+
+    Training ranges give scales, limits and relations between channels; validation ranges give factors of bands and, together with the
+    others, thresholds of health.
+    """
+    bands = None
+    guard = None
+    health = None
+    notes = []
+    try:
+        bands = calibrated(
+            _pieces(estimator, train),
+            _pieces(estimator, validation),
+            tuple(estimator.channels),
+            vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
+            datasets=tuple(
+                dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)
+            ),
+            scaled_on=tuple(stretch.name for stretch in train),
+            calibrated_on=tuple(stretch.name for stretch in validation),
+            horizon_steps=estimator.horizon_steps,
+            cars=tuple(
+                dict.fromkeys(
+                    stretch.recording.car
+                    for stretch in validation
+                    if stretch.recording.car != UNKNOWN_CAR
+                )
+            ),
+        )
+    except DataError as error:  # such as a missing reference, which does not prevent an evaluation
+        notes.append(str(error))
+    try:
+        if not train:
+            raise DataError("there is no training range to learn limits and health from")
+        guard = learn_limits(
+            [stretch.range for stretch in train], estimator.channels, estimator.settings.rate_hz
+        )
+        learnt, stopped = (
+            [stretch.range.without_references() for stretch in part] for part in (train, validation)
+        )
+        health = learn_health(learnt, stopped, estimator.channels, estimator.settings.rate_hz)
+    except DataError as error:
+        notes.append(str(error))
+    return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
+
+
+def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
+    """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
+    found: list[Piece] = []
+    estimates = estimator.estimate(
+        [stretch.recording.without_references() for stretch in stretches]
+    )
+    for stretch, estimate in zip(stretches, estimates, strict=True):
+        recording = stretch.recording
+        rows, vy, variance = band_inputs(
+            estimate, recording, tuple(estimator.channels), estimator.horizon_steps
+        )
+        scored = slice(*recording.index_range(stretch.start + SKIP_SECONDS, recording.end_time))
+        turned = estimate["sideslip"] - np.arctan2(recording["vy_ref"], recording["vx"])
+        errors = np.stack(
+            [vy - recording["vy_ref"], np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi], axis=1
+        )
+        yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
+        found.append(
+            Piece(
+                rows[scored],
+                vy[scored],
+                variance[scored],
+                errors[scored],
+                yaw_rate,
+                recording.rate_hz,
+            )
+        )
+    return found
