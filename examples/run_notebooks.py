@@ -9,7 +9,7 @@ import ast
 import base64
 import io
 import json
-import os
+import sys
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -81,9 +81,8 @@ def texts_of(outputs: list[dict[str, Any]]) -> list[str]:
 
 
 def main() -> None:
-    """Run every notebook and write it with its outputs."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    for path in notebooks():
+    """Run the notebooks that are named, by default all, and write them with their outputs."""
+    for path in [FOLDER / name for name in sys.argv[1:]] or notebooks():
         notebook = read_notebook(path)
         results = run_cells(notebook)
         for count, (cell, outputs) in enumerate(zip(code_cells(notebook), results, strict=True), 1):

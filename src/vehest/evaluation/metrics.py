@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from vehest.data.derived import VelocityFromSideslip
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.data.splits import Span
-from vehest.data.transforms import Resample
 
 BoolArray = NDArray[np.bool_]
 
@@ -35,6 +36,9 @@ COVERAGE = {
     1: 0.6827,
     2: 0.9545,
 }  # number of standard deviations -> fraction of Gaussian errors within them
+
+POLYPHASE: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
+"""Preparation by which recordings come to another rate unless a model's training had another one."""
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
@@ -369,7 +373,9 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     )
 
 
-def score_whole(estimate: Estimate, recording: Recording) -> Scored:
+def score_whole(
+    estimate: Estimate, recording: Recording, preparation: Mapping[str, Any] = POLYPHASE
+) -> Scored:
     """Score an estimate where it has values, after the first `Protocol.skip_seconds` of its recording.
 
     Parameters
@@ -380,6 +386,8 @@ def score_whole(estimate: Estimate, recording: Recording) -> Scored:
         With ``vx`` and ``vy_ref`` or ``sideslip_ref``; brought to `Protocol.rate_hz` if it has
         more. Sideslip counts from the speed that follows from its car's wheelbase
         (`min_sideslip_speed`).
+    preparation : mapping
+        By which the recording is brought to that rate.
 
     Raises
     ------
@@ -397,7 +405,8 @@ def score_whole(estimate: Estimate, recording: Recording) -> Scored:
         "vy_ref",
         *(name for name in ("ay", "vx_ref", "yaw_rate_ref") if name in recording),
     ]
-    reference = Resample(protocol.rate_hz)(recording.select(names))
+    drive = recording if preparation["transforms"] else recording.select(names)
+    reference = resampled(drive, protocol.rate_hz, preparation)
     start = float(times[0]) - protocol.skip_seconds
     span = Span("", recording.id, start, float(times[-1]) + 1.0 / estimate.rate_hz)
     return score(estimate, reference, span, protocol)

@@ -66,6 +66,7 @@ CHANNEL_COLOUR = "#33373b"
 COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to the left
 HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}  # in
 
+NOTEBOOK_DPI = 110
 MIN_AXIS = 0.1  # deg, of estimate over reference
 Draw = Callable[[Axes], None]
 
@@ -74,7 +75,7 @@ class DriveFigure(Figure):
     """A figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
-        return png_of(self)
+        return png_of(self, NOTEBOOK_DPI)
 
 
 @dataclass(frozen=True, eq=False)

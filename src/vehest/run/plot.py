@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vehest.configuration.estimate_options import EstimateOptions, estimate_options
+from vehest.configuration.files import is_file_name
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
-from vehest.report.document import Document, Figure, as_text, page_of
-from vehest.report.style import paper_style
-from vehest.run.config_files import is_file_name
-from vehest.run.estimate import estimate_file, read_table, split_settings
+from vehest.inference.reading import read_checked, without_references
+from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
+from vehest.report.style import MatplotlibFigure
+from vehest.run.estimate import estimate_file
 from vehest.run.estimate_tables import read_estimate_table
 
-PICTURES = (".png", ".pdf", ".svg")
-PAGE = ".html"
-PNG_DPI = 200
+
+def _page(figure: MatplotlibFigure) -> bytes:
+    title = as_text(figure.axes[0].get_title(loc="left"))
+    caption = "Sideslip angle with band and health, lateral velocity, measured channels, course."
+    return page_of(Document(title, [Figure("drive", caption, figure)]))
+
+
+WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
+    ".png": partial(png_of, dpi=200),
+    ".pdf": pdf_of,
+    ".svg": svg_of,
+    ".html": _page,
+}
+"""Ending of a file -> the figure in its format."""
 
 
 def check_plot_name(out: Path) -> None:
     """Raises `ConfigurationError` for the name of a file that no picture is written to."""
-    if out.suffix.lower() not in (*PICTURES, PAGE):
+    if out.suffix.lower() not in WRITERS:
         raise ConfigurationError(
-            f"'{out}': pictures are written as {', '.join(PICTURES)} or {PAGE}; name such a file"
+            f"'{out}': pictures are written as {', '.join(WRITERS)}; name such a file"
         )
 
 
@@ -64,18 +78,12 @@ def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
     """
     check_plot_name(out)
     recording_file, *estimate_files = (Path(word) for word in words if is_file_name(word))
-    _, overrides = split_settings([word for word in words if not is_file_name(word)])
-    recording = _with_references_if_any(recording_file, overrides)
+    options = estimate_options([word for word in words if not is_file_name(word)])
+    recording = _with_references_if_any(recording_file, options)
     estimates = [read_estimate_table(file, recording) for file in estimate_files]
-    figure = recording.plot(*estimates)
+    content = WRITERS[out.suffix.lower()](recording.plot(*estimates))
     with written_aside(out) as aside:
-        if out.suffix.lower() == PAGE:
-            title = f"Sideslip angle on {as_text(recording.id)}"
-            caption = f"Recording {as_text(recording.id)} with {len(estimates)} estimates."
-            aside.write_bytes(page_of(Document(title, [Figure("drive", caption, figure)])))
-        else:
-            with paper_style():
-                figure.savefig(aside, format=out.suffix.lower()[1:], dpi=PNG_DPI)
+        aside.write_bytes(content)
     return {
         "out": str(out),
         "recording": recording.id,
@@ -85,9 +93,9 @@ def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
     }
 
 
-def _with_references_if_any(file: Path, overrides: Sequence[str]) -> Recording:
+def _with_references_if_any(file: Path, options: EstimateOptions) -> Recording:
     """A recording with the references that its data set declares; without them where the file lacks one."""
     try:
-        return read_table(file, overrides, references=True)
+        return read_checked(file, options.dataset, options.limits)
     except DataError:
-        return read_table(file, overrides)
+        return read_checked(file, without_references(options.dataset), options.limits)
