@@ -17,6 +17,7 @@ from typing import Any
 FOLDER = Path(__file__).resolve().parent
 TEXT = "text/plain"
 PNG = "image/png"
+PICTURE = FOLDER.parent / "docs" / "images" / "lap.png"  # the first one of the first notebook
 
 
 def notebooks() -> list[Path]:
@@ -80,6 +81,12 @@ def texts_of(outputs: list[dict[str, Any]]) -> list[str]:
     ]
 
 
+def pictures_of(results: list[list[dict[str, Any]]]) -> list[str]:
+    """Pictures among the outputs of cells, in base64."""
+    shown = [output.get("data", {}) for outputs in results for output in outputs]
+    return [data[PNG] for data in shown if PNG in data]
+
+
 def main() -> None:
     """Run the notebooks that are named, by default all, and write them with their outputs."""
     for path in [FOLDER / name for name in sys.argv[1:]] or notebooks():
@@ -87,6 +94,8 @@ def main() -> None:
         results = run_cells(notebook)
         for count, (cell, outputs) in enumerate(zip(code_cells(notebook), results, strict=True), 1):
             cell |= {"execution_count": count, "outputs": outputs}
+        if path == notebooks()[0]:
+            PICTURE.write_bytes(base64.b64decode(pictures_of(results)[0]))
         text = json.dumps(notebook, indent=1, ensure_ascii=False)
         path.write_text(f"{text}\n", encoding="utf-8")
         print(path.name)
