@@ -77,7 +77,7 @@ lint: $(INSTALLED) ## style, types, layers of imports, published results that ar
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy docs/*.py examples/*.py
+	$(BIN)/mypy docs/*.py tools/*.py
 	$(BIN)/lint-imports
 	$(BIN)/vehest report --check
 	$(BIN)/python -m vehest_papers.scorecard --check
@@ -112,7 +112,7 @@ docs: reference docs-site ## the reference pages that are made from the code and
 
 reference: $(INSTALLED)
 	$(BIN)/python docs/make_reference.py
-	$(BIN)/python docs/make_configuration.py
+	$(BIN)/python tools/make_configuration.py
 
 docs-site: $(INSTALLED) ## a site of all pages in build/site, every warning an error, every local link tried
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/site
@@ -123,12 +123,12 @@ screenshots: $(INSTALLED) docs-site ## pictures of the quickstart's page and of 
 	PYTHONPATH=tests $(BIN)/python tests/screenshots.py "$$(ls -td "$${VEHEST_OUTPUT:-outputs}"/report/quickstart-*/ | head -1)report.html" build/site docs/images
 
 notebooks: $(INSTALLED) ## run the notebooks of examples/ and store what their cells show (a minute)
-	$(BIN)/python examples/run_notebooks.py
+	$(BIN)/python tools/run_notebooks.py
 
 example_log: $(INSTALLED) ## docs/examples/lap.csv, the log of the how-to guides: four minutes of a simulated Ferrari 250 LM
 	$(BIN)/vehest downsample sim_quickstart rate_hz=20 vehicle@dataset.vehicle=ferrari_250_lm \
 	  'dataset.drives=[{id: lap, seed: 7, manoeuvre: {name: laps, course: palm_beach_like, duration: 240, severity: [0.92, 1.0]}}]'
-	$(BIN)/python docs/make_example_log.py "$$(ls -t "$${VEHEST_OUTPUT:-outputs}"/downsample/sim_quickstart-20hz-*/lap.parquet | head -1)"
+	$(BIN)/python tools/make_example_log.py "$$(ls -t "$${VEHEST_OUTPUT:-outputs}"/downsample/sim_quickstart-20hz-*/lap.parquet | head -1)"
 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
@@ -188,7 +188,7 @@ unseen_car_record: $(INSTALLED) ## vehest identify on drives of one car, on 200 
 	$(BIN)/python docs/unseen_car_record.py
 
 pretrained: sim_to_real ## the model for cars that nobody has trained on, from the study before
-	$(BIN)/python docs/make_pretrained.py
+	PYTHONPATH=docs $(BIN)/python tools/make_pretrained.py
 
 sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quickstart, simulated; SEEDS="range(3)")
 	$(BIN)/vehest sweep split=$(SPLIT) estimator=ksnn estimator.n_local=2,3,4,5,6 estimator.n_hidden=0,1,2,3 estimator.bias=true,false \
@@ -235,7 +235,7 @@ export_all: $(INSTALLED) ## every family in C against Python: digits, time, byte
 	$(BIN)/python benchmarks/export.py --out results/export
 
 examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
-	$(BIN)/python docs/compare_examples.py
+	$(BIN)/python tools/compare_examples.py
 
 bench-workflow: $(INSTALLED) ## a finished study run again, estimates of a minute and of 15 hours, against loading libraries and reading the file
 	$(BIN)/python benchmarks/workflow.py

@@ -140,7 +140,7 @@ class Export:
         """Write in.csv and expected.csv: the vectors of every export, or a drive with faults."""
         stepper = self.stepper()
         if faults:
-            samples = faulted(stepper.estimator, stepper._rate)
+            samples = faulted(stepper.estimator, stepper.input_rate_hz)
             times = np.full(len(next(iter(samples.values()))), np.nan)
         else:
             times, samples = drive_for(stepper)

@@ -21,7 +21,7 @@ FAULT_SECONDS = 2.0  # after which the clock resumes
 def stamped(export, kind):
     """Write in.csv, a drive whose clock fails for a while, and expected.csv; the number of the faulted sample."""
     stepper = export.stepper()
-    rate = stepper._rate
+    rate = stepper.input_rate_hz
     plain = drive(stepper.estimator, 5, 6.0)
     times = np.arange(0.0, 5.5, 1.0 / rate)
     samples = {
@@ -51,7 +51,7 @@ def test_every_clock_fault_has_the_same_health_and_reason_as_in_python(tmp_path,
         assert others == 0, kind
         if kind == "constant":
             out = np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)
-            calls = round(0.2 * export.stepper()._rate)
+            calls = round(0.2 * export.stepper().input_rate_hz)
             assert (out[first + calls :, 4][:calls] == 2).all()
             assert (out[first + calls :, 5][:calls] == 10_000 * CLOCK_STOPPED).all()
 

@@ -405,19 +405,59 @@ class Estimator(ABC):
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
         self.require_fitted()
-        samples = recording.stack(self.channels)
-        found, _ = self.run(samples, self.first_state(samples[0], dict(initial_state or {})))
-        covariance = found.pop("covariance", None)
-        innovations = found.pop("innovations", None)
+        sample = np.array([recording[name][0] for name in self.channels])
+        return self._run_over(recording, self.first_state(sample, dict(initial_state or {})))[0]
+
+    @property
+    def continues(self) -> bool:
+        """Whether an estimate may continue from the state after the last sample (`continue_from`)."""
+        return self.causal and self._overrides("run") and not self._overrides("_estimate_all")
+
+    def continue_from(self, recording: Recording, state: Any) -> tuple[Estimate, Any]:
+        """Estimate a recording from a state, where `continues`.
+
+        Parameters
+        ----------
+        recording : Recording
+            At the estimator's rate.
+        state : Any
+            After the last sample before the recording, as this method or `run` returned it, or by
+            `first_state`.
+
+        Returns
+        -------
+        tuple
+            The estimate, and the state after the last sample.
+
+        Raises
+        ------
+        DataError
+            A channel is missing, or the rate is another.
+        ConfigurationError
+            The estimator has not been fitted.
+        """
+        self.require_fitted()
+        return self._run_over(self._checked(recording), state)
+
+    def _run_over(self, recording: Recording, state: Any) -> tuple[Estimate, Any]:
+        """`run` over a checked recording: its estimate, and the state after the last sample."""
+        quantities, last_state = self.run(recording.stack(self.channels), state)
+        covariance = quantities.pop("covariance", None)
+        innovations = quantities.pop("innovations", None)
         if innovations is not None:
-            found["nis"], found["nis_dof"] = innovations()
-        return self._wrapped(
+            quantities["nis"], quantities["nis_dof"] = innovations()
+        estimate = self._wrapped(
             recording,
-            found.pop("vy"),
+            quantities.pop("vy"),
             covariance,
             self.covariance_of if covariance is not None else (),
-            **found,
+            **quantities,
         )
+        return estimate, last_state
+
+    def _overrides(self, method: str) -> bool:
+        """Whether a family replaces a method of this class."""
+        return getattr(type(self), method) is not getattr(Estimator, method)
 
     def online(self) -> Stepper:
         """A stepper in its initial state; raises `ConfigurationError`: it has not been fitted, or is not causal."""

@@ -85,7 +85,7 @@ def export_model(
     times, samples = (
         drive_for(exact)
         if drive is None
-        else (drive.time, {name: drive[name] for name in exact._channels})
+        else (drive.time, {name: drive[name] for name in exact.channels})
     )
     files["test_vectors.csv"] = table_text(
         ("time", *samples), np.column_stack([times, *samples.values()])

@@ -31,7 +31,7 @@ from vehest.export.rendering import (
     whole,
 )
 from vehest.trust import bands as band_rules
-from vehest.trust import clock, health_kernel, verdict, watch
+from vehest.trust import clock, health_kernel, verdict
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.front_end import CUTOFF, FrontEnd
 from vehest.trust.guard import (
@@ -46,7 +46,20 @@ from vehest.trust.named_arrays import views
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
 NEVER = "UINT32_MAX"
-MOST_OF = 1_000_000  # largest denominator of the ratio of rates
+MAX_RATIO_DENOMINATOR = 1_000_000  # of the ratio of rates
+HEALTH_CONSTANTS = (
+    *("PLAUSIBLE", "CLIP", "STEP_CLIP", "CALM", "CAP", "INVALID", "CLEAR"),
+    *("BRAKING", "SLIPPING", "LOST", "REVERSED", "HOLDS", "LARGER", "SLIDE_SECONDS"),
+    *("INSTANT_FEATURES", "FIRST_SMALL", "N_LEVELS"),
+    *("FREE", "MISSING", "FROZEN", "HELD", "JUMP", "OFFSET", "SIGN", "UNIT", "CONTRADICTION"),
+    *("OUTSIDE", "SPIN", "LOCKED", "DROPOUT"),
+)
+VERDICT_CONSTANTS = ("BAND_FACTORS", "WIDEST", "NO_ESTIMATE", "BEYOND_SPEED", "TOO_WIDE")
+CLOCK_CONSTANTS = (
+    *("CLOCK_STOPPED", "CLOCK_JUMPED", "CLOCK_UNEVEN", "REPEATED", "STOPPED", "EVEN_INTERVALS"),
+    *("MIN_ADVANCE", "FAULT_SECONDS", "RECOVERY_SECONDS", "RESET_SECONDS"),
+)
+"""Constants of the modules of `vehest.trust` that the templates have."""
 
 
 def brief(value: float) -> str:
@@ -136,15 +149,13 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
 def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
     """What the templates of the contract are filled in with."""
     estimator = stepper.estimator
-    monitor = stepper._monitor
-    guard = stepper._guard
+    monitor = stepper.monitor
     rate = float(estimator.settings.rate_hz)
-    front = stepper._front
-    top_speed, largest_tan, _, interval = stepper._watch._settings.tolist()
-    guards = [(guard_table(guard), "", "Limits at the method's rate.")]
+    front = stepper.front_end
+    guards = [(guard_table(stepper.guard), "", "Limits at the method's rate.")]
     if front is not None:
-        guards.append((guard_table(front._guard), "BUS_", "Limits at the bus's rate."))
-    health = health_table(monitor._health)
+        guards.append((guard_table(front.guard), "BUS_", "Limits at the bus's rate."))
+    health = health_table(monitor.packed_health)
     number = partial(limit, precision=precision)
     return {
         "title": ascii_only(title),
@@ -152,9 +163,9 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "channels": channels_of(estimator),
         "names": list(estimator.channels),
         "skippable": [name in estimator.skippable for name in estimator.channels],
-        "numbers": monitor._numbers,
+        "numbers": monitor.channel_numbers,
         "rate_hz": rate,
-        "input_rate_hz": float(stepper._rate),
+        "input_rate_hz": float(stepper.input_rate_hz),
         "horizon_steps": estimator.horizon_steps,
         "warm_up_steps": estimator.warm_up_steps,
         "guards": guards,
@@ -162,25 +173,20 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "standstill_speed": STANDSTILL_SPEED,
         "standstill_yaw_rate": STANDSTILL_YAW_RATE,
         "front": front_end_table(front) if front is not None else None,
-        "interval": interval,
-        "top_speed": top_speed,
-        "largest_tan_sideslip": largest_tan,
-        "remembering": math.exp(-interval / watch.REMEMBERED_SECONDS),
-        "fading": math.exp(-interval / watch.FADE_SECONDS),
-        "w": vars(watch),
-        "clock": stepper._clock,
-        "clock_rules": vars(clock),
-        "verdict": vars(verdict),
-        "k": vars(health_kernel),
+        "watch": stepper.watch.c_values(),
+        "clock": stepper.clock,
+        "clock_rules": {name: getattr(clock, name) for name in CLOCK_CONSTANTS},
+        "verdict": {name: getattr(verdict, name) for name in VERDICT_CONSTANTS},
+        "k": {name: getattr(health_kernel, name) for name in HEALTH_CONSTANTS},
         "h": health,
         "r": number,
         "reals": lambda values: braced(values, number),
         "whole": whole,
         "truths": truths,
         "brief": brief,
-        "starts_anew": monitor._starts_anew,
-        "adapts": monitor._adapts,
-        "persistent_steps": monitor._persistent_steps,
+        "starts_anew": monitor.starts_anew,
+        "adapts": monitor.adapts,
+        "persistent_steps": monitor.persistent_steps,
         "bands": band_table(stepper),
         "pi": math.pi,
     }
@@ -188,13 +194,13 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
 
 def guard_table(guard: Guard) -> dict[str, Any]:
     """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged and that a new level has to stand."""
-    runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard._limits[:, 3]]
-    limits = _endless(guard._limits[:, [0, 1, 2, 4, 5]]).tolist()
+    runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard.limits[:, 3]]
+    limits = _endless(guard.limits[:, [0, 1, 2, 4, 5]]).tolist()
     return {
         "limits": limits,
         "runs": runs,
-        "bridged": int(guard._settings[2]),
-        "persists": int(guard._settings[3]),
+        "bridged": guard.bridged_samples,
+        "persists": guard.persistent_samples,
     }
 
 
@@ -205,10 +211,10 @@ def _endless(values: FloatArray) -> FloatArray:
 
 def front_end_table(front: FrontEnd) -> dict[str, Any]:
     """Sections of the low-pass, and of how many samples how many rows are made."""
-    ratio = Fraction(front._ratio).limit_denominator(MOST_OF)
-    rate = front._ratio * front._guard.rate_hz
+    ratio = Fraction(front.ratio).limit_denominator(MAX_RATIO_DENOMINATOR)
+    rate = front.ratio * front.guard.rate_hz
     return {
-        "sections": front._sections.tolist(),
+        "sections": front.sections.tolist(),
         "every": ratio.numerator,
         "of": ratio.denominator,
         "delay": front.delay,
@@ -218,11 +224,11 @@ def front_end_table(front: FrontEnd) -> dict[str, Any]:
 
 def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
     """Factors, squared floors, weights and domain of the bands; None where none are calibrated."""
-    packed = stepper._monitor._bands
+    packed = stepper.monitor.packed_bands
     if packed is None:
         return None
-    head = packed.numbers[: band_rules._HEAD]
-    terms = packed.numbers[band_rules._HEAD :].reshape(3, -1)
+    head = packed.numbers[: band_rules.HEAD_LENGTH]
+    terms = packed.numbers[band_rules.HEAD_LENGTH :].reshape(3, -1)
     return {
         "factor_vy": head[0],
         "factor_sideslip": head[1],
@@ -233,8 +239,8 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
         "weights_sideslip": terms[1],
         "largest": terms[2],
         "terms": ("P", "1", "vx", "ax", "ay", "yaw rate vx", "steer vx", "vy"),
-        "first_feature": band_rules._FIRST_FEATURE,
-        "farthest": stepper._monitor._farthest,
+        "first_feature": band_rules.FIRST_FEATURE,
+        "farthest": stepper.monitor.largest_vy,
     }
 
 

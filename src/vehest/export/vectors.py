@@ -58,7 +58,7 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
     The faults: values that are NaN, infinite or beyond physics, one channel after another; a channel that stands still; an offset; rows
     that are lost for 0.03 s and for 0.7 s; a row that comes twice.
     """
-    rate = stepper._rate
+    rate = stepper.input_rate_hz
     steps = round(SECONDS * rate)
     times = np.arange(steps) / rate
     samples = _motion(stepper, times, rate)
@@ -69,8 +69,8 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
         samples[name][first + 3] = -1e30
         if name in stepper.estimator.skippable or at == 0:
             samples[name][round(4.0 * rate) : round(4.3 * rate)] = math.nan
-    if stepper._front is None or not len(
-        stepper._front._sections
+    if stepper.front_end is None or not len(
+        stepper.front_end.sections
     ):  # behind a low-pass it stands still once digits run out: sooner in float
         samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][
             round(5.0 * rate)
@@ -86,8 +86,8 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
 
 def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
     """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that is the same on every machine."""
-    names = list(stepper._channels)
-    limits = stepper._guard._limits[:, :2]
+    names = list(stepper.channels)
+    limits = stepper.guard.limits[:, :2]
     sizes, usual = _sizes(stepper)
     speed = 1.0 + 0.2 * np.sin(0.7 * times)
     swerve = np.sin(2.0 * times) * np.sin(0.3 * times)
@@ -113,8 +113,8 @@ def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str
 
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
     """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
-    names = stepper._channels
-    table = health_table(stepper._monitor._health)
+    names = stepper.channels
+    table = health_table(stepper.monitor.packed_health)
     if table is not None:
         return dict(zip(names, table["largest"].tolist(), strict=True)), dict(
             zip(names, table["usual"].tolist(), strict=True)

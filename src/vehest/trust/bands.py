@@ -55,8 +55,8 @@ TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
 MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
 MIN_TERM = 1e-30  # of the terms' sizes that are not 0
 MAX_TERM = 1e12  # of these and of weights
-_FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
-_HEAD = 5  # numbers before the weights in a `PackedBands`
+FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
+HEAD_LENGTH = 5  # numbers before the weights in a `PackedBands`
 
 Blocks = Literal["range", "turn"]
 
@@ -187,7 +187,7 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
 
     NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and ``numbers`` are of `PackedBands`.
     """
-    n_terms = (len(numbers) - _HEAD) // 3
+    n_terms = (len(numbers) - HEAD_LENGTH) // 3
     terms = np.empty(n_terms)
     for k in range(len(vy)):
         if not math.isfinite(vy[k]):
@@ -206,14 +206,14 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
         squared_sideslip = 0.0
         wider = 1.0
         for j in range(n_terms):
-            largest = numbers[_HEAD + 2 * n_terms + j]
+            largest = numbers[HEAD_LENGTH + 2 * n_terms + j]
             size = abs(terms[j])
             if not math.isfinite(size):
                 size = largest
-            if j >= _FIRST_FEATURE and largest > 0.0 and size / largest > wider:
+            if j >= FIRST_FEATURE and largest > 0.0 and size / largest > wider:
                 wider = size / largest
-            squared_vy += numbers[_HEAD + j] * size * size
-            squared_sideslip += numbers[_HEAD + n_terms + j] * size * size
+            squared_vy += numbers[HEAD_LENGTH + j] * size * size
+            squared_sideslip += numbers[HEAD_LENGTH + n_terms + j] * size * size
         bands[k, 0] = numbers[0] * wider * math.sqrt(max(squared_vy, numbers[2]))
         bands[k, 1] = math.pi
         if math.isfinite(vx):
@@ -313,7 +313,7 @@ def calibrated(
     speed = np.maximum(np.where(np.isfinite(vx), vx, LOWEST_SPEED), LOWEST_SPEED)
     usable = np.isfinite(terms).any(axis=0)
     if usable[TERMS.index("variance")]:  # a filter: of its variance and a constant alone
-        usable[_FIRST_FEATURE:] = False
+        usable[FIRST_FEATURE:] = False
     names = [name for name, chosen in zip(TERMS, usable, strict=True) if chosen]
     filled = np.where(np.isfinite(terms), terms, largest)[:, usable]
     errors = np.concatenate([piece.errors[piece.known] for piece in training])

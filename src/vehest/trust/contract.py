@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from numbers import Real
 from typing import Any
 
@@ -79,7 +78,6 @@ class GuardedRun:
     ) -> None:
         limits = limits_for(estimator, trust)
         rate = estimator.settings.rate_hz
-        kind = type(estimator)
         self.estimator = estimator
         self.initial_state = initial_state
         self.guard = Guard(
@@ -87,12 +85,7 @@ class GuardedRun:
         )
         self.monitor = Monitor(estimator, trust, elsewhere=elsewhere)
         self.watch = Watch(limits, estimator.warm_up_steps, rate)
-        self._has_state = (
-            estimator.causal
-            and kind._estimate_all is Estimator._estimate_all
-            and kind.run is not Estimator.run
-        )
-        self.takes_parts = self._has_state or estimator.warm_up_steps > 0
+        self.takes_parts = estimator.continues or estimator.warm_up_steps > 0
         self._begun = False
         self._speed = np.full(1, np.nan)
         self._state: Any = None  # of the estimator after the last row
@@ -204,9 +197,9 @@ class GuardedRun:
             r.kind,
             frozenset(self.estimator.skippable),
         )
-        estimate = self._going_on(state).estimate(
-            [piece], None if self._begun or start else self.initial_state
-        )[0]
+        estimate = self._estimated(
+            piece, state, None if self._begun or start else self.initial_state
+        )
         shift = slice(len(window) + extra, len(window) + extra + end - start)
         if "vx" in estimate.channels:
             self.vx[start:end] = estimate["vx"][shift]
@@ -224,18 +217,19 @@ class GuardedRun:
                 ]
         return np.asarray(estimate["vy"][shift])
 
-    def _going_on(self, state: Any) -> Estimator:
-        """The estimator, which begins with a state unless it is None, and leaves the one after its last row."""
-        if not self._has_state:
-            return self.estimator
-        own = copy(self.estimator)
-
-        def run(samples: FloatArray, first: Any) -> tuple[dict[str, Any], Any]:
-            found, self._state = self.estimator.run(samples, first if state is None else state)
-            return found, self._state
-
-        vars(own)["run"] = run
-        return own
+    def _estimated(
+        self, piece: Recording, state: Any, initial_state: Mapping[str, float] | None
+    ) -> Estimate:
+        """The estimate of a piece from a state, which is updated, or from the initial state of a protocol where it is None."""
+        estimator = self.estimator
+        if not estimator.continues:
+            return estimator.estimate([piece], initial_state)[0]
+        if state is None:
+            sample = np.array([piece[name][0] for name in estimator.channels])
+            is_used = initial_state is not None and not estimator.ignores_initial_state
+            state = estimator.first_state(sample, dict(initial_state or {}) if is_used else {})
+        estimate, self._state = estimator.continue_from(piece, state)
+        return estimate
 
     def _estimate(self, verdict: Health) -> Estimate:
         """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
@@ -320,24 +314,24 @@ class GuardedStepper(Stepper):
         clock: SampleClock | None = None,
     ) -> None:
         self.estimator = estimator
-        self._channels = tuple(estimator.channels)
+        self.channels = tuple(estimator.channels)
         self._stepper = estimator.online()
         self._fresh = True
         self.horizon_steps = estimator.horizon_steps
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
-        self._front = (
+        self.front_end = (
             FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate)
             if bus_rate_hz is not None
             else None
         )
-        self._rate = rate if bus_rate_hz is None else bus_rate_hz
-        self._guard = Guard(
+        self.input_rate_hz = rate if bus_rate_hz is None else bus_rate_hz
+        self.guard = Guard(
             estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator)
         )
-        self._watch = Watch(limits, estimator.warm_up_steps, rate)
+        self.watch = Watch(limits, estimator.warm_up_steps, rate)
         filtered = bus_rate_hz is not None and bus_rate_hz > rate * (1 + 1e-6)
-        self._monitor = Monitor(estimator, trust, elsewhere=elsewhere, behind_front_end=filtered)
+        self.monitor = Monitor(estimator, trust, elsewhere=elsewhere, behind_front_end=filtered)
         self._row = np.empty((1, len(estimator.channels)))
         self._motion = np.full((1, 3), np.nan)
         self._raw = np.empty(1)
@@ -346,7 +340,7 @@ class GuardedStepper(Stepper):
         self._places = [
             estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
         ]
-        self._clock = SampleClock(self._rate) if clock is None else clock
+        self.clock = SampleClock(self.input_rate_hz) if clock is None else clock
         self._judges_samples = clock is None
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
@@ -355,7 +349,7 @@ class GuardedStepper(Stepper):
     @property
     def delay(self) -> float:
         """Of slow signals through the filter from the bus's rate [s]; 0 without one."""
-        return self._front.delay if self._front is not None else 0.0
+        return self.front_end.delay if self.front_end is not None else 0.0
 
     def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:
         """Take the sample received at one instant.
@@ -371,19 +365,19 @@ class GuardedStepper(Stepper):
         """
         if not isinstance(time, Real):
             if self._judges_samples:
-                self._clock.unstamped()
+                self.clock.unstamped()
             return self._received(sample)
         try:
-            missing = self._clock.missing_before(float(time))
+            missing = self.clock.missing_before(float(time))
         except OverflowError:  # a whole number beyond every float
-            missing = self._clock.missing_before(math.inf)
+            missing = self.clock.missing_before(math.inf)
         if missing == STOPPED:
             self._received(None)
         elif missing != REPEATED:
             for _ in range(missing):
                 self._received(None)
             self._received(sample)
-        reason = 10_000.0 * self._clock.fault
+        reason = 10_000.0 * self.clock.fault
         if reason and self.last.get("health_reason") != reason:  # between two estimates
             self.last = {**self.last, "health": float(INVALID), "health_reason": reason}
         return self.last
@@ -393,23 +387,23 @@ class GuardedStepper(Stepper):
         self._row[0] = math.nan
         if sample is not None:
             try:
-                self._row[0] = [sample[name] for name in self._channels]
+                self._row[0] = [sample[name] for name in self.channels]
             except NO_NUMBER:
-                for column, name in enumerate(self._channels):
+                for column, name in enumerate(self.channels):
                     with suppress(*NO_NUMBER):
                         self._row[0, column] = sample[name]
-        if self._front is not None:
-            row = self._front(self._row)
+        if self.front_end is not None:
+            row = self.front_end(self._row)
         if row is not None:
             self.last = self._stepped(row)
         return self.last
 
     def _stepped(self, row: FloatArray) -> dict[str, float]:
-        cleaned = self._guard(row)
-        verdict = self._monitor.before(row, cleaned)
-        if self._clock.fault:
+        cleaned = self.guard(row)
+        verdict = self.monitor.before(row, cleaned)
+        if self.clock.fault:
             verdict.status[0] = INVALID
-            verdict.reason[0] = self._clock.fault * 10_000
+            verdict.reason[0] = self.clock.fault * 10_000
         self._raw[0], vx, self._variance[0] = self._estimated(cleaned)
         motion = self._motion
         flow = cleaned.flow[0]
@@ -418,7 +412,7 @@ class GuardedStepper(Stepper):
             motion[0, column] = cleaned.rows[0, at] if known else math.nan
         if math.isnan(motion[0, 0]):
             motion[0, 0] = vx
-        watched = self._watch(self._raw, motion, cleaned.flow)
+        watched = self.watch(self._raw, motion, cleaned.flow)
         if watched.lost:
             self._stepper = self.estimator.online()
             self._fresh = True
@@ -426,14 +420,14 @@ class GuardedStepper(Stepper):
         vy = float(watched.vy[0])
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
-        bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
+        bands = self.monitor.after(verdict, watched, cleaned, self._vx, self._variance)
         vx = float(self._vx[0])
         found = {
             **self._others,
             "vy": vy,
             "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx),
         }
-        if self._monitor.has_bands:
+        if self.monitor.has_bands:
             found["band_vy"] = float(bands[0, 0])
             found["band_sideslip"] = float(bands[0, 1])
         found["health"] = float(verdict.status[0])
@@ -449,7 +443,7 @@ class GuardedStepper(Stepper):
         if flow == RESTART and not self._fresh:
             self._stepper = self.estimator.online()
         self._fresh = False
-        found = self._stepper.step(dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True)))
+        found = self._stepper.step(dict(zip(self.channels, cleaned.rows[0].tolist(), strict=True)))
         self._others = {
             name: value for name, value in found.items() if name not in ("vy", "vy_variance")
         }

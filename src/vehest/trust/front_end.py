@@ -87,41 +87,41 @@ class FrontEnd:
             name: replace(own, jump=max(usual[name].jump, own.jump))
             for name, own in (limits.channels or usual).items()
         }
-        self._guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)
-        self._ratio = rate_hz / bus_rate_hz
-        self._phase = 1.0 - self._ratio  # the first sample is passed on
+        self.guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)
+        self.ratio = rate_hz / bus_rate_hz
+        self._phase = 1.0 - self.ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):
-            self._sections = scipy.signal.butter(
+            self.sections = scipy.signal.butter(
                 ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos"
             )
         else:
-            self._sections = np.zeros((0, 6))
-        self._state = np.full((len(self._sections), len(channels), 2), math.nan)
+            self.sections = np.zeros((0, 6))
+        self._state = np.full((len(self.sections), len(channels), 2), math.nan)
         self._held = np.full(len(channels), math.nan)
 
     @property
     def delay(self) -> float:
         """Of slow signals through the filter [s]."""
-        if not len(self._sections):
+        if not len(self.sections):
             return 0.0
-        numerator, denominator = scipy.signal.sos2tf(self._sections)
+        numerator, denominator = scipy.signal.sos2tf(self.sections)
         return (
             float(scipy.signal.group_delay((numerator, denominator), w=[1e-6])[1][0])
-            / self._guard.rate_hz
+            / self.guard.rate_hz
         )
 
     def __call__(self, row: FloatArray) -> FloatArray | None:
         """Take one row, (1, C); returns a row for the estimator where one is due, NaN what was not measured."""
-        cleaned = self._guard(row)
+        cleaned = self.guard(row)
         waits = bool(cleaned.flow[0] == WAIT)
         measured = cleaned.measured[0]
         if waits:
             self._state[:] = math.nan
         out = np.where(measured, cleaned.rows[0], self._held)
         self._held = out.copy()
-        if len(self._sections) and not waits:
-            filter_row(out, self._sections, self._state)
-        self._phase += self._ratio
+        if len(self.sections) and not waits:
+            filter_row(out, self.sections, self._state)
+        self._phase += self.ratio
         if self._phase < 1.0 - SLACK:
             return None
         self._phase -= 1.0

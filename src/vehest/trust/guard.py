@@ -244,6 +244,13 @@ class Guard:
 
     Channels are in the order of the columns; those without ``limits`` get those of any car. An estimator that ``remembers`` more than a
     window starts anew at a jump that is accepted after all.
+
+    Attributes
+    ----------
+    limits : ndarray of shape (C, 6)
+        Low, high, largest jump, longest run [samples], lower and upper stop of each channel.
+    bridged_samples, persistent_samples : int
+        Missing samples that are bridged at most; samples after which a new level is accepted.
     """
 
     def __init__(
@@ -258,7 +265,7 @@ class Guard:
         self.rate_hz = rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
-        self._limits = np.array(
+        self.limits = np.array(
             [
                 (row.low, row.high, row.jump, run, *row.stops)
                 for row, run in zip(rows, runs, strict=True)
@@ -266,9 +273,10 @@ class Guard:
         )
         self._skippable = np.array([name in skippable for name in channels])
         places = [channels.index(name) if name in channels else -1 for name in ("vx", "yaw_rate")]
-        persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
+        self.bridged_samples = max(round(BRIDGED_SECONDS * rate_hz), 1)
+        self.persistent_samples = max(round(PERSISTS_SECONDS * rate_hz), 2)
         self._settings = np.array(
-            [*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64
+            [*places, self.bridged_samples, self.persistent_samples, int(remembers)], np.int64
         )
         self.state = np.zeros((len(channels) + 1, 6))
         self.state[:-1, [0, 3, 4]] = np.nan  # nothing accepted, no last value, no candidate
@@ -280,7 +288,7 @@ class Guard:
         measured = np.empty(rows.shape, np.bool_)
         flow = np.empty(len(rows), np.int8)
         guard_rows(
-            rows, self.state, self._limits, self._skippable, self._settings, clean, measured, flow
+            rows, self.state, self.limits, self._skippable, self._settings, clean, measured, flow
         )
         return Cleaned(clean, measured, flow)
 

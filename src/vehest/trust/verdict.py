@@ -70,36 +70,34 @@ class Monitor:
         behind_front_end: bool = False,
     ) -> None:
         bands, health = (trust.bands, trust.health) if trust is not None else (None, None)
-        self._health = (
+        self.packed_health = (
             health.packed(behind_front_end=behind_front_end) if health is not None else None
         )
         self._state = health.start() if health is not None else np.empty(0)
-        self._bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
+        self.packed_bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
         self.has_bands = bands is not None
-        self._farthest = bands.largest.get("vy", 0.0) if bands is not None else 0.0
-        self._numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
+        self.largest_vy = bands.largest.get("vy", 0.0) if bands is not None else 0.0
+        self.channel_numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
-        self._starts_anew = starts_anew(estimator)
-        self._adapts = bool(getattr(estimator, "adapts", False))
-        self._persistent_steps = max(
-            round(PERSISTENT_FAULT_SECONDS * estimator.settings.rate_hz), 1
-        )
+        self.starts_anew = starts_anew(estimator)
+        self.adapts = bool(getattr(estimator, "adapts", False))
+        self.persistent_steps = max(round(PERSISTENT_FAULT_SECONDS * estimator.settings.rate_hz), 1)
         self._fault = np.zeros(2)
 
     def before(self, received: FloatArray, cleaned: Cleaned) -> Health:
         """Health of rows (T, C) as received; in ``cleaned``, accused channels are taken out and restarts added, in place."""
-        if self._health is None:
+        if self.packed_health is None:
             return Health(*np.zeros((3, len(received))))
-        found = health_rows(self._health, received, cleaned.measured, self._state)
+        found = health_rows(self.packed_health, received, cleaned.measured, self._state)
         isolate_rows(
             found.status,
             found.reason,
-            self._numbers,
+            self.channel_numbers,
             self._skippable,
-            self._starts_anew,
-            self._adapts,
-            self._persistent_steps,
+            self.starts_anew,
+            self.adapts,
+            self.persistent_steps,
             *cleaned,
             self._fault,
         )
@@ -126,15 +124,21 @@ class Monitor:
             cleaned.flow,
             cleaned.measured,
             self._needed,
-            self._numbers,
+            self.channel_numbers,
             verdict.status,
             verdict.reason,
         )
         bands = np.full((len(watched.vy), 2), np.nan)
-        if self._bands is not None:
-            band_rows(cleaned.rows, watched.vy, variance, *self._bands, bands)
+        if self.packed_bands is not None:
+            band_rows(cleaned.rows, watched.vy, variance, *self.packed_bands, bands)
             widen_rows(
-                verdict.status, verdict.reason, watched.marks, watched.vy, vx, self._farthest, bands
+                verdict.status,
+                verdict.reason,
+                watched.marks,
+                watched.vy,
+                vx,
+                self.largest_vy,
+                bands,
             )
         return bands
 

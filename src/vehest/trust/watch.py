@@ -43,8 +43,10 @@ class Watch:
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
+        self.limits = limits
+        self.interval = 1.0 / rate_hz
         self._settings = np.array(
-            [limits.top_speed, limits.largest_tan_sideslip, float(warm_up), 1.0 / rate_hz]
+            [limits.top_speed, limits.largest_tan_sideslip, float(warm_up), self.interval]
         )
         self.state = np.zeros(6)
         self.state[0] = math.nan  # no estimate yet
@@ -58,6 +60,22 @@ class Watch:
         marks = np.zeros(len(vy), np.int8)
         done, lost = watch_rows(vy, motion, flow, self.state, self._settings, out, marks)
         return Watched(out[:done], marks[:done], bool(lost))
+
+    def c_values(self) -> dict[str, float]:
+        """Values that the template of an export needs."""
+        return {
+            "top_speed": float(self.limits.top_speed),
+            "largest_tan_sideslip": float(self.limits.largest_tan_sideslip),
+            "interval": self.interval,
+            "remembering": math.exp(-self.interval / REMEMBERED_SECONDS),
+            "fading": math.exp(-self.interval / FADE_SECONDS),
+            "REMEMBERED_SECONDS": REMEMBERED_SECONDS,
+            "FADE_SECONDS": FADE_SECONDS,
+            "SPIN_RATE": SPIN_RATE,
+            "SPIN_SECONDS": SPIN_SECONDS,
+            "LEAST_SPEED": LEAST_SPEED,
+            "LOST_SECONDS": LOST_SECONDS,
+        }
 
 
 @entry(nogil=True)

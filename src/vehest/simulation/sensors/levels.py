@@ -279,7 +279,7 @@ RACE = SensorLevels(
 
 # Read off the F1TENTH recordings that the learned-dynamics UKF trains on, iros_hoons_1, where the comment says so: vibration and noise of
 # ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by the motor's speed
-# (docs/compare_tyre_sets.py).
+# (tools/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
     # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which are not measured there.
     **_gyros(

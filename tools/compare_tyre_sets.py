@@ -1,6 +1,6 @@
 """The simulated tyre sets beside the recording that the learned-dynamics UKF trains on, iros_hoons_1.
 
-    VEHEST_DATA=FOLDER python docs/compare_tyre_sets.py
+    VEHEST_DATA=FOLDER python tools/compare_tyre_sets.py
 
 prints what conf/vehicle/f1tenth.yaml and the sensors ``small_car`` take from that recording, then a Markdown table of quantiles. Of the
 paper's other recordings, which are for tests, nothing is read.

@@ -1,4 +1,4 @@
-"""Run the notebooks of this folder and store what their cells print and draw: `python examples/run_notebooks.py`.
+"""Run the notebooks of examples/ and store what their cells print and draw (`make notebooks`).
 
 Cells run in this process, in order, in one namespace, as a fresh kernel would run them.
 """
@@ -14,7 +14,7 @@ from contextlib import chdir, redirect_stdout
 from pathlib import Path
 from typing import Any
 
-FOLDER = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
 TEXT = "text/plain"
 PNG = "image/png"
 PICTURE = FOLDER.parent / "docs" / "images" / "lap.png"  # the first one of the first notebook

@@ -20,7 +20,7 @@ from vehest.run.table_records import record_tables
 
 VERSION = "1"
 """Raised when the numbers of its tables move."""
-EXAMPLES = Path(__file__).with_name("examples")
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 RESULT = Path(__file__).parents[1] / "results" / "examples" / "leaderboard.csv"
 CLASSES = {
     "saturating_ekf": "SaturatingEkf",
@@ -110,7 +110,7 @@ def main() -> None:
         [RESULT],
         "make examples",
         [
-            "script docs/compare_examples.py",
+            "script tools/compare_examples.py",
             "data sim_quickstart",
             *(f"evaluate {name}" for name in baselines),
         ],

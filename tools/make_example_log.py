@@ -12,7 +12,7 @@ import numpy as np
 
 import vehest
 
-OUT = Path(__file__).parent / "examples" / "lap.csv"
+OUT = Path(__file__).parents[1] / "docs" / "examples" / "lap.csv"
 STEERING_RATIO = 16.0
 COLUMNS = "Timestamp,Speed,GyroZ,AccX,AccY,SteerWheel,SlipAngle"
 FORMATS = ("%.2f", "%.3f", "%.3f", "%.3f", "%.3f", "%.2f", "%.3f")
