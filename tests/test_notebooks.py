@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from run_notebooks import code_cells, notebooks, pictures_of, read_notebook, run_cells, texts_of
 
 import vehest
 from place import run_vehest
-from run_notebooks import code_cells, notebooks, pictures_of, read_notebook, run_cells, texts_of
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.store import read_estimate
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,8 +125,13 @@ def test_speed_that_is_not_there_is_one_clear_error():
     log = pd.read_csv(LOG).iloc[:100]
     columns = {name: text for name, text in COLUMNS.items() if name != "vx"}
     recording = vehest.read_recording(log, columns=columns)
-    with pytest.raises(vehest.data.errors.DataError, match="no channel 'vx'"):
+    with pytest.raises(DataError, match="no channel 'vx'"):
         vehest.estimate(recording, wheelbase=2.4)
+
+
+def test_a_dataframe_that_was_not_read_is_refused_with_the_remedy():
+    with pytest.raises(ConfigurationError, match=r"as vehest\.read_recording"):
+        vehest.estimate(pd.read_csv(LOG))
 
 
 def test_score_of_an_estimate_is_that_of_its_model():

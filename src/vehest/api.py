@@ -251,6 +251,10 @@ def estimate(
     if isinstance(recording, Estimator):  # the order of earlier versions
         recording, model = cast(Recording, model), recording
         warnings.warn("use vehest.estimate(recording, model)", DeprecationWarning, stacklevel=2)
+    if not isinstance(recording, Recording):
+        raise ConfigurationError(
+            f"pass a recording, as vehest.read_recording(log, columns=…) reads it, not a {type(recording).__name__}"
+        )
     if wheelbase is not None:
         recording = replace(recording, car=replace(recording.car, wheelbase=wheelbase))
     if model is None:

@@ -108,6 +108,13 @@ def test_course_follows_a_circle():
     assert np.hypot(points[:, 0], points[:, 1] - 20.0) == pytest.approx(20.0, abs=0.01)
 
 
+def test_two_estimates_by_one_estimator_differ_in_name_and_dash(drive):
+    figure = drive.plot(estimate_of(drive), estimate_of(drive, error=0.3))
+    lines = {line.get_label(): line for line in axes_of(figure, "v [m/s]").get_lines()}
+    assert {"mine", "mine (2)"} <= lines.keys()
+    assert lines["mine"].get_linestyle() != lines["mine (2)"].get_linestyle()
+
+
 def test_what_is_not_there_is_left_out(drive):
     bare = drive.without_references().select(["vx", "ay"])
     assert labels(bare.plot()) == ["speed u [m/s]", "$a_y$ [m/s²]"]

@@ -76,7 +76,7 @@ def test_units_of_the_attributes_count_and_those_after_the_column_precede_them(l
         ({"vy": "Speed:m/s"}, ConfigurationError, "there is no channel 'vy'"),
         ({"vx": "Speed:deg"}, ConfigurationError, "unit 'deg' cannot be converted to 'm/s'"),
         ({"vx": "Note:m/s"}, DataError, "column 'Note' contains text; numbers are needed"),
-        ({"time": None}, DataError, "no column 'time' (it has Clock, Speed"),
+        ({"time": None}, DataError, "no columns 'time' (it has Clock, Speed"),
     ],
 )
 def test_each_mistake_is_one_clear_error(log, changed, error, says):
@@ -84,6 +84,11 @@ def test_each_mistake_is_one_clear_error(log, changed, error, says):
     message = refusal(lambda: read_frame(log, TABLE, columns), error)
     assert says in message
     assert "\n" not in message
+
+
+def test_a_column_that_is_there_twice_is_refused(log):
+    twice = pd.concat([log, log[["Speed"]]], axis=1)
+    assert "2 columns 'Speed'" in refusal(lambda: read_frame(twice, TABLE, COLUMNS), DataError)
 
 
 def test_a_table_without_channels_names_the_remedy(log):

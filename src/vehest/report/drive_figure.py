@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -66,6 +66,7 @@ CHANNEL_COLOUR = "#33373b"
 COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to the left
 HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}  # in
 
+DASHES = ("solid", "dashed", "dotted", "dashdot")  # of estimates by the same estimator
 NOTEBOOK_DPI = 110
 MIN_AXIS = 0.1  # deg, of estimate over reference
 Draw = Callable[[Axes], None]
@@ -165,16 +166,21 @@ def _drive_of(
     time = clock.time[(clock.time >= first) & (clock.time < end)]
     if not len(time):
         raise DataError(f"{clock!r} has no samples between {first:g} s and {end:g} s")
-    lines = lines_of(dict.fromkeys((estimate.estimator, "") for estimate in estimates))
-    traces = [
-        Traces(
-            _title_of(estimate.estimator),
-            lines[estimate.estimator, ""],
-            _at(time, estimate, "vy"),
-            np.degrees(_at(time, estimate, "sideslip")),
+    names = [estimate.estimator for estimate in estimates]
+    lines = lines_of((name, "") for name in names)
+    traces = []
+    for place, estimate in enumerate(estimates):
+        name = names[place]
+        count = names[:place].count(name)  # earlier estimates of the same estimator
+        line = lines[name, ""]
+        traces.append(
+            Traces(
+                f"{_title_of(name)} ({count + 1})" if count else _title_of(name),
+                replace(line, dash=DASHES[count % len(DASHES)]) if count else line,
+                _at(time, estimate, "vy"),
+                np.degrees(_at(time, estimate, "sideslip")),
+            )
         )
-        for estimate in estimates
-    ]
     band = health = None
     if estimates:
         channels = estimates[0].channels
@@ -265,6 +271,7 @@ def _panels_below(drive: Drive, estimates: Sequence[Estimate]) -> list[Draw]:
         return []
     panels: list[Draw] = []
     motion = [*drive.estimates, *([drive.reference] if drive.reference else [])]
+    motion = [traces for traces in motion if np.isfinite(traces.sideslip).any()]
     if motion and {"vx", "yaw_rate"} <= recording.channels.keys():
         panels.append(partial(_draw_course, recording, motion[0]))
     if drive.reference is not None and drive.estimates:

@@ -140,12 +140,13 @@ def read_frame(
             "name them, as in columns={'vx': 'Speed:km/h', 'ay': '-AccY:m/s²'}"
         )
     wanted = source.columns_read(names)
-    if missing := [name for name in wanted if name not in names]:
-        raise DataError(
-            f"{where} has no column '{missing[0]}' (it has {listed(names)}); "
-            "name it, as in columns={'time': 'Timestamp:s'}"
-        )
-    table = {name: _numbers(frame[name], where) for name in wanted}
+    for name in wanted:
+        if names.count(name) != 1:
+            raise DataError(
+                f"{where} has {names.count(name) or 'no'} columns '{printable(name)}' (it has {listed(names)}); "
+                "rename all but one, or name another, as in columns={'time': 'Timestamp:s'}"
+            )
+    table = {name: _numbers(frame.iloc[:, names.index(name)], where) for name in wanted}
     return source.recording_of(table, str(frame.attrs.get("name", "frame")))
 
 
