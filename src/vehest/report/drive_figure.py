@@ -167,7 +167,7 @@ def _drive_of(
     if not len(time):
         raise DataError(f"{clock!r} has no samples between {first:g} s and {end:g} s")
     names = [estimate.estimator for estimate in estimates]
-    lines = lines_of((name, "") for name in names)
+    lines = lines_of(dict.fromkeys((name, "") for name in names))
     traces = []
     for place, estimate in enumerate(estimates):
         name = names[place]
