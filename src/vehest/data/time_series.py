@@ -14,7 +14,7 @@ from vehest.constants import FloatArray
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_REPR_CHANNELS = 5  # names in a `repr`, which is to fit on a line
+MAX_REPR_CHANNELS = 4  # names in a `repr`, which is to fit on a line
 
 
 class TimeSeries(ABC):
@@ -53,8 +53,7 @@ class TimeSeries(ABC):
         return self.start_time + self.duration
 
     def _describe(self) -> str:
-        size = f"{len(self)} samples at {self.rate_hz:.6g} Hz, {self.duration:.5g} s"
-        return f"{type(self).__name__} {self.label}: {size}"
+        return f"{type(self).__name__} {self.label}: {self.duration:.5g} s at {self.rate_hz:.6g} Hz"
 
     def __repr__(self) -> str:
         names = list(self.channels)
