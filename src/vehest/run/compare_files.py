@@ -36,7 +36,6 @@ from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
 from vehest.run.estimate import finding_in_words
 from vehest.run.estimate_tables import (
-    NamedColumn,
     names_of_table,
     parse_columns,
     parse_shift,
@@ -44,6 +43,7 @@ from vehest.run.estimate_tables import (
 )
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, note, score_cells
 from vehest.sources.base import read_single
+from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 LEAST_SECONDS = 5.0
