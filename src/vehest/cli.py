@@ -463,6 +463,8 @@ def plot_drive(
         Path,
         typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg, or .html, a page."),
     ] = Path("drive.png"),
+    start: Annotated[float | None, typer.Option("--start", help="Draw from here on [s].")] = None,
+    stop: Annotated[float | None, typer.Option("--stop", help="Draw up to here [s].")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw a recording and estimates of it: `vehest plot lap.csv estimate.parquet -o drive.pdf`.
@@ -472,7 +474,7 @@ def plot_drive(
     """
     from vehest.run.plot import plot_files
 
-    emit(as_json, plot_files([recording, *(words or [])], out))
+    emit(as_json, plot_files([recording, *(words or [])], out, start, stop))
 
 
 @app.command()

@@ -38,6 +38,7 @@ def test_estimate_is_drawn_as_it_is_made_and_afterwards(log):
     [
         (["plot", "drive.parquet", "-o", "drive.jpg"], "pictures are written as"),
         (["plot", "no.parquet"], "no.parquet"),
+        (["plot", "drive.parquet", "--start", "50"], "no samples between 50 s"),
         (["estimate", "drive.parquet", "-o", "b.csv", "--plot", "b.png"], "as .parquet"),
         (["estimate", "drive.parquet", "-o", "b.parquet", "--plot", "b.gif"], "are written as"),
     ],

@@ -60,7 +60,9 @@ def estimate_and_plot(
     return outcome | {"plot": str(picture)}
 
 
-def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
+def plot_files(
+    words: Sequence[str], out: Path, start: float | None = None, stop: float | None = None
+) -> dict[str, Any]:
     """Draw a recording, and estimates of it, on one page.
 
     Parameters
@@ -70,6 +72,8 @@ def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
         conf/estimate.yaml.
     out : Path
         ``.png``, ``.pdf``, ``.svg`` or ``.html``; appears complete or not at all.
+    start, stop : float, optional
+        Range that is drawn [s]; by default all of it.
 
     Raises
     ------
@@ -81,7 +85,7 @@ def plot_files(words: Sequence[str], out: Path) -> dict[str, Any]:
     options = estimate_options([word for word in words if not is_file_name(word)])
     recording = _with_references_if_any(recording_file, options)
     estimates = [read_estimate_table(file, recording) for file in estimate_files]
-    content = WRITERS[out.suffix.lower()](recording.plot(*estimates))
+    content = WRITERS[out.suffix.lower()](recording.plot(*estimates, start=start, stop=stop))
     with written_aside(out) as aside:
         aside.write_bytes(content)
     return {
