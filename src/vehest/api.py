@@ -56,14 +56,21 @@ if TYPE_CHECKING:
 def load_model(model: str | Path = SELF_CALIBRATING, output: str | Path | None = None) -> Estimator:
     """Load a fitted estimator, with its calibration as the attribute `Estimator.trust`.
 
-    Args:
-        model: its folder, or the start of its name in the output root; by default the self-calibrating filter that comes with
-            vehest, as on the command line; ``pretrained`` is the network inside it.
-        output: the output root; by default VEHEST_OUTPUT, or ``outputs``.
+    Parameters
+    ----------
+    model : str or Path
+        Its folder, or the start of its name in the output root; by default the self-calibrating
+        filter that comes with vehest, as on the command line. ``pretrained`` is the network inside
+        it.
+    output : str or Path, optional
+        The output root; by default VEHEST_OUTPUT, or ``outputs``.
 
-    Raises:
-        MissingError: there is no such model.
-        DataError: its files are damaged.
+    Raises
+    ------
+    MissingError
+        There is no such model.
+    DataError
+        Its files are damaged.
     """
     root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
     _, estimator, trust = open_model(str(model), root, partial(warnings.warn, stacklevel=4))
@@ -81,22 +88,35 @@ def train(
 ) -> Estimator:
     """Fit an estimator to recordings, which are brought to its rate first.
 
-    Args:
-        estimator: its name, as in conf/estimator; a wheelbase of null among its settings is that of the recordings' car. Or an estimator of
-            your own that is not fitted, such as ``Mine.from_config({})``, which is fitted with the defaults of its training.
-        train: recordings to learn from, with ``vy_ref``, at any rate from the estimator's upwards.
-        validation: recordings that decide when to stop, of the same kind; may be the same objects where the method does not stop early.
-        overrides: as of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``; of a named estimator only.
-        seed: of all random numbers.
+    Parameters
+    ----------
+    estimator : str or Estimator
+        Its name, as in conf/estimator; a wheelbase of null among its settings is that of the
+        recordings' car. Or an estimator of your own, not fitted, such as ``Mine.from_config({})``,
+        which is fitted with the defaults of its training.
+    train : sequence of Recording
+        To learn from, with ``vy_ref``, at any rate from the estimator's upwards.
+    validation : sequence of Recording
+        Decide when to stop, of the same kind; may be the same objects where the method does not
+        stop early.
+    overrides : sequence of str
+        As of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``;
+        of a named estimator only.
+    seed : int
+        Of all random numbers.
 
-    Raises:
-        ConfigurationError: an unknown name or setting.
-        DataError: a channel is missing, or the recordings are too short or sampled too slowly.
+    Raises
+    ------
+    ConfigurationError
+        An unknown name or setting.
+    DataError
+        A channel is missing, or the recordings are too short or sampled too slowly.
     """
     if isinstance(estimator, Estimator):
         if overrides:
             raise ConfigurationError(
-                f"overrides are for estimators of conf/estimator; pass settings to {type(estimator).__name__}.from_config"
+                "overrides are for estimators of conf/estimator; "
+                f"pass settings to {type(estimator).__name__}.from_config"
             )
         return _fitted(estimator, estimator.training_type(), train, validation, seed)
     from vehest.configuration.composition import compose_config  # imports Hydra
@@ -139,21 +159,30 @@ def _fitted(
 def score(
     estimate: Estimate | Estimator, recordings: Recording | Sequence[Recording]
 ) -> dict[str, float]:
-    """Metrics of an estimate against the reference of its recording, or of a model on whole recordings, over all of them together.
+    """Metrics of an estimate against the reference of its recording, or of a model on recordings.
 
-    Scored are 20 samples a second where there is an estimate, after the first 1.5 s of a recording. That a model was not trained on them is
-    for the caller to see to; it runs without the contract that holds online. Each recording's car is used as by `estimate`, and its
-    wheelbase gives the speed from which sideslip counts.
+    Scored are 20 samples a second where there is an estimate, after the first 1.5 s of a recording,
+    over all recordings together. That a model was not trained on them is for the caller to see to;
+    it runs without the contract that holds online. Each recording's car is used as by `estimate`,
+    and its wheelbase gives the speed from which sideslip counts.
 
-    Args:
-        estimate: as `estimate` makes it, or a fitted model.
-        recordings: with ``vy_ref`` or ``sideslip_ref``; of an estimate the one that it was made of.
+    Parameters
+    ----------
+    estimate : Estimate or Estimator
+        As `estimate` makes it, or a fitted model.
+    recordings : Recording or sequence of Recording
+        With ``vy_ref`` or ``sideslip_ref``; of an estimate the one that it was made of.
 
-    Returns:
-        Metric -> value: ``rmse_vy`` [m/s], ``rmse_sideslip`` [deg], ``fvu`` and others, as docs/estimators.md defines them.
+    Returns
+    -------
+    dict
+        Metric -> value: ``rmse_vy`` [m/s], ``rmse_sideslip`` [deg], ``fvu`` and others, as
+        docs/evaluation.md defines them.
 
-    Raises:
-        DataError: a channel is missing or has gaps, or a recording is too short or sampled too slowly.
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
     drives = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if isinstance(estimate, Estimate):
@@ -194,21 +223,33 @@ def read_recording(
 ) -> Recording:
     """Read a file or a DataFrame as a recording.
 
-    Args:
-        log: a CSV or Parquet file, a file of the format that a data set describes, or a DataFrame. A DataFrame has its times in a column or
-            as index (seconds, time stamps or time differences); ``attrs["units"]`` may have the units of its columns, ``attrs["name"]`` its
-            name.
-        overrides: how to read it, for example ``["dataset=my_car"]``; by default columns carry the channels' names and SI units. The values
-            ``car`` of the data set become `Recording.car`; without a data set give them as ``["dataset.car.wheelbase=2.9"]``.
-        columns: channel, or ``time``, -> its column in a table, with a sign before and the unit behind it, as in
-            ``{"vx": "Speed:km/h", "ay": "-AccY:m/s²"}``; in place of those of the data set.
-        references: whether the reference channels that a data set declares have to be there; else they are left aside. Columns that carry
-            the channels' names, or that ``columns`` names, are read in any case.
+    Parameters
+    ----------
+    log : str, Path or DataFrame
+        A CSV or Parquet file, a file of the format that a data set describes, or a DataFrame with
+        its times in a column or as index (seconds, time stamps or time differences).
+        ``attrs["units"]`` of a DataFrame may have the units of its columns, ``attrs["name"]`` its
+        name.
+    overrides : sequence of str
+        How to read it, for example ``["dataset=my_car"]``; by default columns carry the channels'
+        names and SI units. The values ``car`` of the data set become `Recording.car`; without a
+        data set give them as ``["dataset.car.wheelbase=2.9"]``.
+    columns : mapping, optional
+        Channel, or ``time``, -> its column in a table, with a sign before and the unit behind it,
+        as in ``{"vx": "Speed:km/h", "ay": "-AccY:m/s²"}``; in place of those of the data set.
+    references : bool
+        Whether the reference channels that a data set declares have to be there; else they are left
+        aside. Columns that carry the channels' names, or that ``columns`` names, are read in any
+        case.
 
-    Raises:
-        MissingError: there is no such file.
-        ConfigurationError: ``columns`` names no channel, no column or no unit.
-        DataError: it cannot be used as it is.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    ConfigurationError
+        ``columns`` names no channel, no column or no unit.
+    DataError
+        It cannot be used as it is.
     """
     from vehest.configuration.estimate_options import estimate_options  # imports Hydra
 
@@ -229,31 +270,46 @@ def estimate(
     wheelbase: float | None = None,
     same_vehicle: bool | None = None,
 ) -> Estimate:
-    """Run a model on a recording, brought to the model's rate in the way it was trained with, under the contract that holds online.
+    """Run a model on a recording, at the model's rate, under the contract that holds online.
 
-    The values of ``recording.car`` are used as ``vehest estimate`` uses those of a data set: settings of the self-calibrating filter that
-    its training did not choose, and whether the bands apply.
+    The values of ``recording.car`` are used as ``vehest estimate`` uses those of a data set:
+    settings of the self-calibrating filter that its training did not choose, and whether the bands
+    apply.
 
-    Args:
-        recording: as `read_recording` reads it. The order ``estimate(model, recording)`` of earlier versions is still accepted.
-        model: fitted, or its name as of `load_model`; by default the self-calibrating filter, as on the command line.
-        wheelbase: of the recording's car [m]; by default that of ``recording.car``.
-        same_vehicle: whether it is of the car that bands were calibrated on; None: by the values and the names of the cars.
+    Parameters
+    ----------
+    recording : Recording
+        As `read_recording` reads it. The order ``estimate(model, recording)`` of earlier versions
+        is still accepted.
+    model : Estimator, str or Path, optional
+        Fitted, or its name as of `load_model`; by default the self-calibrating filter, as on the
+        command line.
+    wheelbase : float, optional
+        Of the recording's car [m]; by default that of ``recording.car``.
+    same_vehicle : bool, optional
+        Whether it is of the car that bands were calibrated on; by default by the values and the
+        names of the cars.
 
-    Returns:
-        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet. ``health`` (0 valid,
-        1 degraded, 2 invalid) and ``health_reason`` (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``,
-        where the model was calibrated.
+    Returns
+    -------
+    Estimate
+        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not
+        full yet. ``health`` (0 valid, 1 degraded, 2 invalid) and ``health_reason``
+        (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``, where
+        the model was calibrated.
 
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
+    Raises
+    ------
+    DataError
+        A channel is missing, or the recording is sampled too slowly.
     """
     if isinstance(recording, Estimator):  # the order of earlier versions
         recording, model = cast(Recording, model), recording
         warnings.warn("use vehest.estimate(recording, model)", DeprecationWarning, stacklevel=2)
     if not isinstance(recording, Recording):
         raise ConfigurationError(
-            f"pass a recording, as vehest.read_recording(log, columns=…) reads it, not a {type(recording).__name__}"
+            "pass a recording, as vehest.read_recording(log, columns=…) reads it, "
+            f"not a {type(recording).__name__}"
         )
     if wheelbase is not None:
         recording = replace(recording, car=replace(recording.car, wheelbase=wheelbase))
@@ -297,7 +353,15 @@ class OnlineEstimate(NamedTuple):
 
 
 class OnlineEstimator:
-    """A model that runs along with a drive, guarded by ``stepper``, a `vehest.trust.contract.GuardedStepper`."""
+    """A model that runs along with a drive.
+
+    Attributes
+    ----------
+    stepper : GuardedStepper
+        The model under its contract; its ``step`` returns a dictionary with all quantities.
+    last : OnlineEstimate
+        What the last step returned.
+    """
 
     def __init__(self, stepper: GuardedStepper) -> None:
         self.stepper = stepper
@@ -310,15 +374,21 @@ class OnlineEstimator:
         time: float | None = None,
         **channels: float | None,
     ) -> OnlineEstimate:
-        """Take the sample received at one instant, as in ``step(vx=21.3, yaw_rate=0.1, ay=2.2, ax=0.0)``.
+        """Take the sample received at one instant: ``step(vx=21.3, yaw_rate=0.1, ay=2.2, ax=0.0)``.
 
-        Args:
-            sample: channel -> value [SI], in place of keywords or beside them. A channel that is missing, None or no number counts as not
-                measured.
-            time: of the sample [s], if known; see `GuardedStepper.step`.
-            **channels: channel -> value [SI].
+        Parameters
+        ----------
+        sample : mapping, optional
+            Channel -> value [SI], in place of keywords or beside them. A channel that is missing,
+            None or no number counts as not measured.
+        time : float, optional
+            Of the sample [s]; see `GuardedStepper.step`.
+        **channels : float or None
+            Channel -> value [SI].
 
-        Returns:
+        Returns
+        -------
+        OnlineEstimate
             The same object as the last time until the model has a new estimate.
         """
         values = self.stepper.step({**(sample or {}), **channels}, time)
@@ -330,7 +400,7 @@ class OnlineEstimator:
 
     @property
     def lead_seconds(self) -> float:
-        """How long after its sample an estimate applies [s]; negative where the filter from the bus's rate takes longer."""
+        """How long after its sample an estimate applies [s]; negative behind a slow low-pass."""
         rate = self.stepper.estimator.settings.rate_hz
         return float(self.stepper.horizon_steps / rate - self.stepper.delay)
 
@@ -343,18 +413,28 @@ def online(
     elsewhere: bool = False,
     car: CarValues = UNKNOWN_CAR,
 ) -> OnlineEstimator:
-    """A model that runs along with a drive: ``online(model).step(vx=21.3, yaw_rate=0.1, ay=2.2)`` a sample.
+    """A model that runs along with a drive: ``online(model).step(vx=…, yaw_rate=…, ay=…)``.
 
-    Args:
-        model: fitted, causal; by default that of `load_model`.
-        bus_rate_hz: rate at which samples come, if it is above the model's: they then go through a causal anti-aliasing filter first.
-        wheelbase: of the car [m]; by default that of ``car``.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are wider then. They are, too, where
-            the values of ``car`` say so.
-        car: values of the car, for example ``CarValues(wheelbase=2.9)`` or `Recording.car`; used as `estimate` does.
+    Parameters
+    ----------
+    model : Estimator, optional
+        Fitted, causal; by default that of `load_model`, which also reads ``ax``.
+    bus_rate_hz : float, optional
+        Rate at which samples come, if it is above the model's: they then go through a causal
+        anti-aliasing filter first.
+    wheelbase : float, optional
+        Of the car [m]; by default that of ``car``.
+    elsewhere : bool
+        Whether the car or its tyres are others than those that were calibrated on; bands are wider
+        then. They are, too, where the values of ``car`` say so.
+    car : CarValues
+        Values of the car, for example ``CarValues(wheelbase=2.9)`` or `Recording.car`; used as
+        `estimate` does.
 
-    Raises:
-        ConfigurationError: the model is not causal, or the bus is slower than it.
+    Raises
+    ------
+    ConfigurationError
+        The model is not causal, or the bus is slower than it.
     """
     if wheelbase is not None:
         car = replace(car, wheelbase=wheelbase)

@@ -124,7 +124,7 @@ class Estimate(TimeSeries):
         start: float | None = None,
         stop: float | None = None,
     ) -> Figure:
-        """Draw the estimate, with its recording's channels and reference where that is passed; see `Recording.plot`."""
+        """Draw the estimate, with its recording where that is passed; see `Recording.plot`."""
         from vehest.report.drive_figure import drive_figure
 
         return drive_figure(recording, [self], start, stop)

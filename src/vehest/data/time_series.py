@@ -1,4 +1,4 @@
-"""What recordings and estimates share: values on one uniform clock, and how a notebook shows them."""
+"""What recordings and estimates share: one uniform clock, and how a notebook shows them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class TimeSeries(ABC):
         return f"<{self._describe()}; {', '.join(names[:MAX_REPR_CHANNELS])}{rest}>"
 
     def _repr_html_(self) -> str:
-        """Table of the channels for a notebook: unit, smallest and largest value, missing samples."""
+        """Table of the channels for a notebook: unit, range, missing samples."""
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]

@@ -1,4 +1,4 @@
-"""A recording and estimates of it on one page: β and v with bands and health, the measured channels, the course, the error."""
+"""A recording and estimates of it on one page: β and v, channels, the course, the error."""
 
 from __future__ import annotations
 
@@ -128,7 +128,8 @@ def drive_figure(
     panels = _time_panels(drive)
     if not panels:
         raise DataError(
-            f"there is nothing to draw: no estimate, no reference and none of {', '.join(CHANNEL_LABELS)}"
+            "there is nothing to draw: no estimate, no reference "
+            f"and none of {', '.join(CHANNEL_LABELS)}"
         )
     below = _panels_below(drive, estimates)
     heights = [HEIGHTS[height] for height, _ in panels] + [HEIGHTS["course"]] * bool(below)

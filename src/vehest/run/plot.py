@@ -45,7 +45,7 @@ def check_plot_name(out: Path) -> None:
 def estimate_and_plot(
     words: Sequence[str], out: Path, picture: Path | None, *, strict: bool, car: Path | None
 ) -> dict[str, Any]:
-    """`vehest.run.estimate.estimate_file`, then, where a picture is named, `plot_files` with what it wrote; raises as they do."""
+    """Estimate as `estimate_file` does; where a picture is named, draw what it wrote."""
     if picture is None:
         return estimate_file(words, out, strict=strict, car=car)
     check_plot_name(picture)
@@ -98,7 +98,7 @@ def plot_files(
 
 
 def _with_references_if_any(file: Path, options: EstimateOptions) -> Recording:
-    """A recording with the references that its data set declares; without them where the file lacks one."""
+    """A recording with the references of its data set; without them where the file lacks one."""
     try:
         return read_checked(file, options.dataset, options.limits)
     except DataError:

@@ -94,7 +94,8 @@ def declare_columns(
         )
         if not unit:
             raise ConfigurationError(
-                f"{where}: {key}: the unit of column '{printable(column)}' is not known; write '{printable(column)}:{si_unit}', or whatever it is"
+                f"{where}: {key}: the unit of column '{printable(column)}' is not known; "
+                f"write '{printable(column)}:{si_unit}', or whatever it is"
             )
         plain = unit if name == TIME else plain_unit(unit) or unit
         declared[name] = {"column": column, "unit": plain, "sign": sign}
@@ -110,8 +111,9 @@ def read_frame(
     Parameters
     ----------
     frame : DataFrame
-        A column a channel; times in a column, or as index: seconds, time stamps or time differences.
-        ``frame.attrs["units"]`` may have the columns' units, ``frame.attrs["name"]`` its name.
+        A column a channel; times in a column, or as index: seconds, time stamps or time
+        differences. ``frame.attrs["units"]`` may have the columns' units, ``frame.attrs["name"]``
+        its name.
     dataset : mapping
         Data set that describes the columns, of source ``tabular``.
     columns : mapping
@@ -143,15 +145,16 @@ def read_frame(
     for name in wanted:
         if names.count(name) != 1:
             raise DataError(
-                f"{where} has {names.count(name) or 'no'} columns '{printable(name)}' (it has {listed(names)}); "
-                "rename all but one, or name another, as in columns={'time': 'Timestamp:s'}"
+                f"{where} has {names.count(name) or 'no'} columns '{printable(name)}' "
+                f"(it has {listed(names)}); rename all but one, or name another, "
+                "as in columns={'time': 'Timestamp:s'}"
             )
     table = {name: _numbers(frame.iloc[:, names.index(name)], where) for name in wanted}
     return source.recording_of(table, str(frame.attrs.get("name", "frame")))
 
 
 def _numbers(column: pd.Series, where: str) -> FloatArray:
-    """Values of a column; of time stamps and time differences the seconds; raises `DataError` for text."""
+    """Values of a column, of time stamps and differences in seconds; `DataError` for text."""
     if column.dtype.kind in "mM":
         return column.to_numpy().astype(f"{column.dtype.kind}8[ns]").astype(np.int64) / 1e9
     try:

@@ -220,10 +220,7 @@ class TabularSource(FileSource):
         return list(dict.fromkeys([*wanted, *(str(name) for name in others if name is not None)]))
 
     def recording_of(self, table: Mapping[str, FloatArray], name: str) -> Recording:
-        """A recording of columns in memory, shape (T,) each, as `read_file` makes it of a file's.
-
-        Raises `ConfigurationError`: the data set divides tables into runs, or leaves rows out.
-        """
+        """A recording of columns in memory, (T,) each; `ConfigurationError` with runs or rows left out."""
         if self._cuts or self.options.runs or self.dropped:
             raise ConfigurationError(
                 f"{self.where}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
