@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -68,7 +68,7 @@ test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium c
 	$(BIN)/python -m pytest -m "page and not slow" -rs
 
 TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
-TESTS_docs := tests/test_docs.py tests/test_shown_commands.py tests/test_examples.py
+TESTS_docs := tests/test_docs.py tests/test_shown_commands.py tests/test_examples.py tests/test_notebooks.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py
@@ -77,7 +77,7 @@ lint: $(INSTALLED) ## style, types, layers of imports, published results that ar
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy docs/*.py
+	$(BIN)/mypy docs/*.py tools/*.py
 	$(BIN)/lint-imports
 	$(BIN)/vehest report --check
 	$(BIN)/python -m vehest_papers.scorecard --check
@@ -121,6 +121,9 @@ docs-site: $(INSTALLED) ## a site of all pages in build/site, every warning an e
 screenshots: $(INSTALLED) docs-site ## pictures of the quickstart's page and of the site, in docs/images; needs Chromium
 	$(BIN)/vehest run quickstart tracking=none
 	PYTHONPATH=tests $(BIN)/python tests/screenshots.py "$$(ls -td "$${VEHEST_OUTPUT:-outputs}"/report/quickstart-*/ | head -1)report.html" build/site docs/images
+
+notebooks: $(INSTALLED) ## run the notebooks of examples/ and store what their cells show (a minute)
+	$(BIN)/python tools/run_notebooks.py
 
 example_log: $(INSTALLED) ## docs/examples/lap.csv, the log of the how-to guides: four minutes of a simulated Ferrari 250 LM
 	$(BIN)/vehest downsample sim_quickstart rate_hz=20 vehicle@dataset.vehicle=ferrari_250_lm \

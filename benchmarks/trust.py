@@ -76,7 +76,7 @@ def faults_row() -> dict[str, Any]:
     from vehest.trust.contract import GuardedRun
     from vehest.trust.faults import KINDS, Fault, inject
 
-    model = vehest.load_model()
+    model = vehest.load_model("pretrained")
     trust = model.trust
     drive = prepared_recording(model, linear_drive(150.0, 100.0, 0)[0])
     faults = [

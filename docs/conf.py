@@ -5,12 +5,14 @@ The root of the repository is the source folder, so that links between docs/ and
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from myst_parser.parsers.sphinx_ import MystParser
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -25,6 +27,7 @@ extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.
 root_doc = "docs/index"
 include_patterns = [
     "docs/*.md",
+    "examples/*.ipynb",
     "docs/estimators/*.md",
     "docs/sources/*.md",
     "results/*.md",
@@ -90,6 +93,35 @@ def _displayed_mathml(translator: Any, node: nodes.Element) -> None:
     raise nodes.SkipNode
 
 
+class NotebookParser(MystParser):
+    """Notebooks as pages: their text, cells, and what these printed and drew when the notebook was last run."""
+
+    supported = ("notebook",)
+
+    def parse(self, inputstring: str, document: nodes.document) -> None:
+        """Parse a notebook's JSON as Markdown."""
+        cells = json.loads(inputstring)["cells"]
+        super().parse("\n\n".join(map(_cell_as_markdown, cells)), document)
+
+
+def _cell_as_markdown(cell: dict[str, Any]) -> str:
+    source = "".join(cell["source"])
+    if cell["cell_type"] == "markdown":
+        return source
+    parts = [f"```python\n{source}\n```"]
+    for output in cell["outputs"]:
+        data = output.get("data", {"text/plain": output.get("text", "")})
+        picture = data.get("image/png")
+        parts.append(
+            f"![what the cell draws](data:image/png;base64,{picture})"
+            if picture
+            else f"```text\n{''.join(data['text/plain']).rstrip()}\n```"
+        )
+    return "\n\n".join(parts)
+
+
 def setup(app: Any) -> None:
-    """Render equations as MathML while the site is built, so that a page needs neither script nor network for them."""
+    """Read notebooks; render equations as MathML while the site is built, so that a page needs neither script nor network for them."""
+    app.add_source_suffix(".ipynb", "notebook")
+    app.add_source_parser(NotebookParser)
     app.add_html_math_renderer("mathml", (_inline_mathml, None), (_displayed_mathml, None))

@@ -101,7 +101,7 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
     )
     drive = drive.without_references()
     assert np.array_equal(
-        vehest.estimate(model, drive)["vy"], vehest.estimate(again, drive)["vy"], equal_nan=True
+        vehest.estimate(drive, model)["vy"], vehest.estimate(drive, again)["vy"], equal_nan=True
     )
     at_rate = (
         drive

@@ -6,13 +6,28 @@ from vehest.version import __version__
 
 TYPE_CHECKING = False  # as `typing` names it, which takes half of the start of a process
 if TYPE_CHECKING:
-    from typing import Any
+    from vehest.api import (
+        CarValues,
+        Estimate,
+        Estimator,
+        Recording,
+        estimate,
+        load_model,
+        online,
+        read_recording,
+        reason_in_words,
+        save_model,
+        score,
+        train,
+        write_estimate,
+    )
 
-_API = (
+__all__ = [
     "CarValues",
     "Estimate",
     "Estimator",
     "Recording",
+    "__version__",
     "estimate",
     "load_model",
     "online",
@@ -22,15 +37,17 @@ _API = (
     "score",
     "train",
     "write_estimate",
-)
+]
 
-__all__ = ["__version__", *_API]
+if not TYPE_CHECKING:
 
+    def __dir__() -> list[str]:
+        return __all__
 
-def __getattr__(name: str) -> Any:
-    """Load the Python interface when it is first used, so that the command line starts quickly."""
-    if name in _API:
-        from vehest import api
+    def __getattr__(name: str) -> object:
+        """Load the Python interface when it is first used, so that the command line starts quickly."""
+        if name in __all__:
+            from vehest import api
 
-        return getattr(api, name)
-    raise AttributeError(f"module 'vehest' has no attribute '{name}'")
+            return getattr(api, name)
+        raise AttributeError(f"module 'vehest' has no attribute '{name}'")

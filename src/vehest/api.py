@@ -1,34 +1,38 @@
 """The Python interface: read recordings, train, score, save and load models, estimate, write.
 
 >>> import vehest
->>> model = vehest.load_model("outputs/train/ksnn-linear_bias_p2-seed2-0123456789ab")
 >>> recording = vehest.read_recording("lap.csv")
->>> estimate = vehest.estimate(model, recording)
+>>> estimate = vehest.estimate(recording, wheelbase=2.7)
 >>> vehest.write_estimate(estimate, "estimate.parquet")
 """
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+from vehest.alignment.checks import refuse_errors
 from vehest.data.car import UNKNOWN_CAR
 from vehest.data.car import CarValues as CarValues
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate as Estimate
 from vehest.data.files import written_aside
+from vehest.data.limits import use_limits
 from vehest.data.recording import Recording as Recording
 from vehest.data.resampling import resampled
 from vehest.data.schema import settings_from_config
-from vehest.data.splits import Span
 from vehest.estimators.base import Estimator as Estimator
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import model_digest
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.estimators.registry import new_estimator
+from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.evaluation import metrics
 from vehest.inference.car_values import ASSUMED, adapted, with_car_values
 from vehest.inference.estimation import (
@@ -36,26 +40,37 @@ from vehest.inference.estimation import (
     prepared_recording,
     require_estimate,
 )
-from vehest.inference.models import PRETRAINED, find_model, open_model
+from vehest.inference.models import SELF_CALIBRATING, find_model, open_model
 from vehest.inference.reading import read_checked, without_references
 from vehest.inference.tables import write_estimate_table
+from vehest.sources.named_columns import read_frame
 from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
 
+if TYPE_CHECKING:
+    import pandas as pd
 
-def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:
+
+def load_model(model: str | Path = SELF_CALIBRATING, output: str | Path | None = None) -> Estimator:
     """Load a fitted estimator, with its calibration as the attribute `Estimator.trust`.
 
-    Args:
-        model: its folder, or the start of its name in the output root; by default the one that comes with vehest, which was trained on
-            simulated cars and not on yours.
-        output: the output root; by default VEHEST_OUTPUT, or ``outputs``.
+    Parameters
+    ----------
+    model : str or Path
+        Its folder, or the start of its name in the output root; by default the self-calibrating
+        filter that comes with vehest, as on the command line. ``pretrained`` is the network inside
+        it.
+    output : str or Path, optional
+        The output root; by default VEHEST_OUTPUT, or ``outputs``.
 
-    Raises:
-        MissingError: there is no such model.
-        DataError: its files are damaged.
+    Raises
+    ------
+    MissingError
+        There is no such model.
+    DataError
+        Its files are damaged.
     """
     root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
     _, estimator, trust = open_model(str(model), root, partial(warnings.warn, stacklevel=4))
@@ -64,7 +79,7 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
 
 
 def train(
-    estimator: str,
+    estimator: str | Estimator,
     train: Sequence[Recording],
     validation: Sequence[Recording],
     overrides: Sequence[str] = (),
@@ -73,17 +88,37 @@ def train(
 ) -> Estimator:
     """Fit an estimator to recordings, which are brought to its rate first.
 
-    Args:
-        estimator: its name, as in conf/estimator. A wheelbase of null among its settings is that of the recordings' car.
-        train: recordings to learn from, with ``vy_ref``, at any rate from the estimator's upwards.
-        validation: recordings that decide when to stop, of the same kind; may be the same objects where the method does not stop early.
-        overrides: as of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``.
-        seed: of all random numbers.
+    Parameters
+    ----------
+    estimator : str or Estimator
+        Its name, as in conf/estimator; a wheelbase of null among its settings is that of the
+        recordings' car. Or an estimator of your own, not fitted, such as ``Mine.from_config({})``,
+        which is fitted with the defaults of its training.
+    train : sequence of Recording
+        To learn from, with ``vy_ref``, at any rate from the estimator's upwards.
+    validation : sequence of Recording
+        Decide when to stop, of the same kind; may be the same objects where the method does not
+        stop early.
+    overrides : sequence of str
+        As of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``;
+        of a named estimator only.
+    seed : int
+        Of all random numbers.
 
-    Raises:
-        ConfigurationError: an unknown name or setting.
-        DataError: a channel is missing, or the recordings are too short or sampled too slowly.
+    Raises
+    ------
+    ConfigurationError
+        An unknown name or setting.
+    DataError
+        A channel is missing, or the recordings are too short or sampled too slowly.
     """
+    if isinstance(estimator, Estimator):
+        if overrides:
+            raise ConfigurationError(
+                "overrides are for estimators of conf/estimator; "
+                f"pass settings to {type(estimator).__name__}.from_config"
+            )
+        return _fitted(estimator, estimator.training_type(), train, validation, seed)
     from vehest.configuration.composition import compose_config  # imports Hydra
 
     config = compose_config("train", [f"estimator={estimator}", *overrides])
@@ -99,6 +134,17 @@ def train(
         "method": config["downsample"]["method"],
         "transforms": list(config["downsample"]["transforms"] or []),
     }
+    return _fitted(model, settings, train, validation, seed)
+
+
+def _fitted(
+    model: Estimator,
+    settings: Any,
+    train: Sequence[Recording],
+    validation: Sequence[Recording],
+    seed: int,
+) -> Estimator:
+    """The model, fitted and calibrated."""
     model.seed(seed)
     parts = [
         [resampled(recording, model.settings.rate_hz, model.preparation) for recording in part]
@@ -110,33 +156,44 @@ def train(
     return model
 
 
-def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
-    """Metrics of a model on whole recordings that have ``vy_ref``, over all of them together, at 20 Hz and after the first 1.5 s.
+def score(
+    estimate: Estimate | Estimator, recordings: Recording | Sequence[Recording]
+) -> dict[str, float]:
+    """Metrics of an estimate against the reference of its recording, or of a model on recordings.
 
-    That the model was not trained on them is for the caller to see to.
+    Scored are 20 samples a second where there is an estimate, after the first 1.5 s of a recording,
+    over all recordings together. That a model was not trained on them is for the caller to see to;
+    it runs without the contract that holds online. Each recording's car is used as by `estimate`,
+    and its wheelbase gives the speed from which sideslip counts.
 
-    Each recording's car is used as by `estimate`, and its wheelbase gives the speed from which sideslip counts.
+    Parameters
+    ----------
+    estimate : Estimate or Estimator
+        As `estimate` makes it, or a fitted model.
+    recordings : Recording or sequence of Recording
+        With ``vy_ref`` or ``sideslip_ref``; of an estimate the one that it was made of.
 
-    Returns:
-        Metric -> value: ``rmse_vy`` [m/s], ``rmse_sideslip`` [deg], ``fvu`` and others, as docs/estimators.md defines them.
+    Returns
+    -------
+    dict
+        Metric -> value: ``rmse_vy`` [m/s], ``rmse_sideslip`` [deg], ``fvu`` and others, as
+        docs/evaluation.md defines them.
 
-    Raises:
-        DataError: a channel is missing or has gaps, or a recording is too short or sampled too slowly.
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
-    protocol = metrics.Protocol(warm_up_seconds=0.0)
+    drives = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if isinstance(estimate, Estimate):
+        (drive,) = drives
+        return metrics.accuracy([metrics.score_whole(estimate, drive)])
     parts = []
-    for recording in recordings:
-        of_car, _ = _for_car(model, recording.car)
-        needed = prepared_recording(of_car, recording.without_references())
-        own = require_estimate(of_car, recording, of_car.estimate([needed])[0])
-        parts.append(
-            metrics.score(
-                own,
-                resampled(recording, protocol.rate_hz, model.preparation),
-                Span("", recording.id),
-                protocol.with_wheelbases({"": recording.car.wheelbase}),
-            )
-        )
+    for drive in drives:
+        of_car, _ = _for_recording(estimate, drive)
+        needed = prepared_recording(of_car, drive.without_references())
+        made = require_estimate(of_car, drive, of_car.estimate([needed])[0])
+        parts.append(metrics.score_whole(made, drive, estimate.preparation))
     return metrics.accuracy(parts)
 
 
@@ -158,85 +215,233 @@ def save_model(model: Estimator, folder: str | Path) -> None:
 
 
 def read_recording(
-    path: str | Path, overrides: Sequence[str] = (), *, references: bool = False
+    log: str | Path | pd.DataFrame,
+    overrides: Sequence[str] = (),
+    *,
+    columns: Mapping[str, str] | None = None,
+    references: bool = False,
 ) -> Recording:
-    """Read a CSV or Parquet file as a recording.
+    """Read a file or a DataFrame as a recording.
 
-    Args:
-        path: the file.
-        overrides: how to read it, for example ``["dataset=my_car"]``; by default columns carry the channels' names and SI units. The values
-            ``car`` of the data set become `Recording.car`; without a data set give them as ``["dataset.car.wheelbase=2.9"]``.
-        references: whether the reference channels that a data set declares have to be there; else they are left aside. Columns that carry
-            the channels' names are read in any case.
+    Parameters
+    ----------
+    log : str, Path or DataFrame
+        A CSV or Parquet file, a file of the format that a data set describes, or a DataFrame with
+        its times in a column or as index (seconds, time stamps or time differences).
+        ``attrs["units"]`` of a DataFrame may have the units of its columns, ``attrs["name"]`` its
+        name.
+    overrides : sequence of str
+        How to read it, for example ``["dataset=my_car"]``; by default columns carry the channels'
+        names and SI units. The values ``car`` of the data set become `Recording.car`; without a
+        data set give them as ``["dataset.car.wheelbase=2.9"]``.
+    columns : mapping, optional
+        Channel, or ``time``, -> its column in a table, with a sign before and the unit behind it,
+        as in ``{"vx": "Speed:km/h", "ay": "-AccY:m/s²"}``; in place of those of the data set.
+    references : bool
+        Whether the reference channels that a data set declares have to be there; else they are left
+        aside. Columns that carry the channels' names, or that ``columns`` names, are read in any
+        case.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be used as it is.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    ConfigurationError
+        ``columns`` names no channel, no column or no unit.
+    DataError
+        It cannot be used as it is.
     """
     from vehest.configuration.estimate_options import estimate_options  # imports Hydra
 
     options = estimate_options(overrides)
     dataset = options.dataset if references else without_references(options.dataset)
-    return read_checked(Path(path), dataset, options.limits)
+    if isinstance(log, str | Path):
+        return read_checked(Path(log), dataset, options.limits, columns or {})
+    with use_limits(options.limits):
+        recording = read_frame(log, dataset, columns or {})
+    refuse_errors(recording, dataset.get("accept") or (), "DataFrame")
+    return recording
 
 
 def estimate(
-    model: Estimator, recording: Recording, *, same_vehicle: bool | None = None
+    recording: Recording,
+    model: Estimator | str | Path | None = None,
+    *,
+    wheelbase: float | None = None,
+    same_vehicle: bool | None = None,
 ) -> Estimate:
-    """Run a model on a recording, brought to the model's rate in the way it was trained with, under the contract that holds online.
+    """Run a model on a recording, at the model's rate, under the contract that holds online.
 
-    The values of ``recording.car`` are used as ``vehest estimate`` uses those of a data set: settings of the self-calibrating filter that
-    its training did not choose, and whether the bands apply.
+    The values of ``recording.car`` are used as ``vehest estimate`` uses those of a data set:
+    settings of the self-calibrating filter that its training did not choose, and whether the bands
+    apply.
 
-    Args:
-        model: fitted.
-        recording: as `read_recording` reads it.
-        same_vehicle: whether it is of the car that bands were calibrated on; None: by the values and the names of the cars.
+    Parameters
+    ----------
+    recording : Recording
+        As `read_recording` reads it. The order ``estimate(model, recording)`` of earlier versions
+        is still accepted.
+    model : Estimator, str or Path, optional
+        Fitted, or its name as of `load_model`; by default the self-calibrating filter, as on the
+        command line.
+    wheelbase : float, optional
+        Of the recording's car [m]; by default that of ``recording.car``.
+    same_vehicle : bool, optional
+        Whether it is of the car that bands were calibrated on; by default by the values and the
+        names of the cars.
 
-    Returns:
-        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet. ``health`` (0 valid,
-        1 degraded, 2 invalid) and ``health_reason`` (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``,
-        where the model was calibrated.
+    Returns
+    -------
+    Estimate
+        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not
+        full yet. ``health`` (0 valid, 1 degraded, 2 invalid) and ``health_reason``
+        (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``, where
+        the model was calibrated.
 
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
+    Raises
+    ------
+    DataError
+        A channel is missing, or the recording is sampled too slowly.
     """
-    of_car, trust = _for_car(model, recording.car)
+    if isinstance(recording, Estimator):  # the order of earlier versions
+        recording, model = cast(Recording, model), recording
+        warnings.warn("use vehest.estimate(recording, model)", DeprecationWarning, stacklevel=2)
+    if not isinstance(recording, Recording):
+        raise ConfigurationError(
+            "pass a recording, as vehest.read_recording(log, columns=…) reads it, "
+            f"not a {type(recording).__name__}"
+        )
+    if wheelbase is not None:
+        recording = replace(recording, car=replace(recording.car, wheelbase=wheelbase))
+    if model is None:
+        model = load_model()
+    elif not isinstance(model, Estimator):
+        model = load_model(model)
+    of_car, trust = _for_recording(model, recording)
     return estimate_recording(of_car, recording, trust, same_vehicle)
 
 
-def _for_car(model: Estimator, car: CarValues) -> tuple[Estimator, Trust | None]:
+def _for_recording(model: Estimator, recording: Recording) -> tuple[Estimator, Trust | None]:
+    """A model and its calibration for the car and channels of a recording; see `_for_car`."""
+    settings = {}
+    if isinstance(model, SelfCalibrating) and "ax" not in recording:
+        settings["measured_ax"] = False
+    return _for_car(model, recording.car, settings)
+
+
+def _for_car(
+    model: Estimator, car: CarValues, settings: Mapping[str, Any]
+) -> tuple[Estimator, Trust | None]:
     """A model and its calibration for a car; warns where the model's wheelbase is an assumption."""
-    of_car, trust, remarks = adapted(model, model.trust, car, {})
+    of_car, trust, remarks = adapted(model, model.trust, car, settings)
     for remark in remarks:
         if ASSUMED in remark:
-            warnings.warn(remark, stacklevel=3)
+            text = f"{ASSUMED} {of_car.settings.wheelbase:g} m; give your car's, as wheelbase=2.9"
+            warnings.warn(text, stacklevel=4)
     return of_car, trust
 
 
+class OnlineEstimate(NamedTuple):
+    """What an estimator returns after a sample."""
+
+    vy: float  # lateral velocity [m/s]; NaN only before the first estimate
+    sideslip: float  # [rad]
+    health: float  # 0 valid, 1 degraded, 2 invalid
+    health_reason: float  # for `reason_in_words`
+    band_vy: float = math.nan  # half widths of the 90 % band, NaN without a calibration [m/s]
+    band_sideslip: float = math.nan  # [rad]
+
+
+class OnlineEstimator:
+    """A model that runs along with a drive.
+
+    Attributes
+    ----------
+    stepper : GuardedStepper
+        The model under its contract; its ``step`` returns a dictionary with all quantities.
+    last : OnlineEstimate
+        What the last step returned.
+    """
+
+    def __init__(self, stepper: GuardedStepper) -> None:
+        self.stepper = stepper
+        self._values: Mapping[str, float] = {}
+        self.last = OnlineEstimate(math.nan, math.nan, 0.0, 0.0)
+
+    def step(
+        self,
+        sample: Mapping[str, Any] | None = None,
+        time: float | None = None,
+        **channels: float | None,
+    ) -> OnlineEstimate:
+        """Take the sample received at one instant: ``step(vx=21.3, yaw_rate=0.1, ay=2.2, ax=0.0)``.
+
+        Parameters
+        ----------
+        sample : mapping, optional
+            Channel -> value [SI], in place of keywords or beside them. A channel that is missing,
+            None or no number counts as not measured.
+        time : float, optional
+            Of the sample [s]; see `GuardedStepper.step`.
+        **channels : float or None
+            Channel -> value [SI].
+
+        Returns
+        -------
+        OnlineEstimate
+            The same object as the last time until the model has a new estimate.
+        """
+        values = self.stepper.step({**(sample or {}), **channels}, time)
+        if values is not self._values:
+            self._values = values
+            fields = {name: values[name] for name in OnlineEstimate._fields if name in values}
+            self.last = OnlineEstimate(**{"health": 0.0, "health_reason": 0.0, **fields})
+        return self.last
+
+    @property
+    def lead_seconds(self) -> float:
+        """How long after its sample an estimate applies [s]; negative behind a slow low-pass."""
+        rate = self.stepper.estimator.settings.rate_hz
+        return float(self.stepper.horizon_steps / rate - self.stepper.delay)
+
+
 def online(
-    model: Estimator,
+    model: Estimator | None = None,
     bus_rate_hz: float | None = None,
     *,
+    wheelbase: float | None = None,
     elsewhere: bool = False,
     car: CarValues = UNKNOWN_CAR,
-) -> GuardedStepper:
-    """A model that runs along with a drive: ``online(model).step({"vx": 21.3, …})`` a sample.
+) -> OnlineEstimator:
+    """A model that runs along with a drive: ``online(model).step(vx=…, yaw_rate=…, ay=…)``.
 
-    Args:
-        model: fitted, causal.
-        bus_rate_hz: rate at which samples come, if it is above the model's: they then go through a causal anti-aliasing filter first.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are wider then. They are, too, where
-            the values of ``car`` say so.
-        car: values of the car, for example ``CarValues(wheelbase=2.9)`` or `Recording.car`; used as `estimate` does.
+    Parameters
+    ----------
+    model : Estimator, optional
+        Fitted, causal; by default that of `load_model`, which also reads ``ax``.
+    bus_rate_hz : float, optional
+        Rate at which samples come, if it is above the model's: they then go through a causal
+        anti-aliasing filter first.
+    wheelbase : float, optional
+        Of the car [m]; by default that of ``car``.
+    elsewhere : bool
+        Whether the car or its tyres are others than those that were calibrated on; bands are wider
+        then. They are, too, where the values of ``car`` say so.
+    car : CarValues
+        Values of the car, for example ``CarValues(wheelbase=2.9)`` or `Recording.car`; used as
+        `estimate` does.
 
-    Raises:
-        ConfigurationError: the model is not causal, or the bus is slower than it.
+    Raises
+    ------
+    ConfigurationError
+        The model is not causal, or the bus is slower than it.
     """
-    of_car, trust = _for_car(model, car)
+    if wheelbase is not None:
+        car = replace(car, wheelbase=wheelbase)
+    of_car, trust = _for_car(load_model() if model is None else model, car, {})
     bands = None if trust is None else trust.bands
     is_other = elsewhere or (bands is not None and bool(bands.difference_to(car)))
-    return GuardedStepper(of_car, trust, bus_rate_hz, elsewhere=is_other)
+    return OnlineEstimator(GuardedStepper(of_car, trust, bus_rate_hz, elsewhere=is_other))
 
 
 def write_estimate(estimate: Estimate, path: str | Path) -> None:

@@ -412,6 +412,14 @@ def estimate(
             help="Exit code 3 and no file where a check finds something in the channels read.",
         ),
     ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            "--plot",
+            help="Draw recording and estimate, as `vehest plot` does: .png, .pdf, .svg, .html.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
@@ -425,12 +433,46 @@ def estimate(
 
     Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
-    from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
+    from vehest.run.plot import estimate_and_plot
 
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    outcome = estimate_file(words, out, strict=strict, car=car)
+    outcome = estimate_and_plot(words, out, plot, strict=strict, car=car)
     emit(as_json, outcome, summary_lines(outcome))
+
+
+@app.command("plot")
+def plot_drive(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE", help="The recording: a table, or with dataset=NAME one of its format."
+        ),
+    ],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ESTIMATE]... [OVERRIDES]...",
+            help="Tables of estimates, of `vehest estimate` or another tool; key=value …, as of `vehest estimate`.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg, or .html, a page."),
+    ] = Path("drive.png"),
+    start: Annotated[float | None, typer.Option("--start", help="Draw from here on [s].")] = None,
+    stop: Annotated[float | None, typer.Option("--stop", help="Draw up to here [s].")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw a recording and estimates of it: `vehest plot lap.csv estimate.parquet -o drive.pdf`.
+
+    β with the 90 % band and the health of the first estimate, v, the measured channels, the course in colours of β; with a reference
+    also estimate over reference. The course is reckoned from u, v and the yaw rate, and drifts over minutes.
+    """
+    from vehest.run.plot import plot_files
+
+    emit(as_json, plot_files([recording, *(words or [])], out, start, stop))
 
 
 @app.command()

@@ -59,7 +59,9 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
     figures = replayed(written, out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
     values = by_cantools(written)
-    stepper = vehest.online(vehest.load_model(), RATE, elsewhere=True)  # a bus names no car
+    stepper = vehest.online(
+        vehest.load_model("pretrained"), RATE, elsewhere=True
+    ).stepper  # a bus names no car
     expected = []
     last = stepper.last
     for k in range(len(values["vx"])):

@@ -80,7 +80,9 @@ def through(types, message):
 
 def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path, node, types):
     drive = planar_drive(20.0, 100.0)
-    stepper, bare = (vehest.online(vehest.load_model(), 100.0) for _ in range(2))
+    stepper, bare = (
+        vehest.online(vehest.load_model("pretrained"), 100.0).stepper for _ in range(2)
+    )
     samples = node.Samples()
     sent = []
     expected = []

@@ -300,7 +300,9 @@ def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_
         drives[1:],
         [*OF_SHIPPED, *NO_TRAINING, f"training.start_from={pretrained_folder()}"],
     )
-    assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
+    assert flat_weights(started) == pytest.approx(
+        flat_weights(vehest.load_model("pretrained")), abs=1e-6
+    )
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *NO_TRAINING])
     assert np.abs(flat_weights(scratch) - flat_weights(started)).max() > 0.01
 

@@ -171,7 +171,7 @@ def sideslip(vy, vx):
 
 def walk(estimator, limits, samples):
     """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
-    stepper = vehest.online(estimator)
+    stepper = vehest.online(estimator).stepper
     rows = [
         dict(zip(samples, row, strict=True))
         for row in zip(*(values.tolist() for values in samples.values()), strict=True)

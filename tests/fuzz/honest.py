@@ -163,7 +163,7 @@ def load_kernels():
     }
     drive = vehest.Recording("drive", "car", 20.0, 0.0, channels, "simulated")
     for drives in ([drive], []):
-        vehest.estimate(vehest.train("zero", drives, drives), drive.without_references())
-    stepper = vehest.online(vehest.load_model(), 100.0)
+        vehest.estimate(drive.without_references(), vehest.train("zero", drives, drives))
+    stepper = vehest.online(vehest.load_model("pretrained"), 100.0)
     for _ in range(400):
         stepper.step({"vx": 20.0, "yaw_rate": 0.0, "ay": 0.0, "ax": 0.0})

@@ -227,16 +227,16 @@ def test_the_python_functions_use_the_car_of_a_data_set_as_the_commands_do(place
     for overrides in (["dataset=f1"], ["dataset.car.wheelbase=0.33"]):
         recording = vehest.read_recording("lap.csv", overrides)
         assert recording.car == CarValues(wheelbase=0.33)
-        np.testing.assert_array_equal(vehest.estimate(model, recording)["vy"], expected)
+        np.testing.assert_array_equal(vehest.estimate(recording, model)["vy"], expected)
     assert model.settings.wheelbase == 2.7, "the caller's model stays as it is"
     stepper = vehest.online(model, car=CarValues(wheelbase=0.33))
-    assert stepper.estimator.settings.wheelbase == 0.33
+    assert stepper.stepper.estimator.settings.wheelbase == 0.33
     unknown = vehest.read_recording("lap.csv")
     with pytest.warns(UserWarning, match="the wheelbase is assumed to be 2.7 m"):
-        assumed = vehest.estimate(model, unknown)["vy"]
+        assumed = vehest.estimate(unknown, model)["vy"]
     assert np.abs(assumed - expected).max() > 0.05
     with_reference = replace(unknown, car=CarValues(wheelbase=0.33))
-    small = vehest.score(model, [with_reference])
+    small = vehest.score(model, with_reference)
     with pytest.warns(UserWarning, match="the wheelbase is assumed"):
         large = vehest.score(model, [unknown])
     assert small["rmse_sideslip"] != large["rmse_sideslip"]
@@ -320,7 +320,7 @@ def test_a_band_is_doubled_on_a_car_whose_values_are_others(place):
     model = vehest.load_model("own")
 
     def median(overrides, **options):
-        estimate = vehest.estimate(model, vehest.read_recording("lap.csv", overrides), **options)
+        estimate = vehest.estimate(vehest.read_recording("lap.csv", overrides), model, **options)
         return np.degrees(np.nanmedian(estimate["band_sideslip"]))
 
     assert median(["dataset=same"]) == pytest.approx(alone, abs=1e-3)

@@ -205,7 +205,7 @@ def test_train_eval_estimate_report_one_by_one(place):
     ].fillna("").tolist()
 
     model = vehest.load_model(trained["model"])
-    estimate = vehest.estimate(model, vehest.read_recording("lap.csv", ["dataset=lap"]))
+    estimate = vehest.estimate(vehest.read_recording("lap.csv", ["dataset=lap"]), model)
     vehest.write_estimate(estimate, "api.parquet")
     assert np.array_equal(estimate["vy"], frame["vy"], equal_nan=True)
 

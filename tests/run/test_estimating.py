@@ -227,8 +227,8 @@ def test_online_says_what_estimate_says_of_the_whole_drive(model):
     channels = {name: drive[name].copy() for name in model.channels}
     channels["ay"][1000:1100] = channels["ay"][1000]  # a second that stands still
     faulty = Recording("drive", drive.vehicle, 100.0, 0.0, channels)
-    batch = vehest.estimate(model, faulty)
-    stepper = vehest.online(model)
+    batch = vehest.estimate(faulty, model)
+    stepper = vehest.online(model).stepper
     assert stepper.horizon_steps == 0
     said = [
         stepper.step({name: values[k] for name, values in channels.items()})
@@ -250,7 +250,7 @@ def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
     vehest.save_model(model, tmp_path / "own")
     assert read_trust(tmp_path / "own").bands is not None
     before, after = (
-        vehest.estimate(own, drive_of(4)) for own in (model, vehest.load_model(tmp_path / "own"))
+        vehest.estimate(drive_of(4), own) for own in (model, vehest.load_model(tmp_path / "own"))
     )
     assert {"band_vy", "band_sideslip", "health", "health_reason"} <= set(before.channels)
     for name, values in before.channels.items():
@@ -259,11 +259,11 @@ def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
 
 def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_why(saved):
     alone = vehest.train("static_map", [drive_of(1)], [])
-    assert not {"band_vy", "band_sideslip"} & set(vehest.estimate(alone, drive_of(4)).channels), (
+    assert not {"band_vy", "band_sideslip"} & set(vehest.estimate(drive_of(4), alone).channels), (
         "nothing to calibrate by"
     )
     zero = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
-    assert set(vehest.estimate(zero, drive_of(4)).channels) == {
+    assert set(vehest.estimate(drive_of(4), zero).channels) == {
         "vy",
         "sideslip",
         "health",

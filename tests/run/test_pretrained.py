@@ -104,7 +104,7 @@ def test_python_interface_estimates_without_stages_and_hydra():
         "means = {'vx': 20.0, 'yaw_rate': 0.1, 'ay': 2.0, 'ax': 0.0}\n"
         "channels = {name: mean + values for (name, mean), values in zip(means.items(), noise)}\n"
         "recording = vehest.Recording('lap', 'car', 20.0, 0.0, channels)\n"
-        "assert numpy.isfinite(vehest.estimate(vehest.load_model(), recording)['band_vy']).any()\n"
+        "assert numpy.isfinite(vehest.estimate(recording, 'pretrained')['band_vy']).any()\n"
         "print(*sys.modules)"
     )
     run = subprocess.run(
@@ -117,7 +117,7 @@ def test_python_interface_estimates_without_stages_and_hydra():
 
 
 def test_a_copy_of_a_loaded_model_keeps_its_calibration():
-    model = vehest.load_model()
+    model = vehest.load_model("pretrained")
     assert model.trust.bands is not None
     assert copy.copy(model).trust is model.trust
 
@@ -128,7 +128,7 @@ def bands_on(name, data_root):
         compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]
     )
     recording = next(iter(source.recordings()))
-    estimate = vehest.estimate(vehest.load_model(), recording)
+    estimate = vehest.estimate(recording, "pretrained")
     reference = np.interp(estimate.time, recording.time, recording["sideslip_ref"])
     error = np.abs(estimate["sideslip"] - reference)
     band = estimate["band_sideslip"]

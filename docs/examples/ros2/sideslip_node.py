@@ -79,7 +79,8 @@ def main() -> None:
     rclpy.init()
     node = Node("vehest")
     model = vehest.load_model(node.declare_parameter("model", "pretrained").value)
-    stepper = vehest.online(model, node.declare_parameter("imu_rate_hz", 100.0).value)
+    rate_hz = node.declare_parameter("imu_rate_hz", 100.0).value
+    stepper = vehest.online(model, rate_hz).stepper
     samples = Samples()
     publisher = node.create_publisher(SideslipEstimate, "sideslip", 10)
     last = stepper.last

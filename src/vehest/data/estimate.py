@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import clock_tolerance
+from vehest.data.recording import Recording, clock_tolerance
+from vehest.data.time_series import TimeSeries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Mode = Literal["causal", "offline"]
 
@@ -57,8 +61,8 @@ def number_cell(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.6g}"
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(TimeSeries):
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
     NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`: a quantity is unknown or of another
@@ -98,8 +102,15 @@ class Estimate:
                 f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}"
             )
 
-    def __len__(self) -> int:
-        return len(next(iter(self.channels.values())))
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return f"of '{self.recording_id}' by {self.estimator}"
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Quantity -> SI unit."""
+        return {name: QUANTITIES[name] for name in self.channels}
 
     def __getitem__(self, name: str) -> FloatArray:
         """Values of one quantity, shape (T,)."""
@@ -107,10 +118,16 @@ class Estimate:
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
 
-    @property
-    def time(self) -> FloatArray:
-        """Times the values hold for [s], shape (T,)."""
-        return self.start_time + np.arange(len(self)) / self.rate_hz
+    def plot(
+        self,
+        recording: Recording | None = None,
+        start: float | None = None,
+        stop: float | None = None,
+    ) -> Figure:
+        """Draw the estimate, with its recording where that is passed; see `Recording.plot`."""
+        from vehest.report.drive_figure import drive_figure
+
+        return drive_figure(recording, [self], start, stop)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
         """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate."""
@@ -135,9 +152,7 @@ class Estimate:
 
     def _held_index(self, times: FloatArray) -> NDArray[np.int64]:
         """Sample that is held at each time; -1 outside the estimate."""
-        tolerance = clock_tolerance(
-            self.start_time, self.start_time + len(self) / self.rate_hz, self.rate_hz
-        )
+        tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(
             np.int64
         )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -14,6 +14,12 @@ from vehest.constants import FloatArray
 from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
+from vehest.data.time_series import TimeSeries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from vehest.data.estimate import Estimate
 
 Kind = Literal["real", "simulated"]
 
@@ -24,8 +30,8 @@ LOWEST_RATE = 1e-6
 HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(TimeSeries):
     """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
     Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or a senseless rate, start or kind.
@@ -82,8 +88,15 @@ class Recording:
                 )
                 raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
 
-    def __len__(self) -> int:
-        return len(next(iter(self.channels.values())))
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return f"'{self.id}'"
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Channel -> SI unit."""
+        return {name: CHANNELS[name].unit for name in self.channels}
 
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of one channel, shape (T,). Raises `DataError`: the recording does not have it."""
@@ -95,21 +108,6 @@ class Recording:
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
-
-    @property
-    def time(self) -> FloatArray:
-        """Sample times [s], shape (T,)."""
-        return self.start_time + np.arange(len(self)) / self.rate_hz
-
-    @property
-    def duration(self) -> float:
-        """Time from the first sample to the end of the last sampling interval [s]."""
-        return len(self) / self.rate_hz
-
-    @property
-    def end_time(self) -> float:
-        """End of the last sampling interval [s]."""
-        return self.start_time + self.duration
 
     def stack(self, names: Iterable[str]) -> FloatArray:
         """Channels as columns, shape (T, C). Raises `DataError`: one of them is missing."""
@@ -153,6 +151,27 @@ class Recording:
         return replace(
             self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels
         )
+
+    def plot(
+        self, *estimates: Estimate, start: float | None = None, stop: float | None = None
+    ) -> Figure:
+        """Draw the drive with estimates of it; see `vehest.report.drive_figure.drive_figure`.
+
+        Parameters
+        ----------
+        *estimates : Estimate
+            Of this recording; band, health and course are those of the first.
+        start, stop : float, optional
+            Range that is drawn [s]; by default all of it.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A notebook shows it; ``savefig`` writes PNG, PDF or SVG.
+        """
+        from vehest.report.drive_figure import drive_figure
+
+        return drive_figure(self, estimates, start, stop)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""

@@ -10,14 +10,17 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.derived import VelocityFromSideslip
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.data.splits import Span
 
 BoolArray = NDArray[np.bool_]
@@ -39,6 +42,9 @@ COVERAGE = {
     1: 0.6827,
     2: 0.9545,
 }  # number of standard deviations -> fraction of Gaussian errors within them
+
+POLYPHASE: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
+"""Preparation by which recordings come to another rate unless a model's training had another one."""
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public
@@ -403,6 +409,53 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         nis_dof=estimate_at("nis_dof") if innovations else None,
         bands=bands,
     )
+
+
+def score_whole(
+    estimate: Estimate, recording: Recording, preparation: Mapping[str, Any] = POLYPHASE
+) -> Scored:
+    """Score an estimate where it has values, after the first `Protocol.skip_seconds` of its recording.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the recording.
+    recording : Recording
+        With ``vx`` and ``vy_ref`` or ``sideslip_ref``; brought to `Protocol.rate_hz` if it has
+        more. Sideslip counts from the speed that follows from its car's wheelbase
+        (`min_sideslip_speed`).
+    preparation : mapping
+        By which the recording is brought to that rate.
+
+    Raises
+    ------
+    DataError
+        There is no reference or no estimate, they have gaps, or less than two samples in common.
+    """
+    recording = with_vy_ref(recording)
+    times = estimate.time[np.isfinite(estimate["vy"])]
+    if not len(times):
+        raise DataError(f"estimator '{estimate.estimator}' has no estimate of '{recording.id}'")
+    protocol = Protocol(min_sideslip_speed=min_sideslip_speed(recording.car.wheelbase))
+    protocol = replace(protocol, rate_hz=min(protocol.rate_hz, recording.rate_hz))
+    names = [
+        "vx",
+        "vy_ref",
+        *(name for name in ("ay", "vx_ref", "yaw_rate_ref") if name in recording),
+    ]
+    drive = recording if preparation["transforms"] else recording.select(names)
+    reference = resampled(drive, protocol.rate_hz, preparation)
+    start = float(times[0]) - protocol.skip_seconds
+    span = Span("", recording.id, start, float(times[-1]) + 1.0 / estimate.rate_hz)
+    return score(estimate, reference, span, protocol)
+
+
+def with_vy_ref(recording: Recording) -> Recording:
+    """The recording; with ``vy_ref`` made of ``sideslip_ref`` where it has only that."""
+    channels = recording.channels.keys()
+    if "vy_ref" in channels or not {"vx", "sideslip_ref"} <= channels:
+        return recording
+    return VelocityFromSideslip()(recording)
 
 
 def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> BoolArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from vehest.alignment.checks import refuse_errors
@@ -12,9 +13,16 @@ from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.transforms import OF_REFERENCES
 from vehest.sources.base import read_single
+from vehest.sources.named_columns import declare_columns
+from vehest.sources.tables import column_names
 
 
-def read_checked(path: Path, dataset: Mapping[str, Any], limits: Limits) -> Recording:
+def read_checked(
+    path: Path,
+    dataset: Mapping[str, Any],
+    limits: Limits,
+    columns: Mapping[str, str] = MappingProxyType({}),
+) -> Recording:
     """Read a recording from a file of any format.
 
     Parameters
@@ -25,6 +33,8 @@ def read_checked(path: Path, dataset: Mapping[str, Any], limits: Limits) -> Reco
         Options of its data set, by default a table with the channels' names.
     limits : Limits
         On what the file may ask for.
+    columns : mapping
+        Columns of a table that take the place of those of the data set; see `declare_columns`.
 
     Raises
     ------
@@ -32,6 +42,9 @@ def read_checked(path: Path, dataset: Mapping[str, Any], limits: Limits) -> Reco
         As `read_single`; `DataError` also where a check finds an error that the data set does not accept.
     """
     with use_limits(limits):
+        if columns:
+            names = column_names(path)
+            dataset = {**dataset, **declare_columns(columns, names, {}, f"'{path}'")}
         recording = read_single(dataset, path)
         refuse_errors(recording, dataset.get("accept") or (), f"'{path}'")
     return recording

@@ -129,7 +129,7 @@ def clouds_figure(
             all_axes, panels, strict=True
         ):
             for cloud in clouds:
-                _scatter(axes, cloud)
+                draw_cloud(axes, cloud)
             axes.set_xlabel(x_label)
             axes.set_ylabel(y_label)
             if has_equal_scales:
@@ -146,7 +146,7 @@ def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> Matpl
     with new_figure(DOUBLE_COLUMN, 0.4 + 1.85 * n_rows) as figure:
         grid = figure.subplots(n_rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes, cloud in zip(grid.flat, estimates, strict=False):
-            _scatter(axes, cloud)
+            draw_cloud(axes, cloud)
             axes.axline((0.0, 0.0), slope=1.0, color=REFERENCE_GREY, linewidth=0.9)
             axes.set_title(_wrapped(cloud.label), loc="left", fontsize=6.5)
             axes.set_xlim(-limit, limit)
@@ -165,7 +165,7 @@ def _wrapped(label: str) -> str:
     )
 
 
-def _scatter(axes: Any, cloud: Cloud) -> None:
+def draw_cloud(axes: Any, cloud: Cloud, marker_size: float = 1.6) -> None:
     """Points of a cloud, every n-th so that a figure stays small."""
     step = max(len(cloud.x) // MAX_POINTS, 1)
     axes.plot(
@@ -174,7 +174,7 @@ def _scatter(axes: Any, cloud: Cloud) -> None:
         color=cloud.colour,
         linestyle="none",
         marker=".",
-        markersize=1.6,
+        markersize=marker_size,
         markeredgewidth=0.0,
         label=cloud.label,
     )

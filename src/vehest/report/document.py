@@ -181,9 +181,15 @@ def write_document(
     )
     if page:
         whole = replace(document, blocks=[*document.blocks, *on_page])
-        (folder / f"{name}.html").write_bytes(
-            _page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace")
-        )
+        (folder / f"{name}.html").write_bytes(page_of(whole, images))
+
+
+def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
+    """The self-contained HTML page of a document; ``images``: its figures as SVG by name, if they are drawn already."""
+    drawn = images or {
+        block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
+    }
+    return _page(document, _numbers(document), drawn).encode("utf-8", "backslashreplace")
 
 
 def as_text(name: str) -> str:
@@ -251,20 +257,28 @@ def _numbers(document: Document) -> dict[int, str]:
     return numbers
 
 
-def png_of(figure: MatplotlibFigure) -> bytes:
+def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
     """A figure as pixels, in as few colours as look the same: a third of the size."""
     from PIL import Image
 
     buffer = io.BytesIO()
     small = io.BytesIO()
     with paper_style():
-        figure.savefig(buffer, format="png", dpi=PNG_DPI)
+        figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
         few = image.convert("RGB").quantize(
             PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(small, format="png", optimize=True, dpi=(PNG_DPI, PNG_DPI))
+        few.save(small, format="png", optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
+
+
+def pdf_of(figure: MatplotlibFigure) -> bytes:
+    """A figure as PDF."""
+    buffer = io.BytesIO()
+    with paper_style():
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Creator": None})
+    return buffer.getvalue()
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
 from vehest.data.runs import true_runs
 
 LEVELS = 65_534
@@ -58,6 +59,14 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
     return described, base64.b64encode(
         zlib.compress(b"".join(part.tobytes() for part in parts), 9)
     ).decode()
+
+
+def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
+    """Values of a channel and their unit as people read them: angles in degrees."""
+    channel = CHANNELS[name]
+    if channel.is_angular:
+        return np.degrees(values), {"rad": "deg", "rad/s": "deg/s"}[channel.unit]
+    return values, channel.unit
 
 
 def reckoned_course(

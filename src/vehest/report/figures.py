@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STATIC_POINTS = 500
+MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
+MAX_POINTS = 2000  # of a line over a whole drive on one page
 LEAST_SAMPLES = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other
@@ -110,30 +112,9 @@ def zoom_figure(
         (top, middle, below) = all_axes[:3]
         bottom = all_axes[-1]
         for estimate in reversed(estimates):
-            looks = {
-                "color": estimate.line.colour,
-                "linestyle": estimate.line.dash,
-                "linewidth": 1.0,
-            }
-            top.plot(time, estimate.sideslip, label=estimate.label, **looks)
-            middle.plot(time, estimate.sideslip - reference.sideslip, **looks)
-            below.plot(time, estimate.vy, **looks)
-        if band is not None:
-            for axes, centre, half in (
-                (top, band.estimate.sideslip, band.sideslip),
-                (below, band.estimate.vy, band.vy),
-            ):
-                axes.fill_between(
-                    time,
-                    centre - half,
-                    centre + half,
-                    color=band.estimate.line.colour,
-                    alpha=0.2,
-                    linewidth=0.0,
-                    label=f"90 % band of {band.estimate.label}",
-                )
-        top.plot(time, reference.sideslip, label=reference.label, zorder=1, **BELOW_ESTIMATES)
-        below.plot(time, reference.vy, zorder=1, **BELOW_ESTIMATES)
+            middle.plot(time, estimate.sideslip - reference.sideslip, **_looks(estimate.line))
+        draw_quantity(top, time, "sideslip", reference, estimates, band)
+        draw_quantity(below, time, "vy", reference, estimates, band)
         middle.axhline(0.0, color=reference.line.colour, linewidth=0.7)
         if ay is not None:
             bottom.plot(time, ay, color="#444444", linewidth=0.8)
@@ -144,8 +125,39 @@ def zoom_figure(
         bottom.set_xlabel(time_label)
         figure.align_ylabels()
         bottom.xaxis.set_major_locator(MaxNLocator(nbins=11, integer=True))
-        _legend_above(figure, top)
+        legend_above(figure, top)
     return figure
+
+
+def _looks(line: Line) -> dict[str, Any]:
+    return {"color": line.colour, "linestyle": line.dash, "linewidth": 1.0}
+
+
+def draw_quantity(
+    axes: Any,
+    time: FloatArray,
+    quantity: Literal["vy", "sideslip"],
+    reference: Traces | None,
+    estimates: Sequence[Traces],
+    band: Band | None,
+) -> None:
+    """Draw a quantity of estimates, the first one above the others, with a band, over a wide line of the reference."""
+    for estimate in reversed(estimates):
+        shown = decimated(time, getattr(estimate, quantity), MAX_POINTS)
+        axes.plot(*shown, label=estimate.label, **_looks(estimate.line))
+    if band is not None:
+        centre = getattr(band.estimate, quantity)
+        half_width = getattr(band, quantity)
+        axes.fill_between(
+            *envelope(time, centre - half_width, centre + half_width, MAX_POINTS),
+            color=band.estimate.line.colour,
+            alpha=0.2,
+            linewidth=0.0,
+            label=f"90 % band of {band.estimate.label}",
+        )
+    if reference is not None:
+        shown = decimated(time, getattr(reference, quantity), MAX_POINTS)
+        axes.plot(*shown, label=reference.label, zorder=1, **BELOW_ESTIMATES)
 
 
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
@@ -210,7 +222,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
         below.set_xlabel("$|a_y|$ [m/s²]")
         below.set_xlim(0.0, edges[-1])
         figure.align_ylabels()
-        _legend_above(figure, axes)
+        legend_above(figure, axes)
     return figure
 
 
@@ -239,7 +251,7 @@ def learning_curves(runs: Sequence[tuple[str, Line, pd.DataFrame]]) -> Matplotli
             axes.set_xlabel("epoch")
             axes.set_xlim(left=0)
         left.set_ylabel("loss [m²/s²]")
-        _legend_above(figure, left)
+        legend_above(figure, left)
     return figure
 
 
@@ -334,7 +346,17 @@ def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[Floa
     return time[order], values[order]
 
 
-def _legend_above(figure: Any, axes: Any) -> None:
+def envelope(
+    time: FloatArray, low: FloatArray, high: FloatArray, n_points: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fewer points of the ends of a band, (K,), that contain it: lowest and highest of each segment; NaN where either end is."""
+    if len(time) <= n_points:
+        return time, low, high
+    starts = np.linspace(0, len(time), n_points, endpoint=False).astype(int)
+    return time[starts], np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
+
+
+def legend_above(figure: Any, axes: Any) -> None:
     """A legend over the whole width, in the reverse of the order in which lines were drawn."""
     handles, labels = (entries[::-1] for entries in axes.get_legend_handles_labels())
     fitting = [

@@ -35,7 +35,6 @@ from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
 from vehest.run.estimate_tables import (
-    NamedColumn,
     names_of_table,
     parse_columns,
     parse_shift,
@@ -50,6 +49,7 @@ from vehest.run.printing import (
     score_cells,
 )
 from vehest.sources.base import read_single
+from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 LEAST_SECONDS = 5.0

@@ -74,6 +74,7 @@ def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
         "point": f"v and β at the {outcome['point']}",
         "warnings": f"{len(outcome['findings'])}, printed above" if outcome["findings"] else "none",
         "file": f"{outcome['out']}{_columns(Path(outcome['out']))}",
+        "picture": outcome.get("plot", ""),
         "note": outcome.get("note", ""),
     }
     return [f"{label:<{LABEL_WIDTH}}{text}" for label, text in rows.items() if text]

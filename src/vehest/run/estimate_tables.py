@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from vehest.run.printing import complain, note
 from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
 from vehest.run.time_shift import Series, estimate_shift
 from vehest.sources.base import read_single
+from vehest.sources.named_columns import NamedColumn, written_unit
 from vehest.sources.surveys.tables import shape_of, unit_in_name
 from vehest.sources.tables import TextLayout, column_names, is_parquet
 from vehest.sources.unit_spellings import plain_unit
@@ -50,24 +51,6 @@ OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
 DEFAULT_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 AUTO = "auto"
-
-
-@dataclass(frozen=True)
-class NamedColumn:
-    """A column that the user names: ``sideslip=-Beta_CarMaker:deg``."""
-
-    channel: str  # ``time``, or the channel that it is read as
-    text: str  # a sign, the name and a unit, as they were given
-
-    def find(self, names: Sequence[str]) -> tuple[str, str, int] | None:
-        """Name, unit (empty if none is stated) and sign of the column in a table; None if the table lacks it."""
-        for sign, text in ((1, self.text), (-1, self.text.removeprefix("-"))):
-            if text in names:
-                return text, "", sign
-            name, _, unit = text.rpartition(":")
-            if name in names:
-                return name, unit, sign
-        return None
 
 
 def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
@@ -219,8 +202,7 @@ def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
 
 def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
     """The unit that is stated or in a column's name, or the default; raises `DataError` for an unknown one."""
-    written = re.search(r"[\[(](.*?)[\])]", name)
-    text = stated or (written[1] if written else unit_in_name(name))
+    text = stated or written_unit(name)
     if quantity == "time" and not text and (last := name.lower().rpartition("_")[2]) in TIME_UNITS:
         text = last if "_" in name else ""
     if not text:

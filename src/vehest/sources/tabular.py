@@ -211,30 +211,54 @@ class TabularSource(FileSource):
         if is_stored_recording(file):
             return read_recording(file)
         columns = self._columns_of(file)
-        selected = [
-            column.column
-            for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))
-        ]
-        extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
-        values = self._values(
-            file,
-            list(dict.fromkeys([*selected, *(str(name) for name in extra if name is not None)])),
-        )
+        values = self._values(file, self.columns_read(column_names(file, self.layout)))
         rows = self._runs_of(file)[run]
         return self._recording_of(
             file, run, columns, {name: samples[rows] for name, samples in values.items()}
         )
 
-    def _columns_of(self, file: Path) -> Mapping[str, Column]:
-        """Column of each channel: those of the data set, else those that are named like
-        channels.
+    def columns_read(self, names: Sequence[str]) -> list[str]:
+        """Columns read of a table with columns of these names: of channels, poses, times, runs."""
+        columns = [
+            *self.columns_of(names).values(),
+            *(self.pose.columns.values() if self.pose else ()),
+        ]
+        others = [
+            self.time and self.time.column,
+            self.options.runs,
+            self.held and self.held.updated,
+        ]
+        wanted = [column.column for column in columns]
+        return list(dict.fromkeys([*wanted, *(str(name) for name in others if name is not None)]))
+
+    def recording_of(self, table: Mapping[str, FloatArray], name: str) -> Recording:
+        """A recording of columns in memory, (T,) each.
+
+        Raises
+        ------
+        ConfigurationError
+            The data set has runs, or rows that are left out.
         """
+        if self._cuts or self.options.runs or self.dropped:
+            raise ConfigurationError(
+                f"{self.where}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
+            )
+        if self.time is not None:
+            table = self.time.in_order(table)
+        columns = self.columns_of(list(table))
+        values = measured_columns(columns, table)
+        return self._prepared(self._recording_of(Path(name), None, columns, values))
+
+    def columns_of(self, names: Sequence[str]) -> Mapping[str, Column]:
+        """Column of each channel: those of the data set, else those that are named like channels."""
+        if self.columns is not None:
+            return self.columns
+        return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
+
+    def _columns_of(self, file: Path) -> Mapping[str, Column]:
+        """The columns of a file's channels; raises `DataError` where there is none."""
         names = column_names(file, self.layout)
-        columns = self.columns
-        if columns is None:
-            columns = {
-                name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS
-            }
+        columns = self.columns_of(names)
         if not columns:
             problem = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(

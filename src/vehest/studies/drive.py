@@ -34,7 +34,6 @@ from vehest.report.document import (
 from vehest.report.style import Line, decimals_for, fixed, lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.drawings import (
-    MIN_UNIX_SECONDS,
     behaviour_blocks,
     busiest_block,
     error_over_ay_block,
@@ -406,7 +405,7 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     file = artefacts.references.get((span.dataset, span.recording))
     begin = 0.0
     bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
-    if file is not None and bounds and min(bounds) >= MIN_UNIX_SECONDS:
+    if file is not None and bounds and min(bounds) >= figures.MIN_UNIX_SECONDS:
         begin = read_recording(file, ["vx"]).start_time
     start = span.start - begin
     stop = span.stop - begin

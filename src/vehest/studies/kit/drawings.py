@@ -14,6 +14,7 @@ from vehest.evaluation.metrics import BoolArray, Scored
 from vehest.report import figures
 from vehest.report.comparison_figures import Cloud, agreement_figure, clouds_figure
 from vehest.report.document import Figure
+from vehest.report.figures import MIN_UNIX_SECONDS
 from vehest.report.style import REFERENCE, REFERENCE_GREY, Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.explorer import chained, explorer_of
@@ -22,7 +23,6 @@ from vehest.studies.kit.runs import Name
 ZOOM_SECONDS = 20.0
 MAX_IN_ZOOM = 4  # estimates in the figure of the busiest seconds
 TEST_COLOUR = "#0b4f9c"
-MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Scored, pieces_of, scored_range
-from vehest.report.explorer import explorer_json, reckoned_course
+from vehest.report.explorer import explorer_json, in_display_unit, reckoned_course
 from vehest.report.style import Line, on_dark
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import Name
@@ -67,12 +67,7 @@ def explorer_of(
     inputs = []
     candidates = []
     for i, name in enumerate(names[:MOST_INPUTS]):
-        channel = CHANNELS[name]
-        values = measured(name)
-        columns[f"input{i}"] = np.degrees(values) if channel.is_angular else values
-        unit = (
-            {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
-        )
+        columns[f"input{i}"], unit = in_display_unit(name, measured(name))
         inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
     for i, (own, (model, title, line)) in enumerate(shown.items()):
         columns[f"vy{i}"] = chained([part.vy for part in scored[own]], gap)

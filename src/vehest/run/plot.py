@@ -1,0 +1,105 @@
+"""Draws a recording with estimates of it into a picture or a page (`vehest plot`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from vehest.configuration.estimate_options import EstimateOptions, estimate_options
+from vehest.configuration.files import is_file_name
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.files import written_aside
+from vehest.data.recording import Recording
+from vehest.inference.reading import read_checked, without_references
+from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
+from vehest.report.style import MatplotlibFigure
+from vehest.run.estimate import estimate_file
+from vehest.run.estimate_tables import read_estimate_table
+
+
+def _page(figure: MatplotlibFigure) -> bytes:
+    title = as_text(figure.axes[0].get_title(loc="left"))
+    caption = "Sideslip angle with band and health, lateral velocity, measured channels, course."
+    return page_of(Document(title, [Figure("drive", caption, figure)]))
+
+
+WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
+    ".png": partial(png_of, dpi=200),
+    ".pdf": pdf_of,
+    ".svg": svg_of,
+    ".html": _page,
+}
+"""Ending of a file -> the figure in its format."""
+
+
+def check_plot_name(out: Path) -> None:
+    """Raises `ConfigurationError` for the name of a file that no picture is written to."""
+    if out.suffix.lower() not in WRITERS:
+        raise ConfigurationError(
+            f"'{out}': pictures are written as {', '.join(WRITERS)}; name such a file"
+        )
+
+
+def estimate_and_plot(
+    words: Sequence[str], out: Path, picture: Path | None, *, strict: bool, car: Path | None
+) -> dict[str, Any]:
+    """Estimate as `estimate_file` does; where a picture is named, draw what it wrote."""
+    if picture is None:
+        return estimate_file(words, out, strict=strict, car=car)
+    check_plot_name(picture)
+    if out.suffix.lower() != ".parquet":
+        raise ConfigurationError(
+            f"--plot needs the estimate as .parquet, which has its bands and health, not as '{out}'"
+        )
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    has_model = len(words) > 1 and is_file_name(words[1])
+    recording, *overrides = words[1:] if has_model else words
+    plot_files([recording, str(out), *overrides], picture)
+    return outcome | {"plot": str(picture)}
+
+
+def plot_files(
+    words: Sequence[str], out: Path, start: float | None = None, stop: float | None = None
+) -> dict[str, Any]:
+    """Draw a recording, and estimates of it, on one page.
+
+    Parameters
+    ----------
+    words : sequence of str
+        File of the recording, files of estimates as `read_estimate_table` reads them, overrides of
+        conf/estimate.yaml.
+    out : Path
+        ``.png``, ``.pdf``, ``.svg`` or ``.html``; appears complete or not at all.
+    start, stop : float, optional
+        Range that is drawn [s]; by default all of it.
+
+    Raises
+    ------
+    VehestError
+        A file cannot be used or written.
+    """
+    check_plot_name(out)
+    recording_file, *estimate_files = (Path(word) for word in words if is_file_name(word))
+    options = estimate_options([word for word in words if not is_file_name(word)])
+    recording = _with_references_if_any(recording_file, options)
+    estimates = [read_estimate_table(file, recording) for file in estimate_files]
+    content = WRITERS[out.suffix.lower()](recording.plot(*estimates, start=start, stop=stop))
+    with written_aside(out) as aside:
+        aside.write_bytes(content)
+    return {
+        "out": str(out),
+        "recording": recording.id,
+        "seconds": recording.duration,
+        "estimates": [str(file) for file in estimate_files],
+        "has_reference": "vy_ref" in recording,
+    }
+
+
+def _with_references_if_any(file: Path, options: EstimateOptions) -> Recording:
+    """A recording with the references of its data set; without them where the file lacks one."""
+    try:
+        return read_checked(file, options.dataset, options.limits)
+    except DataError:
+        return read_checked(file, without_references(options.dataset), options.limits)

@@ -1,0 +1,45 @@
+"""How a notebook shows recordings and estimates: one line, a table, a DataFrame."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from conftest import planar_drive
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+
+
+@pytest.fixture
+def recording():
+    channels = {"vx": np.array([20.0, 21.0, 22.0]), "ay": np.array([-1.5, np.nan, 2.0])}
+    return Recording("lap <1>", "car", 50.0, 4.0, channels, gappy=frozenset({"ay"}))
+
+
+def test_repr_says_size_and_channels_on_one_line(recording):
+    assert repr(recording) == "<Recording 'lap <1>': 0.06 s at 50 Hz; vx, ay>"
+    estimate = Estimate("lap", "zero", 50.0, 4.0, dict.fromkeys(("vy", "sideslip"), np.zeros(3)))
+    assert repr(estimate) == ("<Estimate of 'lap' by zero: 0.06 s at 50 Hz; vy, sideslip>")
+    many = planar_drive(4.0)
+    assert "\n" not in repr(many)
+    assert len(repr(many)) <= 100
+    assert repr(many).endswith(f"and {len(many.channels) - 4} more>")
+
+
+def test_table_of_a_notebook_escapes_names_and_counts_missing_samples(recording):
+    html = recording._repr_html_()
+    assert "lap &lt;1&gt;" in html
+    assert "<tr><td>ay</td><td>m/s²</td><td>-1.5</td><td>2</td><td>1</td></tr>" in html
+
+
+def test_dataframe_has_the_samples_on_their_times_and_their_units(recording):
+    frame = recording.to_pandas()
+    expected = pd.DataFrame(
+        {"vx": [20.0, 21.0, 22.0], "ay": [-1.5, np.nan, 2.0]},
+        index=pd.Index([4.0, 4.02, 4.04], name="time"),
+    )
+    pd.testing.assert_frame_equal(frame, expected, check_exact=True)
+    assert frame.attrs["units"] == {"time": "s", "vx": "m/s", "ay": "m/s²"}
+    frame.loc[4.0, "vx"] = 0.0
+    assert recording["vx"][0] == 20.0
+    estimate = Estimate("lap", "zero", 50.0, 4.0, dict.fromkeys(("vy", "sideslip"), np.ones(3)))
+    assert estimate.to_pandas().attrs["units"] == {"time": "s", "vy": "m/s", "sideslip": "rad"}
