@@ -135,7 +135,7 @@ def read_frame(
     declared = declare_columns(columns, names, frame.attrs.get("units", {}), where)
     source = open_source({**dataset, **declared})
     if not isinstance(source, TabularSource):
-        raise ConfigurationError(f"{where}: {source.where} describes no table")
+        raise ConfigurationError(f"{where}: {source.location} describes no table")
     if not source.columns_of(names):
         raise DataError(
             f"{where}: no column is named like a channel (it has {listed(names)}); "

@@ -241,7 +241,7 @@ class TabularSource(FileSource):
         """
         if self._cuts or self.options.runs or self.dropped:
             raise ConfigurationError(
-                f"{self.where}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
+                f"{self.location}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
             )
         if self.time is not None:
             table = self.time.in_order(table)
