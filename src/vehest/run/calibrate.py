@@ -135,8 +135,8 @@ def learn_trust(
     notes = []
     try:
         bands = calibrated(
-            _pieces(estimator, train),
-            _pieces(estimator, validation),
+            pieces_of(estimator, train),
+            pieces_of(estimator, validation),
             tuple(estimator.channels),
             vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
             datasets=tuple(
@@ -170,7 +170,7 @@ def learn_trust(
     return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
 
 
-def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
+def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
     """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
     found: list[Piece] = []
     estimates = estimator.estimate(
