@@ -339,6 +339,12 @@ def test_band_widens_while_motion_and_estimate_contradict_each_other_and_narrows
     assert deviations[later].max() < 0.3 * largest
 
 
+def test_place_of_the_unit_is_not_identified_on_a_model_car():
+    for cg, mean in ((None, TYPICAL_REAR * 0.33), (0.115, 0.115)):
+        model = SelfCalibrating.from_config({"wheelbase": 0.33, "cg_to_rear_axle": cg})
+        assert model.imu_prior == pytest.approx((mean, model.imu_deviation * 0.33))
+
+
 def test_refuses_a_place_far_outside_of_the_car_and_a_point_that_is_none():
     with pytest.raises(ConfigurationError, match=r"imu_to_rear_axle must lie between .* not at 9"):
         model_of(imu_to_rear_axle=9.0)

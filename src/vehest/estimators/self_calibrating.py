@@ -201,7 +201,10 @@ class SelfCalibrating(Recursive):
         3.0, "power of the typical wheelbase over the car's by which it grows", least=0.0
     )
     network_wheelbase: float = setting(
-        1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0
+        1.5,
+        "shortest wheelbase of cars for which the network counts and the place of the unit is identified",
+        unit="m",
+        least=0.0,
     )
 
     def __init__(self, settings: Any) -> None:
@@ -259,6 +262,8 @@ class SelfCalibrating(Recursive):
         """Mean and standard deviation of the inertial unit's distance from the rear axle at the start [m]."""
         if self.imu_to_rear_axle is not None:
             return float(self.imu_to_rear_axle), self.imu_deviation * self.wheelbase
+        if self.wheelbase < self.network_wheelbase:  # their sensors do not resolve the place
+            return self.rear, self.imu_deviation * self.wheelbase
         mean = self.place * self.wheelbase if self.cg_to_rear_axle is None else self.rear
         return mean, self.place_deviation * self.wheelbase
 
