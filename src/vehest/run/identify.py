@@ -20,7 +20,15 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
+from vehest.run.car_record import (
+    FORMAT,
+    LIMITS,
+    CarRecord,
+    Number,
+    adapted,
+    read_car,
+    with_settings,
+)
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.estimate import (
@@ -111,11 +119,8 @@ def in_words(record: CarRecord) -> TerminalTable:
         for drive, own in record.offsets.items()
         for channel, one in own.items()
     }
-    prior = prior_of(
-        SelfCalibrating.from_config(
-            {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
-        )
-    )
+    car = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
+    prior = prior_of(with_settings(SelfCalibrating.from_config({}), car))
     at_start = {name: prior[name].deviation for name in LIMITS}
     at_start["grip"] *= record.grip.value
     rows = [
