@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.io
 import yaml
+from numpy.typing import NDArray
 
 from vehest.configuration.composition import compose_config
 from vehest.constants import FloatArray
@@ -27,6 +28,7 @@ from vehest.data.resampling import resampled
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.data_sheet import DataSheet
+from vehest.estimators.prior_map import PriorMap
 from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
 from vehest.inference.car_values import LIMITS, calibrated, with_settings
 from vehest.inference.estimation import estimate_recording
@@ -37,6 +39,7 @@ from vehest.run.identify import Normal, posterior_of, record_of
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.table_records import record_tables
+from vehest.sources.base import open_source
 
 VERSION = "1"
 """Raised when the numbers of its tables move."""
@@ -45,16 +48,17 @@ CHOICES = "conf/estimator/self_calibrating.yaml"
 TARGET = ROOT / "results" / "unseen_car"
 RATE = 20.0
 BLOCK = round(10.0 * RATE)  # samples of a block of the bootstrap
+TURN_YAW_RATE = 0.1  # rad/s
 WARM_UP = 30  # samples until the shipped network estimates; scored for no method
 PLAIN = {"method": "polyphase", "transforms": []}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "cold": {},
     "car not given": {"wheelbase": TYPICAL_WHEELBASE, "cg_to_rear_axle": None},
+    "centre of gravity not given": {"cg_to_rear_axle": None},
     "bank alone": {"network_odds": 1e-9, "steady_odds": 1e-9},
-    "no filter with the network's axle": {"network_start": 1e-300},
-    "no saturation": {"grips": [1000.0], "network_start": 1e-300},
+    "no saturation": {"grips": [1000.0]},
     "no longitudinal equation": {"measured_ax": False},
-    "fixed rear axle": {"grips": [14.0], "compliance_deviation": 1e-3, "network_start": 1e-300},
+    "fixed rear axle": {"grips": [14.0], "compliance_deviation": 1e-3},
     "no roll leakage": {"leakage": 0.0, "leakage_deviation": 1e-4},
 }
 
@@ -99,6 +103,8 @@ CARS = (
     Car("Corvette Grand Sport", "simulated", True, 2.49, 1.19, "sim_race_cars", "c*", FIRST),
     Car("Ferrari 250 LM-like", "simulated", True, 2.4, 1.07, "sim_race_cars", "f*", FIRST),
     Car("Jaguar E-type-like", "simulated", True, 2.44, None, "sim_race_cars", "j*", FIRST),
+    Car("Volvo V40", "real", True, 2.55, 1.505, "kth_v40", slowest=3.0),
+    Car("VW Golf, no ax, poor reference", "real", True, 2.578, 1.547, "liu_golf", slowest=3.0),
     Car("BMW 545i", "simulated", False, 2.88, 1.41, "sim_bmw_unseen", "unseen_*"),
     Car("F1TENTH, 1:8", "real", False, 0.33, 0.115, "f1tenth", slowest=1.0),
     Car("DART, 1:10", "real", False, 0.175, 0.094, "dart", slowest=0.5),
@@ -114,12 +120,37 @@ CARS = (
     ),
     Car("AutoRally, 1:5, smoothed signals", "real", False, 0.57, None, "autorally", slowest=1.0),
 )
-FILES = {"stanford_tts": "stanford_tts/*.mat", "autorally": "autorally/mppi_*.mat"}
+FILES = {
+    "stanford_tts": "stanford_tts/*.mat",
+    "autorally": "autorally/mppi_*.mat",
+    "kth_v40": "kth_v40/*.VBO",
+    "liu_golf": "liu_golf/dlc*.csv",
+}
 """Raw files of cars that no data set in conf/dataset reads."""
 SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
 LARGEST_RATIO = 1.1
+STANDSTILL = "Stand_Still_no2"
+V40 = {
+    "name": "kth_v40",
+    "vehicle": "volvo_v40",
+    "source": "vbo",
+    "files": "*.VBO",
+    "channels": {
+        "vx": {"column": "Lng._Vel.", "unit": "km/h"},
+        "yaw_rate": {"column": "YawRate", "unit": "deg/s", "sign": -1},
+        "ax": {"column": "X_Accel", "unit": "g"},
+        "ay": {"column": "Y_Accel", "unit": "g"},
+        "vy_ref": {"column": "Lat._Vel.", "unit": "km/h"},
+        "vx_ref": {"column": "Lng._Vel.", "unit": "km/h"},
+    },
+    "reference_point": {"x": -0.7, "y": 0.0},  # of the antenna, by the logger's own offsets
+    "imu_point": "unknown",
+    "clock": "interpolate",
+}
+"""How the files of the Volvo V40 are read."""
 METHODS = (
     "v = 0",
+    "prior map",
     "data sheet",
     "shipped",
     "self-calibrating",
@@ -127,8 +158,9 @@ METHODS = (
     "smoothed, offline",
     "map with reference",
 )
+BANDS = ("band holds", "while turning, worst drive", "interval score of β [deg]")
 WORSE = ("drives", "worse than v = 0", "than 1.1 times shipped")
-HEADS = ("car", "choices", *METHODS, "over shipped", "FVU, median (worst)", "band holds", *WORSE)
+HEADS = ("car", "choices", *METHODS, "over shipped", "FVU, median (worst)", *BANDS, *WORSE)
 PAGE = """# A car that nobody has trained on
 
 Self-calibrating filter with the choices of [one file](../../{choices}), started cold on every drive. It {verdict}
@@ -172,6 +204,8 @@ class Errors(NamedTuple):
     sideslip: Mapping[str, FloatArray]
     vy: Mapping[str, FloatArray]
     within: FloatArray
+    turning: NDArray[np.bool_]  # |yaw rate| above TURN_YAW_RATE
+    interval_score: float  # of the 90 % band of β (Gneiting & Raftery 2007) [deg]
     reference: FloatArray
     time: FloatArray
     title: str
@@ -231,6 +265,19 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
             }
             yield resampled(Recording(file.stem, "autorally", 1000.0, 0.0, channels), RATE, PLAIN)
         return
+    if car.dataset == "liu_golf":
+        for file in sorted((Path(root) / "liu_golf").glob("dlc*.csv")):
+            table = np.genfromtxt(file, delimiter=",", names=True)
+            columns = {"yaw_rate": "Omegaz", "vx": "vx", "ay": "ay", "vy_ref": "vy"}
+            channels = {name: table[column].copy() for name, column in columns.items()}
+            yield resampled(Recording(file.stem, "vw_golf", 250.0, 0.0, channels), RATE, PLAIN)
+        return
+    if car.dataset == "kth_v40":
+        source = open_source(V40 | {"path": str(Path(root) / "kth_v40")})
+        for recording in source.recordings():
+            if recording.id != STANDSTILL:
+                yield resampled(recording, RATE, PLAIN)
+        return
     for recording in ingested(runner, root, f"dataset={car.dataset}", *car.overrides):
         read = {"yaw_rate", "vx", "ay", "vy_ref"} <= set(recording.channels)
         if fnmatchcase(recording.id, car.drives) and read and recording.duration > 5.0:
@@ -279,12 +326,17 @@ def models_of(car: Car, rate_hz: float, has_ax: bool) -> dict[str, Estimator]:
         "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase,
         "rate_hz": rate_hz,
     }
+    prior = {**sheet, "cg_to_rear_axle": car.cg_to_rear_axle}
     variants = ABLATIONS | {"smoothed": {"smoothed": True}}
     filters = {
         name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed))
         for name, changed in variants.items()
     }
-    return {"data sheet": DataSheet.from_config(sheet), **filters}
+    return {
+        "data sheet": DataSheet.from_config(sheet),
+        "prior map": PriorMap.from_config(prior),
+        **filters,
+    }
 
 
 def errors_of(
@@ -329,11 +381,16 @@ def errors_of(
         for name, vy in found.items()
     }
     within = (np.abs(found["cold"] - truth) < 1.645 * np.sqrt(variance))[moving]
+    half = np.degrees(1.645 * np.sqrt(variance) / np.maximum(np.abs(speed), 1.0))[moving]
+    beyond = np.maximum(np.sqrt(angle["cold"]) - half, 0.0)
+    turning = (np.abs(inputs["yaw_rate"]) > TURN_YAW_RATE)[moving]
     time = np.arange(len(speed))[moving] / plain.rate_hz
     return Errors(
         angle,
         {name: (vy - truth)[moving] ** 2 for name, vy in found.items()},
         within,
+        turning,
+        float(np.mean(2.0 * half + 20.0 * beyond)),
         truth[moving],
         time,
         recording.id,
@@ -497,6 +554,7 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
             rmse(drives, name)
             for name in (
                 "v = 0",
+                "prior map",
                 "data sheet",
                 "shipped",
                 "cold",
@@ -506,9 +564,16 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
             )
         ]
         if car in ratios:
-            over = f"{fixed(errors[3] / errors[2], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
+            over = f"{fixed(errors[4] / errors[3], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
         figures = [fixed(error, 2) if np.isfinite(error) else "–" for error in errors]
-        band = fixed(float(np.mean(np.concatenate([drive.within for drive in drives]))), 2)
+        band = [fixed(float(np.mean(np.concatenate([drive.within for drive in drives]))), 2)]
+        turns = [
+            drive.within[drive.turning].mean()
+            for drive in drives
+            if drive.turning.sum() > BLOCK // 4
+        ]
+        band.append(fixed(float(min(turns)), 2) if turns else "–")
+        band.append(fixed(float(np.mean([drive.interval_score for drive in drives])), 2))
         about = [title, "made on it" if car.development else "not", *figures, over]
         above = [
             sum(rmse([drive], "cold") > limit * rmse([drive], name) for drive in drives)
@@ -523,7 +588,7 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
             [
                 *about,
                 f"{fixed(float(np.median(shares)), 3)} ({fixed(max(shares), 2)})",
-                band,
+                *band,
                 *counts,
             ]
         )

@@ -24,7 +24,7 @@ SMALL = {"inputs": "imu", "hidden": [8, 4]}
 DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
 CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurrent ones see what the drives below have
     "factor_graph": {"window": 0.05},
-    **{name: {"rate_hz": 100.0} for name in ("zero", "static_map", "kinematic")},
+    **{name: {"rate_hz": 100.0} for name in ("zero", "static_map", "prior_map", "kinematic")},
     "data_sheet": {"rate_hz": 100.0, "wheelbase": 2.7},
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,

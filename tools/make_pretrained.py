@@ -2,24 +2,24 @@
 
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
-stopped; bands of the filter from 30 other simulated cars and the development cars of ``make unseen_car``, which needs VEHEST_DATA.
-``--trust`` makes them anew for the models as they are, ``--digest`` only writes into trust.yaml which model it belongs to.
+stopped; bands of the filter from the development cars of ``make unseen_car``, which needs VEHEST_DATA.
+``--trust`` makes them anew for the models as they are, ``--filter`` the filter alone, ``--digest`` only writes into trust.yaml which
+model it belongs to.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from make_unseen_car import CARS, drives_of
+from make_unseen_car import CARS, RATE, Car, drives_of, filter_of
 
 from vehest.configuration.composition import compose_config
-from vehest.data.resampling import resampled
-from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import (
     load_model,
@@ -35,13 +35,17 @@ from vehest.run.console import Messages
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.train import model_artefact
-from vehest.trust.calibration import Stretch, learn_trust
-from vehest.trust.record import read_trust, write_trust
+from vehest.trust.bands import LEVELS, Bands, Piece, calibrated, pooled_quantile
+from vehest.trust.calibration import Stretch, pieces_of
+from vehest.trust.record import About, Trust, read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "results" / "sim_to_real" / "tables" / "overview.csv"
 TARGET = ROOT / "src" / "vehest" / "pretrained"
 FILTER = ROOT / "src" / "vehest" / "pretrained_filter"
+LEAST_SCALE = (
+    1e-4  # m/s and rad: floor of the filter's scale, whose deviation has a floor of its own
+)
 FILTER_NOTE = (
     "self-calibrating filter: finds your car's rear axle on the drive, without training on it or on any reference. Inside is a network "
     "that learnt on simulated cars and not on this one. Errors: results/unseen_car; on cars of 1:8 and 1:10 it is many times "
@@ -140,53 +144,83 @@ def write_its_trust(step: str, output: Path) -> None:
 
 
 def write_filter(output: Path) -> None:
-    """The self-calibrating filter, with bands scaled on 30 simulated cars and calibrated on the drives of its development cars."""
-    counts = [f"dataset.drives.{at}.count=5" for at in range(6)]
-    made = Runner(output, Messages(), StopSignals()).ingest(
-        compose_config("ingest", ["dataset=sim_fleet_real", *counts, f"output={output}"])
-    )
+    """The self-calibrating filter, with bands from the drives of its development cars, each with its wheelbase and centre of gravity."""
     estimator = estimator_class("self_calibrating").from_config({})
-    drives = [
-        resampled(read_recording(made.folder / name), estimator.rate_hz, estimator.preparation)
-        for name in sorted(made.outputs)
-    ]
-    fleet = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
     FILTER.mkdir(exist_ok=True)
     save_model(
         estimator,
         FILTER,
         {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE},
     )
+    drives = {car: development_drives(car, output) for car in CARS if car.development}
+    pieces = [
+        piece
+        for car, stretches in drives.items()
+        for piece in pieces_of(filter_of(car, RATE), stretches)
+    ]
+    names = tuple(stretch.name for stretches in drives.values() for stretch in stretches)
+    bands = calibrated(
+        pieces,
+        pieces,
+        tuple(estimator.channels),
+        vehicles=(),  # of many cars, so that they hold for the next one
+        datasets=tuple(dict.fromkeys(car.dataset for car in drives)),
+        scaled_on=names,
+        calibrated_on=names,
+        horizon_steps=estimator.horizon_steps,
+    )
+    bands = scaled_by_variance(bands, pieces)
     health = read_trust(TARGET).health  # of the same channels, from more cars
-    trust = learn_trust(estimator, fleet, development_drives(output))
-    if trust.bands is None:
-        raise SystemExit(f"no bands: {trust.about.note}")
-    bands = replace(trust.bands, vehicles=())  # of many cars, so that they hold for the next one
-    trust = replace(trust, bands=bands, guard=None, health=health)
+    trust = Trust(About(estimator.name), bands=bands, guard=None, health=health)
     write_trust(trust, FILTER, model_digest(FILTER))
 
 
-def development_drives(output: Path) -> list[Stretch]:
-    """Drives of the cars that the filter's choices were made on, with ax from the speed where it was not measured."""
+def scaled_by_variance(bands: Bands, pieces: Sequence[Piece]) -> Bands:
+    """Bands whose scale is the filter's deviation itself; a constant beside it, fitted to these drives, made their interval score worse."""
+    own = {
+        name: replace(
+            getattr(bands, name), weights={"variance": 1.0}, floor=LEAST_SCALE, factors=(1.0,) * 4
+        )
+        for name in ("vy", "sideslip")
+    }
+    bands = replace(bands, **own)
+    scores = [
+        np.abs(piece.errors[piece.known])
+        / bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known]
+        for piece in pieces
+    ]
+    blocks = np.repeat(np.arange(len(pieces)), [len(part) for part in scores])
+    for at, name in enumerate(own):
+        ratios = np.concatenate([part[:, at] for part in scores])
+        quantiles = [pooled_quantile(ratios, blocks, level) for level in LEVELS]
+        factors, beyond = zip(*quantiles, strict=True)
+        own[name] = replace(own[name], factors=factors, beyond=beyond)
+    return replace(bands, **own)
+
+
+def development_drives(car: Car, output: Path) -> list[Stretch]:
+    """Drives of a car that the filter's choices were made on, with ax from the speed where it was not measured."""
     runner = Runner(output, Messages(), StopSignals())
     found = []
-    for car in (car for car in CARS if car.development):
-        for drive in drives_of(car, runner, os.environ["VEHEST_DATA"]):
-            ax = drive["ax"] if "ax" in drive else np.gradient(drive["vx"], 1.0 / drive.rate_hz)
-            whole = replace(drive, channels={**drive.channels, "ax": ax})
-            found.append(Stretch(whole, whole.start_time, car.dataset, whole.id))
+    for drive in drives_of(car, runner, os.environ["VEHEST_DATA"]):
+        ax = drive["ax"] if "ax" in drive else np.gradient(drive["vx"], 1.0 / drive.rate_hz)
+        whole = replace(drive, channels={**drive.channels, "ax": ax})
+        found.append(Stretch(whole, whole.start_time, car.dataset, whole.id))
     return found
 
 
 def main() -> None:
     """Command line."""
-    if sys.argv[1:] not in ([], ["--trust"], ["--digest"]):
+    if sys.argv[1:] not in ([], ["--trust"], ["--filter"], ["--digest"]):
         sys.exit(__doc__)
     if "--digest" in sys.argv:
         for folder in (TARGET, FILTER):
             write_trust(read_trust(folder), folder, model_digest(folder))
         return
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
+    if "--filter" in sys.argv:
+        write_filter(output)
+        return
     row = chosen_step()
     if "--trust" not in sys.argv:
         write(row, find_model(str(row["model"]), output, print))

@@ -70,6 +70,25 @@ def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
 
+def test_prior_map_is_the_static_map_with_the_numbers_that_the_self_calibrating_filter_starts_from():
+    """At the filter's centre of gravity, for a car of full size and for a small one whose tyres slip more."""
+    drive = steady_drive(CAR)
+    for wheelbase, compliance in ((2.7, 0.0045), (0.3, 0.0135)):
+        (estimate,) = new("prior_map", wheelbase=wheelbase).estimate([drive.without_references()])
+        fixed = new("static_map", b=0.48 * wheelbase, k=compliance)
+        (expected,) = fixed.estimate([drive.without_references()])
+        np.testing.assert_allclose(estimate["vy"], expected["vy"], rtol=0.0, atol=1e-12)
+        model = new("self_calibrating", wheelbase=wheelbase)
+        assert model.prior[0][6] == pytest.approx(compliance)  # the mean of C
+        assert model.rear == pytest.approx(0.48 * wheelbase)
+    given = new("prior_map", wheelbase=2.7, cg_to_rear_axle=1.1)
+    (estimate,) = given.estimate([drive.without_references()])
+    r = drive["yaw_rate"]
+    np.testing.assert_allclose(estimate["vy"], r * (1.1 - 0.0045 * drive["vx"] ** 2), atol=1e-12)
+    with pytest.raises(ConfigurationError, match="between 0 and the wheelbase"):
+        new("prior_map", wheelbase=2.4, cg_to_rear_axle=3.0)
+
+
 def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_constant_it_finds():
     drive = planar_drive(20.0)
     estimator = new("kinematic")

@@ -9,7 +9,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
-from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
 from vehest.export.program import method_files
 from vehest.inference.models import pretrained_folder
 
@@ -59,15 +59,11 @@ def drive(
     return np.ascontiguousarray(samples), v[::fine]
 
 
-def plain_filter(model, samples, network=None):
-    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone.
-
-    With v of the network at each sample, (T,), that is the filter whose axle slips as the network has it.
-    """
+def plain_filter(model, samples):
+    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone."""
     n = model.numbers()
     (mean, deviation) = model.prior
     grip = model.grips[0]
-    of_network = 0.0
     x = mean.copy()
     p = np.diag(deviation**2)
     x[1] = samples[0, 1]
@@ -91,8 +87,6 @@ def plain_filter(model, samples, network=None):
     found = np.empty((len(samples), 8))
 
     def curve(force):
-        if network is not None:
-            return of_network, 0.0
         limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
         share = min(abs(force) / limit, n.largest_share)
         return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (
@@ -107,10 +101,6 @@ def plain_filter(model, samples, network=None):
         turn = (last[0] * last[1] + sample[0] * sample[1]) / 2.0
         speed = sample[1]
         sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
-        if network is not None:
-            of_network += g * (
-                (mean[5] * sample[0] - network[t]) / n.compliance / sample[1] - of_network
-            )
         phi, slope = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)
         bent = (
             n.axle_per_slip * abs(phi)
@@ -139,11 +129,10 @@ def plain_filter(model, samples, network=None):
 
         def axle(x, smooth=smooth, sums=sums, turning=turning, size=size, speed=speed):
             phi = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)[0]
-            rear = x[5] if network is None else mean[5]
             return (
                 x[0]
                 - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1])
-                - rear * smooth[0]
+                - x[5] * smooth[0]
                 + x[6] * speed * phi
                 + size * x[7]
             )
@@ -166,31 +155,17 @@ def plain_filter(model, samples, network=None):
 
 
 def model_of(**settings):
-    return SelfCalibrating.from_config({"wheelbase": 2.7, "cg_to_rear_axle": 1.3} | settings)
+    places = {"cg_to_rear_axle": 1.3, "imu_to_rear_axle": 1.3}
+    return SelfCalibrating.from_config({"wheelbase": 2.7} | places | settings)
 
 
 def test_filter_of_one_grip_limit_matches_plain_matrices():
     samples, _ = drive(20.0)
-    model = model_of(grips=[12.0], network_start=1e-300)
+    model = model_of(grips=[12.0])
     _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
     expected = plain_filter(model, samples)
     largest = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(states[:, :8] / largest, expected / largest, rtol=0.0, atol=1e-6)
-
-
-def test_filter_with_the_networks_axle_matches_plain_matrices():
-    samples, _ = drive(20.0)
-    model = model_of(grips=[300.0], network_start=1e12)  # so that the other filter has no weight
-    state = model.first_state(samples[0], {})
-    network = np.empty(len(samples))
-    states = np.empty((len(samples), 8))
-    for k in range(len(samples)):
-        network[k] = state.lags[kernel.PREDICTED]
-        _, _, state = model.trace(samples[k : k + 1], state)
-        states[k] = state.means[-1]
-    expected = plain_filter(model, samples, network)
-    largest = np.abs(expected).max(axis=0)
-    np.testing.assert_allclose(states / largest, expected / largest, rtol=0.0, atol=1e-6)
 
 
 def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing():
@@ -200,7 +175,11 @@ def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing(
     )
     expected = load_model(pretrained_folder()).estimate([recording])[0]["vy"]
     model = model_of(
-        network_odds=1e12, lateral_power=0.0, longitudinal_power=0.0, minimum_speed=1.0
+        cg_to_rear_axle=TYPICAL_REAR * 2.7,  # where the network's estimates are taken to hold
+        network_odds=1e12,
+        lateral_power=0.0,
+        longitudinal_power=0.0,
+        minimum_speed=1.0,
     )
     vy = model.estimate([recording])[0]["vy"]
     np.testing.assert_allclose(
@@ -301,6 +280,78 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     assert estimate["vy"][-1] == pytest.approx((1.0 + 0.3) * 0.3, abs=0.01)
 
 
+@pytest.mark.parametrize("place", [-0.5, 0.3, 1.3, 2.4])
+def test_place_of_the_inertial_unit_is_identified_where_it_is_not_given(place):
+    """From half a metre behind the rear axle to near the front axle; v is that of the inertial unit."""
+    samples, vy = drive(90.0, 1, rear=place)
+    model = model_of(cg_to_rear_axle=None, imu_to_rear_axle=None)
+    assert model.point == "imu"
+    found, states, _ = model.trace(samples, model.first_state(samples[0], {}))
+    deviation = np.sqrt(states[-1, kernel.STATES + kernel.REAR])
+    assert deviation < 0.3 * model.prior[1][kernel.REAR]
+    assert abs(states[-1, kernel.REAR] - place) < 2.0 * deviation
+    late = slice(600, None)
+    assert np.std(found[late, 0] - vy[late]) < 0.4 * np.std(vy[late])
+
+
+def test_estimates_at_other_points_differ_by_their_distance_times_the_yaw_rate():
+    samples, _ = drive(30.0)
+    found = {}
+    for point in ("cg", "rear_axle", "imu"):
+        model = model_of(cg_to_rear_axle=1.4, imu_to_rear_axle=-0.3, reference_point=point)
+        found[point], states, _ = model.trace(samples, model.first_state(samples[0], {}))
+    yaw_rate = samples[:, 0]
+    np.testing.assert_allclose(
+        found["cg"][:, 0] - found["rear_axle"][:, 0], 1.4 * yaw_rate, rtol=0.0, atol=1e-9
+    )
+    place = states[:, kernel.REAR]  # as far as it is identified
+    np.testing.assert_allclose(
+        found["imu"][:, 0] - found["rear_axle"][:, 0], place * yaw_rate, rtol=0.0, atol=1e-9
+    )
+    assert model_of(cg_to_rear_axle=1.4).point == "cg"
+
+
+def test_a_rolling_car_is_certain_of_the_rear_axle_and_not_of_a_unit_whose_place_is_not_given():
+    circle = np.tile([0.4, 2.0, 0.8, 0.0], (100, 1))  # v = b ω below 3 m/s, and no parameter learns
+    shares = {"variance_share": 1.0, "residual_share": 0.0, "error_share": 0.0, "angle_floor": 0.0}
+    deviations = {}
+    for point in ("imu", "rear_axle"):
+        model = model_of(
+            imu_to_rear_axle=None, reference_point=point, point_deviation=0.0, **shares
+        )
+        found, _, _ = model.trace(circle, model.first_state(circle[0], {}))
+        deviations[point] = np.sqrt(found[-1, 1])
+    assert deviations["imu"] == pytest.approx(0.4 * model.prior[1][kernel.REAR], rel=0.05)
+    assert deviations["rear_axle"] < 0.2 * deviations["imu"]
+
+
+def test_band_widens_while_motion_and_estimate_contradict_each_other_and_narrows_afterwards():
+    samples, _ = drive(90.0)
+    model = model_of(residual_share=1.0, variance_share=1e-9, error_share=0.0)
+    calm, _, _ = model.trace(samples, model.first_state(samples[0], {}))
+    shaken = samples.copy()
+    shaken[1000:1010, 2] += 8.0
+    found, _, _ = model.trace(shaken, model.first_state(shaken[0], {}))
+    deviations = np.sqrt(found[:, 1])
+    largest = deviations[1000:1040].max()
+    assert largest > 5.0 * np.sqrt(calm[1000:1040, 1]).max()
+    later = slice(1000 + round(8.0 * model.band_time * RATE), None)
+    assert deviations[later].max() < 0.3 * largest
+
+
+def test_place_of_the_unit_is_not_identified_on_a_model_car():
+    for cg, mean in ((None, TYPICAL_REAR * 0.33), (0.115, 0.115)):
+        model = SelfCalibrating.from_config({"wheelbase": 0.33, "cg_to_rear_axle": cg})
+        assert model.imu_prior == pytest.approx((mean, model.imu_deviation * 0.33))
+
+
+def test_refuses_a_place_far_outside_of_the_car_and_a_point_that_is_none():
+    with pytest.raises(ConfigurationError, match=r"imu_to_rear_axle must lie between .* not at 9"):
+        model_of(imu_to_rear_axle=9.0)
+    with pytest.raises(ConfigurationError, match="must be cg, rear_axle, imu or empty, not 'roof'"):
+        model_of(reference_point="roof")
+
+
 def test_refuses_weights_of_another_network():
     model = model_of()
     with pytest.raises(DataError, match="weights of 'self_calibrating' do not fit its settings"):
@@ -372,10 +423,11 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
 def test_at_the_end_of_a_drive_smoother_and_filter_agree():
     """Nothing is later than the last sample; a smoother that takes the drive twice is too sure there."""
     samples, _ = drive(40.0, 0)
-    alone = {"grips": [14.0], "network_start": 1e-300, "network_odds": 1e-12, "steady_odds": 1e-12}
+    alone = {"grips": [14.0], "network_odds": 1e-12, "steady_odds": 1e-12}
     last = []
     for smoothed in (False, True):
-        model = model_of(smoothed=smoothed, variance_share=1.0, residual_share=0.0, **alone)
+        shares = {"variance_share": 1.0, "residual_share": 0.0, "error_share": 0.0}
+        model = model_of(smoothed=smoothed, **shares, **alone)
         estimate, _ = model.run(samples, model.first_state(samples[0], {}))
         last.append((estimate["vy"][-1], estimate["covariance"][-1, 0, 0]))
     assert last[1] == pytest.approx(last[0], rel=1e-9)

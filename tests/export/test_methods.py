@@ -62,6 +62,8 @@ VARIANTS = [
     ("learned_ukf", {"dynamics": "neural", "noise": "constant", "repair": False}),
     ("learned_ukf", {"dynamics": "tyre_network", "gate": 2.0, "scaled": False}),
     ("learned_ukf", {"noise": "state_dependent", "width": 8, "correlated_noise": False}),
+    ("self_calibrating", {"cg_to_rear_axle": 1.4, "imu_to_rear_axle": -0.3}),
+    ("self_calibrating", {"reference_point": "rear_axle", "measured_ax": False}),
 ]
 
 pytestmark = [

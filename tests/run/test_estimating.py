@@ -77,14 +77,15 @@ def test_the_summary_for_people_names_point_band_share_rate_warnings_and_file(sa
     assert err.startswith("warning: vx: constant at 0 m/s")
 
 
-def test_the_point_of_the_self_calibrating_filter_depends_on_the_centre_of_gravity(saved):
+def test_the_summary_names_the_point_of_the_self_calibrating_filter(saved):
     lap({})
     words = ("lap.csv", "estimator.wheelbase=2.4", "-o", "out.csv")
     out, _ = saved.done("estimate", *words)
-    assert (
-        "30 % of the way from the accelerometer to a typical centre of gravity, which is assumed 1.15 m"
-        in out
-    )
+    assert "v and β at the inertial unit, whose place is identified on the drive" in out
+    out, _ = saved.done("estimate", *words, "estimator.imu_to_rear_axle=-0.3")
+    assert "v and β at the inertial unit, 0.3 m behind the rear axle" in out
+    out, _ = saved.done("estimate", *words, "estimator.reference_point=rear_axle")
+    assert "v and β at the rear axle" in out
     out, _ = saved.done("estimate", *words, "estimator.cg_to_rear_axle=1.07")
     assert "v and β at the centre of gravity, 1.07 m ahead of the rear axle" in out
     [note] = [line for line in out.splitlines() if line.startswith("note")]

@@ -30,6 +30,8 @@ class CarValues:
         Distance of the centre of gravity from the rear axle [m].
     steering_ratio : float or None
         Overall steering ratio: handwheel angle over road-wheel angle.
+    imu_to_rear_axle : float or None
+        Distance of the inertial unit from the rear axle, negative behind it [m].
     """
 
     wheelbase: (
@@ -38,6 +40,9 @@ class CarValues:
     mass: PositiveNumber | None = None
     cg_to_rear_axle: PositiveNumber | None = None
     steering_ratio: PositiveNumber | None = None
+    imu_to_rear_axle: (
+        Annotated[float, Field(ge=-20.0, le=40.0), "a number of metres, -20 to 40"] | None
+    ) = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError`: a centre of gravity outside of the wheelbase."""
@@ -51,7 +56,10 @@ class CarValues:
         """The same car with its lengths multiplied; its mass then is that of no car."""
         wheelbase = None if self.wheelbase is None else factor * self.wheelbase
         rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
-        return replace(self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None)
+        imu = None if self.imu_to_rear_axle is None else factor * self.imu_to_rear_axle
+        return replace(
+            self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None, imu_to_rear_axle=imu
+        )
 
     def difference_to(self, other: CarValues) -> str:
         """Why this and another car cannot be the same: ``wheelbase 0.33 m, not 2.7 m``; else empty.

@@ -25,13 +25,16 @@ from vehest.estimators.recursive import Recursive
 TYPICAL_WHEELBASE = 2.7  # m
 TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not given
 SCALED = {
-    **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
+    **dict.fromkeys(
+        ("axle_lag", "residual_time", "slow_time", "band_time", "memory", "decision_time"), 0.5
+    ),
     **dict.fromkeys(
         ("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5
     ),
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "compliance": -0.5},
 }
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
+REFERENCE_POINTS = ("cg", "rear_axle", "imu")
 WINDOW = 30
 NETWORK_HZ = 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
@@ -58,7 +61,7 @@ class SelfCalibrating(Recursive):
             "estimator.wheelbase={wheelbase}",
         ),
     )
-    version = "4"
+    version = "5"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -73,6 +76,15 @@ class SelfCalibrating(Recursive):
         UNSET,
         "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases",
         unit="m",
+    )
+    imu_to_rear_axle: float = setting(
+        UNSET,
+        "distance of the inertial unit from the rear axle, negative behind it; null: identified",
+        unit="m",
+    )
+    reference_point: str = setting(
+        "",
+        "point of v: cg, rear_axle or imu; empty: cg where cg_to_rear_axle is given, else imu",
     )
     smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline")
     measured_ax: bool = setting(
@@ -97,23 +109,20 @@ class SelfCalibrating(Recursive):
         0.0045, "prior of C of a car of 2.7 m", unit="rad s²/m", positive=True
     )
     compliance_deviation: float = setting(0.5, "its deviation over C", positive=True)
-    leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
-    leakage_deviation: float = setting(0.03, "its deviation", positive=True)
-    rear_deviation: float = setting(
-        0.1,
-        "deviation of b over the wheelbase where the centre of gravity is not given",
-        positive=True,
-    )
+    leakage: float = setting(0.03, "prior of κ", least=-0.5, most=0.5)
+    leakage_deviation: float = setting(0.05, "its deviation", positive=True)
     imu_deviation: float = setting(
-        0.05,
-        "deviation of the inertial unit's place over the wheelbase, else of v's point",
-        positive=True,
+        0.02, "deviation of a given imu_to_rear_axle over the wheelbase", positive=True
     )
-    rear_share: float = setting(
-        0.3,
-        "of b found over typical by which vy is moved to the typical point, where it is not given",
-        least=0.0,
-        most=1.0,
+    place: float = setting(
+        0.35,
+        "prior of b over the wheelbase where imu_to_rear_axle is not given",
+        least=-1.0,
+        most=2.0,
+    )
+    place_deviation: float = setting(0.5, "its deviation", positive=True)
+    point_deviation: float = setting(
+        0.055, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
@@ -135,7 +144,7 @@ class SelfCalibrating(Recursive):
     axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
     axle_per_slip: float = setting(0.03, "size over speed, prior of C and |φ|", least=0.0)
     axle_per_bend: float = setting(
-        2.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0
+        4.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0
     )
     axle_per_slope: float = setting(
         0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0
@@ -153,13 +162,19 @@ class SelfCalibrating(Recursive):
         3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True
     )
     variance_share: float = setting(
-        0.5, "share of the filters' and candidates' variance that is reported", positive=True
+        0.35, "share of the filters' and candidates' variance that is reported", positive=True
     )
     residual_share: float = setting(
-        0.1, "share of the mean square that is left of v' that is reported, too", least=0.0
+        0.002, "share of the mean square that is left of v' that is reported, too", least=0.0
+    )
+    error_share: float = setting(
+        0.06, "share of the square of the axle's error s e that is reported, too", least=0.0
+    )
+    band_time: float = setting(
+        2.0, "time over which that mean square is taken", unit="s", positive=True
     )
     angle_floor: float = setting(
-        0.0025, "least deviation of the sideslip angle", unit="rad", least=0.0
+        0.0017, "least deviation of the sideslip angle", unit="rad", least=0.0
     )
     residual_time: float = setting(
         1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True
@@ -185,11 +200,11 @@ class SelfCalibrating(Recursive):
     steady_power: float = setting(
         3.0, "power of the typical wheelbase over the car's by which it grows", least=0.0
     )
-    network_start: float = setting(
-        0.7, "weight at the start of the filter with the network's axle", positive=True
-    )
     network_wheelbase: float = setting(
-        1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0
+        1.5,
+        "shortest wheelbase of cars for which the network counts and the place of the unit is identified",
+        unit="m",
+        least=0.0,
     )
 
     def __init__(self, settings: Any) -> None:
@@ -202,6 +217,16 @@ class SelfCalibrating(Recursive):
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
                 f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+            )
+        imu = self.imu_to_rear_axle
+        if imu is not None and not -self.wheelbase <= imu <= 2.0 * self.wheelbase:
+            raise ConfigurationError(
+                "estimator.imu_to_rear_axle must lie between one wheelbase behind the rear axle and two ahead of it "
+                f"({-self.wheelbase} to {2.0 * self.wheelbase} m), not at {imu}"
+            )
+        if self.reference_point not in ("", *REFERENCE_POINTS):
+            raise ConfigurationError(
+                f"estimator.reference_point must be {', '.join(REFERENCE_POINTS)} or empty, not '{self.reference_point}'"
             )
         if not self.grips or not all(limit > 0.0 for limit in self.grips):
             raise ConfigurationError(
@@ -219,8 +244,13 @@ class SelfCalibrating(Recursive):
         return f"{self.title}, smoothed" if self.smoothed else self.title
 
     @property
+    def point(self) -> str:
+        """The point of the car that v belongs to: cg, rear_axle or imu."""
+        return self.reference_point or ("imu" if self.cg_to_rear_axle is None else "cg")
+
+    @property
     def rear(self) -> float:
-        """Distance of the rear axle behind the reference point [m], as given or typical."""
+        """Distance of the centre of gravity from the rear axle [m], as given or typical."""
         return (
             TYPICAL_REAR * self.wheelbase
             if self.cg_to_rear_axle is None
@@ -228,21 +258,30 @@ class SelfCalibrating(Recursive):
         )
 
     @property
+    def imu_prior(self) -> tuple[float, float]:
+        """Mean and standard deviation of the inertial unit's distance from the rear axle at the start [m]."""
+        if self.imu_to_rear_axle is not None:
+            return float(self.imu_to_rear_axle), self.imu_deviation * self.wheelbase
+        if self.wheelbase < self.network_wheelbase:  # their sensors do not resolve the place
+            return self.rear, self.imu_deviation * self.wheelbase
+        mean = self.place * self.wheelbase if self.cg_to_rear_axle is None else self.rear
+        return mean, self.place_deviation * self.wheelbase
+
+    @property
     def bank_arrays(self) -> tuple[FloatArray, FloatArray]:
-        """Grip limits of the filters [m/s²], 0 for that with the network's axle, and logarithms of their weights at the start, (J,)."""
+        """Grip limits of the filters [m/s²] and logarithms of their weights at the start, (J,)."""
         grips = np.array(self.grips, dtype=np.float64)
-        start = -0.5 * np.square(np.log(grips / self.grip) / self.grip_deviation)
-        return np.append(grips, 0.0), np.append(start, math.log(self.numbers().network_start))
+        return grips, -0.5 * np.square(np.log(grips / self.grip) / self.grip_deviation)
 
     @property
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the states at the start, (8,) each."""
-        rear_deviation = self.rear_deviation if self.cg_to_rear_axle is None else self.imu_deviation
+        place, place_deviation = self.imu_prior
         compliance = self.numbers().compliance
-        mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, self.rear, compliance, 0.0])
+        mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, place, compliance, 0.0])
         own = (
             self.leakage_deviation,
-            rear_deviation * self.wheelbase,
+            place_deviation,
             self.compliance_deviation * compliance,
             1.0,
         )
@@ -282,18 +321,14 @@ class SelfCalibrating(Recursive):
         }
         own |= {
             "dt": 1.0 / self.rate_hz,
-            "rear": self.rear,
-            "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share,
+            "network_rear": TYPICAL_REAR * self.wheelbase,
+            "is_moved": float(self.point != "imu"),
+            "point": self.rear if self.point == "cg" else 0.0,
         }
-        own["point"] = (
-            0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase
-        )  # m: of the point of v
+        own["point_deviation"] *= self.wheelbase  # m
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         if self.rate_hz != NETWORK_HZ or self.wheelbase < self.network_wheelbase:
-            own |= {
-                "network_odds": UNLIKELY,
-                "network_start": UNLIKELY,
-            }  # its weights hold for its own steps alone
+            own["network_odds"] = UNLIKELY  # its weights hold for its own steps alone
         powers = SCALED | {"steady_odds": -self.steady_power}
         own |= {
             name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power
@@ -315,11 +350,13 @@ class SelfCalibrating(Recursive):
             sample[1],
             sample[1],
         )
-        lags[kernel.PREDICTED] = first[0] * (self.rear - mean[kernel.COMPLIANCE] * first[1] ** 2)
+        lags[kernel.PREDICTED] = first[0] * (
+            TYPICAL_REAR * self.wheelbase - mean[kernel.COMPLIANCE] * first[1] ** 2
+        )
         weights = self.bank_arrays[1]
         means = np.tile(mean, (len(weights), 1))
         covariances = np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
-        candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
+        candidates = np.zeros((kernel.CANDIDATES, kernel.MOMENTS)), np.ones(kernel.CANDIDATES)
         return kernel.State(
             means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1))
         )
@@ -363,6 +400,7 @@ class SelfCalibrating(Recursive):
         (mean, deviation) = self.prior
         (grips, start) = self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
+        gains["g_recent"] = n.band_time
         return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
             "numbers": n._asdict()
             | {name: -math.expm1(-n.dt / time) for name, time in gains.items()},
@@ -447,8 +485,11 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     x = means[-1].copy()
     p = covariances[-1].copy()
     found = np.empty((len(rows), 3))
+    row = np.zeros(kernel.STATES)
+    row[kernel.V] = 1.0
     for k in range(len(rows) - 1, -1, -1):
-        found[k] = x[kernel.V], x[kernel.REAR], p[kernel.V, kernel.V]
+        row[kernel.REAR] = -n.is_moved * rows[k, 0]
+        found[k] = x[kernel.V], x[kernel.REAR], row @ p @ row
         if k == 0:
             break
         step = np.eye(kernel.STATES)
@@ -463,8 +504,10 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
         x = means[k - 1] + gain @ (x - predicted)
         p = covariances[k - 1] + gain @ (p - spread) @ gain.T
-    own = found[:, 0] + n.rear_known * (n.rear - found[:, 1]) * rows[:, 0]
-    steady = rows[:, 0] * (n.rear - n.compliance * np.square(rows[:, 1]))
+    shift = n.is_moved * (n.point - found[:, 1]) * rows[:, 0]
+    own = found[:, 0] + shift
+    network += (found[:, 1] - n.network_rear) * rows[:, 0] + shift
+    steady = rows[:, 0] * (found[:, 1] - n.compliance * np.square(rows[:, 1])) + shift
     moving = np.clip(rows[:, 1] / n.minimum_speed - 1.0, 0.0, 1.0)
     shares = last.weights * np.column_stack([moving, moving, np.ones(len(rows))])
     shares[:, kernel.BANK] = 1.0 - shares[:, kernel.NETWORK] - shares[:, kernel.STEADY]
@@ -472,7 +515,12 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     vy = (shares * values).sum(axis=1)
     variance = found[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
     return np.column_stack(
-        [vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])]
+        [
+            vy,
+            variance
+            + np.square(n.angle_floor * rows[:, 1])
+            + np.square(n.point_deviation * rows[:, 0]),
+        ]
     )
 
 
@@ -481,7 +529,7 @@ NUMERIC = [
     for own in fields(SelfCalibrating.settings_type)
     if isinstance(own.default, int | float)
 ]
-DERIVED = ["dt", "point", "rear", "rear_known", "yaw_rate_max", "without_ax"]
+DERIVED = ["dt", "point", "is_moved", "network_rear", "yaw_rate_max", "without_ax"]
 Numbers: Any = namedtuple("Numbers", NUMERIC + DERIVED)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
 ESTIMATOR = SelfCalibrating

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
 from vehest.estimators.registry import option_names
-from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
+from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.trust.record import Trust
 
 FORMAT = 1
@@ -24,14 +23,14 @@ WIDENING = 1.5
 """By which the deviations of a record are multiplied before an estimate starts from them."""
 LIMITS = {
     "leakage": (-0.3, 0.3),
-    "rear_axle": (0.0, 20.0),
+    "rear_axle": (-20.0, 20.0),
     "compliance": (2e-4, 0.1),
     "grip": (1.0, 60.0),
 }
 """Beyond which a number is not one of a car."""
 ASSUMED = "the wheelbase is assumed to be"
 """Beginning of the remark that no wheelbase was given."""
-CAR_SETTINGS = {"wheelbase": "m", "cg_to_rear_axle": "m"}
+CAR_SETTINGS = {"wheelbase": "m", "cg_to_rear_axle": "m", "imu_to_rear_axle": "m"}
 """Settings of the self-calibrating filter that are values of the car -> unit."""
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -200,19 +199,15 @@ def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) 
     base = with_settings(model, changed)
     leakage = record.leakage
     rear = record.rear_axle
-    point = base.cg_to_rear_axle
     if leakage.identified_on:
         changed |= {
             "leakage": leakage.value,
             "leakage_deviation": min(widening * leakage.deviation, base.leakage_deviation),
         }
     if rear.identified_on:
-        if point is None:  # where the filter's estimates hold without it
-            point = rear.value + base.rear_share * (TYPICAL_REAR * record.wheelbase - rear.value)
         changed |= {
-            "cg_to_rear_axle": point,
-            "imu_deviation": math.hypot(widening * rear.deviation, rear.value - point)
-            / record.wheelbase,
+            "imu_to_rear_axle": rear.value,
+            "imu_deviation": widening * rear.deviation / record.wheelbase,
         }
     return with_settings(model, changed)
 

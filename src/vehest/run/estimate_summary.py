@@ -23,8 +23,8 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
     """The point of the car to which v and β belong.
 
     A trained model estimates them at the reference point of its training data, which is the centre
-    of gravity unless a data set states that it is unknown. The self-calibrating filter uses the
-    centre of gravity only where it is given.
+    of gravity unless a data set states that it is unknown. The self-calibrating filter has a
+    setting for the point.
 
     Parameters
     ----------
@@ -34,12 +34,7 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
         Of its description, which names the data sets of its training.
     """
     if isinstance(model, SelfCalibrating):
-        if model.cg_to_rear_axle is not None:
-            return f"centre of gravity, {model.cg_to_rear_axle:g} m ahead of the rear axle"
-        return (
-            f"point {100 * model.rear_share:.0f} % of the way from the accelerometer to a typical centre of gravity, which is "
-            f"assumed {model.rear:.2f} m ahead of the rear axle; state yours by estimator.cg_to_rear_axle=…"
-        )
+        return describe_point(model)
     unknown = [
         name
         for name in read_description(model_folder).about.datasets
@@ -51,6 +46,24 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
             "(reference_point in conf/dataset)"
         )
     return "centre of gravity"
+
+
+def describe_point(model: SelfCalibrating) -> str:
+    """The reference point of the self-calibrating filter, with its place in the car."""
+    if model.point == "rear_axle":
+        return "rear axle"
+    if model.point == "cg":
+        assumed = "" if model.cg_to_rear_axle is not None else "assumed "
+        remedy = "; state yours by estimator.cg_to_rear_axle=…" if assumed else ""
+        return f"centre of gravity, {assumed}{model.rear:.4g} m ahead of the rear axle{remedy}"
+    place = model.imu_to_rear_axle
+    if place is None:
+        return (
+            "inertial unit, whose place is identified on the drive; state it by "
+            "estimator.imu_to_rear_axle=…, or the centre of gravity by estimator.cg_to_rear_axle=…"
+        )
+    side = "ahead of" if place >= 0.0 else "behind"
+    return f"inertial unit, {abs(place):g} m {side} the rear axle"
 
 
 def has_unknown_reference_point(dataset: str) -> bool:

@@ -23,7 +23,15 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.inference.car_values import FORMAT, LIMITS, CarRecord, Number, adapted, read_car
+from vehest.inference.car_values import (
+    FORMAT,
+    LIMITS,
+    CarRecord,
+    Number,
+    adapted,
+    read_car,
+    with_settings,
+)
 from vehest.inference.estimation import prepared_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.run.estimate import findings_of
@@ -36,6 +44,14 @@ IDENTIFIED_SHARE = (
 ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
 UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
+MEANINGS = {
+    "leakage": "share of ay that is gravity of the rolling body",
+    "rear_axle": "distance of the inertial unit from the rear axle, negative behind it",
+    "compliance": "slip angle of the rear axle over its lateral acceleration",
+    "grip": "lateral acceleration at the rear axle's limit",
+}
+AGREEMENT = 0.95
+"""Probability at which the drives' values of a number, were they of one car, would agree; beyond it the number is not identified."""
 LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives do not tell apart from b and C
 
 
@@ -97,17 +113,29 @@ def in_words(record: CarRecord) -> TerminalTable:
         for drive, own in record.offsets.items()
         for channel, one in own.items()
     }
+    car = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
+    prior = prior_of(with_settings(SelfCalibrating.from_config({}), car))
+    at_start = {name: prior[name].deviation for name in LIMITS}
+    at_start["grip"] *= record.grip.value
     rows = [
         (
             name,
             f"{one.value:.4g}",
             f"{one.deviation:.2g}",
             UNITS.get(name, "m/s²"),
+            _excitation(one.deviation, at_start[name]) if name in at_start else "",
             ", ".join(one.identified_on) or "not identified",
+            MEANINGS.get(name, "mean error of the accelerometer"),
         )
         for name, one in numbers.items()
     ]
-    return TerminalTable("", ("quantity", "value", "deviation", "unit", "identified on"), rows)
+    heads = ("quantity", "value", "deviation", "unit", "seen", "identified on", "meaning")
+    return TerminalTable("", heads, rows)
+
+
+def _excitation(deviation: float, at_start: float) -> str:
+    """How much the drives have excited a number: the share of the prior's variance that they removed."""
+    return f"{100.0 * max(0.0, 1.0 - (deviation / at_start) ** 2):.0f} %"
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
@@ -142,9 +170,7 @@ def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float
         for name, at in OFFSETS.items()
     }
     numbers["grip"] = _grip(model, last.log_weights)
-    if (
-        last.weights[kernel.BANK] < last.weights[kernel.STEADY]
-    ):  # the filter fell back on the priors: its bank tells nothing
+    if int(np.argmax(last.weights)) == kernel.STEADY:  # the filter fell back on the priors
         numbers |= {name: (numbers[name][0], math.inf) for name in LIMITS}
     return numbers
 
@@ -188,25 +214,28 @@ def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]
 def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     """The prior and what each drive adds to it, weighted by information; deviations hold the yaw rate's lateness, which drives share.
 
-    The deviation grows where drives contradict each other.
+    The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT` none of them identifies the number.
     """
     mean, deviation, of_lateness = (
         np.array([own for own in drives.values() if own.deviation < prior.deviation])
         .reshape(-1, 3)
         .T
     )
+    from scipy.stats import chi2  # slow to import
+
     alone, of_alone = without_prior(prior, Normal(mean, deviation))
     total = prior.deviation**-2.0 + float(np.sum(of_alone**-2.0))
     shares = deviation**-2.0 / total
     value = prior.mean + float(shares @ (mean - prior.mean))
-    scatter = (
-        float(np.sum(np.square((alone - value) / of_alone))) / (len(alone) - 1)
-        if len(alone) > 1
-        else 1.0
-    )
+    squares = float(np.sum(np.square((alone - value) / of_alone)))
+    others = max(len(alone) - 1, 1)
+    scatter = squares / others if len(alone) > 1 else 1.0
+    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT, others))
     least = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
     identified = tuple(
-        drive for drive, own in drives.items() if math.hypot(own.deviation, own.of_lateness) < least
+        drive
+        for drive, own in drives.items()
+        if agree and math.hypot(own.deviation, own.of_lateness) < least
     )
     return Number(
         value,

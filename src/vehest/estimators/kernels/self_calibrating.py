@@ -23,11 +23,13 @@ V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, then those of the candidates' residuals
-LAGS = 16
+LAGS = 15
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
-SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
-# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
-SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED = range(10, LAGS)
+# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v, and the mean
+# square of the residual of v' over the last moments
+MOMENTS = 9
+SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST, RECENT = range(MOMENTS)
 # rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
 AT = np.array(
     [
@@ -36,16 +38,12 @@ AT = np.array(
     ]
 )
 AT = (STATES + AT) * (BYTES // 8)
-GRIP, WEIGHT, KNOWN = range(
-    STATES + 36, STATES + 39
-)  # grip limit, weight among all filters and among those without the network's
-COST = STATES + 39
-TOTAL = (
-    STATES + 41
-)  # of both measurements: what lowers the log likelihood, variance of the residual
-ROW = STATES + 43
-SHARED = STATES + 51
-ROWS = STATES + 59  # derivatives of a measurement, its covariances with the states
+GRIP, WEIGHT = range(STATES + 36, STATES + 38)  # grip limit, weight among all filters
+COST = STATES + 38  # of both measurements: what lowers the log likelihood
+TOTAL = STATES + 40  # of both measurements: variance of the residual
+ROW = STATES + 42
+SHARED = STATES + 50
+ROWS = STATES + 58  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
@@ -56,8 +54,8 @@ class State(NamedTuple):
     means: FloatArray  # (J, 8)
     covariances: FloatArray  # (J, 8, 8)
     log_weights: FloatArray  # (J,)
-    lags: FloatArray  # (16,)
-    candidates: FloatArray  # (3, 8)
+    lags: FloatArray  # (15,)
+    candidates: FloatArray  # (3, 9)
     weights: FloatArray  # (3,), of the candidates
     last: FloatArray  # (4,), the sample before
     window: FloatArray  # (N, 4), the last samples, the oldest first; the first sample stands for those before it
@@ -65,7 +63,7 @@ class State(NamedTuple):
 
 @part()
 def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
-    """φ and dφ/da of the rear axle, and its acceleration beyond the limit; a filter without a grip limit (0) takes φ of the network.
+    """φ and dφ/da of the rear axle, and its acceleration beyond the limit.
 
     φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a, a_m what the longitudinal acceleration leaves of the grip limit.
     """
@@ -74,19 +72,14 @@ def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
     force = (lags[AY] - load(f, OFFSET_Y * lanes)) * (1.0 - load(f, LEAKAGE * lanes)) - load(
         f, REAR * lanes
     ) * turning
-    limit = choose(
-        grip > 0.0, root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip)), 1.0
-    )
+    limit = root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip))
     rest = 1.0 - least(abs(force) / limit, n.largest_share)
     store(f, SHARED * lanes, rest)
     for k in range(SHARED * lanes, (SHARED + 1) * lanes):
-        if f[k + (GRIP - SHARED) * lanes] > 0.0:
-            f[k] **= n.exponent
+        f[k] **= n.exponent
     left = load(f, SHARED * lanes)
     slip = limit * (1.0 - left) / n.exponent
-    excess = most(abs(force) - limit, 0.0)
-    slip = choose(grip > 0.0, choose(force < 0.0, -slip, slip), lags[SLIP])
-    return slip, choose(grip > 0.0, left / rest, 0.0), choose(grip > 0.0, excess, 0.0)
+    return choose(force < 0.0, -slip, slip), left / rest, most(abs(force) - limit, 0.0)
 
 
 @part()
@@ -154,11 +147,7 @@ def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-
     store(f, (ROW + V) * lanes, 1.0)
     store(f, (ROW + OFFSET_Y) * lanes, lags[SUM_ONE] - gain * own)
     store(f, (ROW + LEAKAGE) * lanes, lags[SUM_AY] - gain * (lags[AY] - offset))
-    store(
-        f,
-        (ROW + REAR) * lanes,
-        choose(load(f, GRIP * lanes) > 0.0, -lags[YAW_RATE] - gain * turning, 0.0),
-    )
+    store(f, (ROW + REAR) * lanes, -lags[YAW_RATE] - gain * turning)
     store(f, (ROW + COMPLIANCE) * lanes, speed * slip)
     store(f, (ROW + ERROR) * lanes, size)
     variance = 0.0 * slip + n.axle_white**2 + n.axle_white_share * size**2
@@ -260,8 +249,8 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
 
 
 @part()
-def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
-    """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u, its mean square in ``left``, and of u' = ax + ω v."""
+def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, g_recent, moving):  # type: ignore[no-untyped-def]
+    """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u and of u' = ax + ω v."""
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
     if moving:
@@ -289,12 +278,11 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
         leakage = min(
             max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage
         )
-        left[c] = (
-            max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
-        )
-        score = n.lateral_power * math.log(left[c] + floor) + n.longitudinal_power * math.log(
-            one[SQUARE_X] / time + floor
-        )
+        one[RECENT] += g_recent * ((y - leakage * ay) ** 2 - one[RECENT])
+        square_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0)
+        score = n.lateral_power * math.log(
+            square_y / time + floor
+        ) + n.longitudinal_power * math.log(one[SQUARE_X] / time + floor)
         weights[c] = odds[c] - 0.5 * score * lags[TIME] / (lags[TIME] + n.decision_time)
     _normalise(weights, weights, CANDIDATES)
 
@@ -305,7 +293,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
 
     Args:
         n: numbers of the estimator, a named tuple.
-        grips: grip limits of the bank, (J,) [m/s²]; 0 for the filter whose axle slips as the network has it.
+        grips: grip limits of the bank, (J,) [m/s²].
         start: logarithms of the bank's weights at the start, (J,).
         prior, spread: mean and standard deviation of the states at the start, (8,).
         decay: factors by which they return to it in a sample, (8,).
@@ -318,6 +306,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
     g = -math.expm1(-n.dt / n.axle_lag)
     g_1 = -math.expm1(-n.dt / n.residual_time)
     g_slow = -math.expm1(-n.dt / n.slow_time)
+    g_recent = -math.expm1(-n.dt / n.band_time)
     lags = state.lags
     log_weights = state.log_weights
     lanes = width(grips)
@@ -326,8 +315,8 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
     bank = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes))
     own = np.zeros((3, 4))
     values = own[0]
-    left = own[1]
-    sample = own[2]
+    sample = own[1]
+    moments = own[2]
     last = state.last
     for k in range(
         len(bank) * lanes
@@ -356,10 +345,6 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for i in range(4):
             sample[i] = series[i, steps + t]
         turning = _advance_lags(lags, sample, last, n, g, g_1, g_slow)
-        slip = (n.rear * sample[0] - series[4, t]) / (
-            n.compliance * max(sample[1], n.minimum_speed)
-        )
-        lags[SLIP] += g * (slip - lags[SLIP])
         speed = sample[1]
         moving = sample[1] > n.minimum_speed
         yaw_rate = (last[0] + sample[0]) / 2.0
@@ -409,25 +394,28 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
                     start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
                 )
             _weigh(bank, log_weights)
-        known = parameters[min(t, len(parameters) - 1)]
-        rear = _mixture(bank, known)
-        values[BANK] = known[V] + n.rear_known * (n.rear - rear) * sample[0]
-        values[NETWORK] = series[4, t]
-        values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
+        states = parameters[min(t, len(parameters) - 1)]
+        _mixture(bank, states)
+        rear = states[REAR]
+        values[BANK] = states[V]
+        values[NETWORK] = series[4, t] + (rear - n.network_rear) * sample[0]
+        values[STEADY] = sample[0] * (rear - n.compliance * speed * speed)
         _judge(
             values,
             state.candidates,
             state.weights,
-            left,
             lags,
             sample,
             yaw_rate,
             n,
             g_1,
             g_slow,
+            g_recent,
             moving,
         )
-        _combine(values, state.weights, left, known, sample, n, found[t])
+        _at_point(bank, n.is_moved, n.point, sample[0], moments)
+        moments[2] = (size * states[ERROR]) ** 2
+        _combine(values, state.weights, state.candidates, states, moments, sample, n, found[t])
         for i in range(4):
             last[i] = sample[i]
     lags[PREDICTED] = series[4, len(samples)]
@@ -443,50 +431,55 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
 
 @part()
 def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
-    """Weights of the filters from their logarithms, with and without the last, the network's; of sum 1."""
+    """Weights of the filters from their logarithms, of sum 1; whole arrays would double the time to compile."""
     lanes = width(bank)
-    others = len(log_weights) - 1
     largest = log_weights[0]
     sum_ = 0.0
-    for j in range(others):
-        largest = max(largest, log_weights[j])
-    for j in range(others):
-        weight = math.exp(log_weights[j] - largest)
-        bank[j // lanes, KNOWN * lanes + j % lanes] = weight
+    for log_weight in log_weights:
+        largest = max(largest, log_weight)
+    for j, log_weight in enumerate(log_weights):
+        weight = math.exp(log_weight - largest)
+        bank[j // lanes, WEIGHT * lanes + j % lanes] = weight
         sum_ += weight
-    lead = log_weights[others] - largest
-    share = math.exp(min(-lead, 0.0))
-    own = math.exp(min(lead, 0.0))
-    whole = sum_ * share + own
     for b in range(len(bank)):
-        known = load(bank[b], KNOWN * lanes)
-        store(bank[b], WEIGHT * lanes, known * (share / whole))
-        store(bank[b], KNOWN * lanes, known * (1.0 / sum_))
-    bank[others // lanes, WEIGHT * lanes + others % lanes] = own / whole
+        store(bank[b], WEIGHT * lanes, load(bank[b], WEIGHT * lanes) * (1.0 / sum_))
 
 
 @part()
 def _mixture(bank, found):  # type: ignore[no-untyped-def]
-    """Mean and variance of the states over the bank, differences between filters included; of b and C without the network's filter.
-
-    Returns the mean of b with it.
-    """
+    """Mean and variance of the states over the bank, differences between filters included."""
     lanes = width(bank)
-    rear = 0.0
     for i in range(STATES):
-        own = KNOWN if REAR <= i <= COMPLIANCE else WEIGHT
         mean = 0.0
         variance = 0.0
         for b in range(len(bank)):
-            mean += total(load(bank[b], own * lanes) * load(bank[b], i * lanes))
+            mean += total(load(bank[b], WEIGHT * lanes) * load(bank[b], i * lanes))
         for b in range(len(bank)):
             off = load(bank[b], i * lanes) - mean
-            variance += total(load(bank[b], own * lanes) * (load(bank[b], AT[i, i]) + off * off))
+            variance += total(load(bank[b], WEIGHT * lanes) * (load(bank[b], AT[i, i]) + off * off))
         found[i] = mean
         found[STATES + i] = variance
+
+
+@part()
+def _at_point(bank, is_moved, point, yaw_rate, moments):  # type: ignore[no-untyped-def]
+    """Mean and variance of v + ω (point - b) over the bank, of v itself where the point is the inertial unit."""
+    lanes = width(bank)
+    lever = is_moved * yaw_rate
+    mean = 0.0
+    variance = 0.0
     for b in range(len(bank)):
-        rear += total(load(bank[b], WEIGHT * lanes) * load(bank[b], REAR * lanes))
-    return rear
+        f = bank[b]
+        moved = load(f, V * lanes) + lever * (point - load(f, REAR * lanes))
+        mean += total(load(f, WEIGHT * lanes) * moved)
+    for b in range(len(bank)):
+        f = bank[b]
+        off = load(f, V * lanes) + lever * (point - load(f, REAR * lanes)) - mean
+        own = load(f, AT[V, V]) - 2.0 * lever * load(f, AT[V, REAR])
+        own += lever * lever * load(f, AT[REAR, REAR])
+        variance += total(load(f, WEIGHT * lanes) * (own + off * off))
+    moments[0] = mean
+    moments[1] = variance
 
 
 @part()
@@ -504,16 +497,23 @@ def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _combine(values, weights, left, parameters, sample, n, found):  # type: ignore[no-untyped-def]
+def _combine(values, weights, candidates, states, moments, sample, n, found):  # type: ignore[no-untyped-def]
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
-    own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
-    mean = own[0] * values[0] + own[1] * values[1] + own[2] * values[2]
+    shares = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
+    of_slip = n.compliance_deviation * n.compliance * sample[1] ** 2
+    steady = sample[0] ** 2 * ((1.0 - n.is_moved) * states[STATES + REAR] + of_slip**2)
+    shift = n.is_moved * (n.point - states[REAR]) * sample[0]
+    values[BANK] = moments[0]
+    values[NETWORK] += shift
+    values[STEADY] += shift
+    mean = shares[0] * values[0] + shares[1] * values[1] + shares[2] * values[2]
     spread = 0.0
-    unexplained = 0.0
+    recent = 0.0
     for c in range(CANDIDATES):
-        spread += own[c] * (values[c] - mean) ** 2
-        unexplained += own[c] * left[c]
+        spread += shares[c] * (values[c] - mean) ** 2
+        recent += shares[c] * candidates[c, RECENT]
     found[0] = mean
-    found[1] = n.variance_share * (parameters[STATES + V] + spread) + n.residual_share * unexplained
-    found[1] += (n.angle_floor * sample[1]) ** 2 + (n.point * sample[0]) ** 2
+    found[1] = n.variance_share * ((1.0 - shares[2]) * moments[1] + shares[2] * steady + spread)
+    found[1] += n.residual_share * recent + (n.angle_floor * sample[1]) ** 2
+    found[1] += (n.point_deviation * sample[0]) ** 2 + n.error_share * moments[2]

@@ -1,0 +1,72 @@
+"""Baseline: steady cornering with the priors of the self-calibrating filter; nothing is learnt and nothing is identified."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.declared import UNSET, setting
+from vehest.estimators.base import rate
+from vehest.estimators.recursive import Recursive
+from vehest.estimators.self_calibrating import SCALED, TYPICAL_REAR, TYPICAL_WHEELBASE
+
+
+class PriorMap(Recursive):
+    """v = r (b - C u²) with the prior means of b and C: what an estimate for a car that nobody has trained on has to beat.
+
+    It is the steady cornering of a linear single track (Mitschke & Wallentowitz, Dynamik der Kraftfahrzeuge), with the compliance C
+    of a typical rear axle. `SelfCalibrating` starts from the same numbers; `StaticMap` fits its two to a reference.
+    """
+
+    name = "prior_map"
+    title = "Prior map"
+    channels = ("vx", "yaw_rate")
+    ignores_initial_state = True
+    template = "static"
+    rate_hz: float = rate(20.0)
+    wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
+    cg_to_rear_axle: float = setting(
+        UNSET,
+        "distance b of the point where v holds from the rear axle; null: 0.48 wheelbases",
+        unit="m",
+    )
+    compliance: float = setting(
+        0.0045, "compliance C of a car of 2.7 m", unit="rad s²/m", positive=True
+    )
+
+    def check(self) -> None:
+        """Raises `ConfigurationError`: a point outside of the wheelbase."""
+        if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
+            raise ConfigurationError(
+                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+            )
+
+    @property
+    def b(self) -> float:
+        """Distance of the point where v holds from the rear axle [m]."""
+        return (
+            TYPICAL_REAR * self.wheelbase
+            if self.cg_to_rear_axle is None
+            else float(self.cg_to_rear_axle)
+        )
+
+    @property
+    def k(self) -> float:
+        """Compliance of the car's rear axle [rad s²/m]: tyres of small cars slip more."""
+        return self.compliance * (self.wheelbase / TYPICAL_WHEELBASE) ** SCALED["compliance"]
+
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
+        """r (b - C u²) [m/s]."""
+        vx, yaw_rate = samples.T
+        return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
+
+    def c_values(self) -> dict[str, Any]:
+        """Its two numbers."""
+        about = "Steady cornering of a linear single track with typical numbers."
+        return {"about": about, "b": self.b, "k": self.k}
+
+
+ESTIMATOR = PriorMap
