@@ -185,8 +185,8 @@ def scaled_by_variance(bands: Bands, pieces: Sequence[Piece]) -> Bands:
     }
     bands = replace(bands, **own)
     scores = [
-        np.abs(piece.errors[piece.known])
-        / bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known]
+        np.abs(piece.errors[piece.has_error])
+        / bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.has_error]
         for piece in pieces
     ]
     blocks = np.repeat(np.arange(len(pieces)), [len(part) for part in scores])
