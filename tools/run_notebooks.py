@@ -17,7 +17,7 @@ from typing import Any
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 TEXT = "text/plain"
 PNG = "image/png"
-PICTURE = FOLDER.parent / "docs" / "images" / "lap.png"  # the first one of the first notebook
+PICTURE = FOLDER.parent / "docs" / "images" / "lap.png"  # the last one of the first notebook
 
 
 def notebooks() -> list[Path]:
@@ -95,7 +95,7 @@ def main() -> None:
         for count, (cell, outputs) in enumerate(zip(code_cells(notebook), results, strict=True), 1):
             cell |= {"execution_count": count, "outputs": outputs}
         if path == notebooks()[0]:
-            PICTURE.write_bytes(base64.b64decode(pictures_of(results)[0]))
+            PICTURE.write_bytes(base64.b64decode(pictures_of(results)[-1]))
         text = json.dumps(notebook, indent=1, ensure_ascii=False)
         path.write_text(f"{text}\n", encoding="utf-8")
         print(path.name)
