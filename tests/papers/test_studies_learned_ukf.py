@@ -18,12 +18,21 @@ from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.store import read_estimate, write_estimate
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.estimators.model_files import save_model
-from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
+from vehest.evaluation.metrics import (
+    Protocol,
+    Scored,
+    accuracy,
+    reference_state,
+    score_all,
+    sequences,
+)
 from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts, Trial
 from vehest.training.through_filter import Drive
-from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
+from vehest_papers.kit.block_rows import BlockRow, checked_training
+from vehest_papers.kit.reading import metric_values
+from vehest_papers.learned_ukf import block_errors, claims, documents, friction, paper, tables
 from vehest_papers.learned_ukf.additions import (
     Comparison,
     Subject,
@@ -141,7 +150,13 @@ def part(tmp_path_factory):
             )
             models.append(
                 EvaluatedModel(
-                    name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}
+                    name,
+                    variant,
+                    candidate,
+                    seed,
+                    home,
+                    home,
+                    AS_THE_PAPER if estimator else {"phase": PHASE},
                 )
             )
             for test, span in {
@@ -349,6 +364,38 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
     assert f"P{remark[1:]}." in text
+    blocks = document.data["blocks"]
+    assert blocks.columns.tolist() == list(BlockRow.__dataclass_fields__)
+    assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
+    keys = ["candidate", "seed", "metric"]
+    ours = blocks[(blocks["part"] == "simulated") & (blocks["test_set"] == "tyre_a")]
+    ours = ours.groupby(keys)[["value", "size"]].sum()
+    known = metric_values(part)
+    for candidate, models in models_by_candidate(part).items():
+        for own in models:
+            for metric, power in (("mse_weighted", 1.0), ("rmse_vy", 0.5), ("rmse_sideslip", 0.5)):
+                value, size = ours.loc[(candidate, own.seed, metric)]
+                figure = known[own.estimator, own.variant, own.seed, "tyre_a", metric]
+                assert (value / size) ** power == pytest.approx(figure, rel=1e-9)
+    swaps = document.data["figure_6_simulated"].set_index(
+        ["test_set", "seed", "predicts", "observes"]
+    )["mse"]
+    value, size = ours.loc[("NNTF_U predicting, NNTF observing", 1, "mse_weighted")]
+    assert value / size == pytest.approx(swaps["tyre_a", 1, "NNTF_U", "NNTF"])
+    assert size == ours.loc[("NNTF", 1, "mse_weighted"), "size"]
+    one_step = document.data["figure_5_simulated"].set_index(["test_set", "seed", "task", "state"])
+    value, size = ours.loc[("NNTF", 0, "one_step_rmse_wheel_speed")]
+    assert value / size == pytest.approx(
+        one_step.loc[("tyre_a", 0, "one_step", "rim_speed"), "before"]
+    )
+    measured = blocks[blocks["metric"] == "friction_settles_within_2_s"]
+    assert (measured["size"] == 1).all()
+    assert len(measured) == 6, "two seeds, three sequences"
+    training = document.data["training"].set_index("candidate")
+    assert training.loc["NNTF_UH", "epochs"] == "1000 + 1000"
+    assert training.loc["NNTF_UH", "epochs_paper"] == "1000 + 1000"
+    assert training.loc["NNTF", "epochs"] == "1000 + 1000 for the noise"
+    assert training.loc["static_map", "training"] == "not applicable"
     trials = next(
         block for block in document.blocks if isinstance(block, Table) and block.name == "trials"
     ).frame
@@ -369,7 +416,7 @@ def gru_trials():
             variant="velocity_gru",
             title="GRU",
             seed=9,
-            training={"phase": {"learning_rate": rate}},
+            training={"phase": {"learning_rate": rate}, "batch_size": 6},
             metric="mse_weighted",
             validation=error,
             key="",
@@ -421,9 +468,9 @@ def test_swapping_a_model_for_itself_changes_nothing_and_for_another_both_halves
 def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
     estimator = loaded(model(part, "NNTF"))
     drives = drives_of(part, estimator, "tyre_a")
-    assert lost_sequences(estimator, drives) == (0, 3)
+    assert lost_sequences(estimator, drives).tolist() == [False] * 3
     estimator.filter.initial_covariance = lambda: -torch.eye(5)
-    assert lost_sequences(estimator, drives) == (3, 3)
+    assert lost_sequences(estimator, drives).tolist() == [True] * 3
     repaired = filtered(estimator, drives).repaired
     assert repaired.numel() == 300
     assert int(repaired.sum()) >= 3
@@ -753,3 +800,80 @@ def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand
     )
     np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
     assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
+
+
+def test_losses_of_a_sequence_are_those_of_a_hand_calculation():
+    rate = np.array([0.1, 0.3])
+    others = {"vx": (np.array([1.0, 3.0]), np.array([1.0, 1.0])), "yaw_rate": (rate, rate - 0.1)}
+    scored = Scored(
+        time=np.array([0.0, 0.01]),
+        vy=np.array([0.5, 0.0]),
+        vy_ref=np.zeros(2),
+        sideslip=np.radians([2.0, 179.0]),
+        sideslip_ref=np.radians([0.0, -179.0]),
+        ay=np.zeros(2),
+        is_sideslip_scored=np.array([False, True]),
+        others=others,
+    )
+    found = {name: (value, size) for name, value, size in block_errors.losses_of(scored)}
+    weighted = 0.2225 * 4.0 + 0.5064 * 0.25 + 0.1566 * 0.02
+    assert found["mse_weighted"] == pytest.approx((weighted, 2))
+    assert found["mae_weighted"] == pytest.approx((0.2225 * 2 + 0.5064 * 0.5 + 0.1566 * 0.2, 2))
+    first, second = 0.5064 * 0.5 + 0.1566 * 0.1, 0.2225 * 2.0 + 0.1566 * 0.1
+    assert found["ae99_weighted"] == pytest.approx((2 * (first + 0.99 * (second - first)), 2))
+    assert found["rmse_vy"] == pytest.approx((0.25, 2))
+    assert found["rmse_vx"] == pytest.approx((4.0, 2))
+    assert found["rmse_sideslip"] == pytest.approx((4.0, 1)), "2 degrees, across the half turn"
+
+
+@pytest.mark.parametrize(
+    ("doubled", "state", "words"),
+    [
+        ({0: 0.97, 1: 1.94}, "sufficient", "by -3.0 %, 2 seeds"),
+        ({0: 0.9, 1: 1.8}, "insufficient", "by -10.0 %, 2 seeds"),
+        ({1: 2.2}, "sufficient", "by +10.0 %, 1 seed"),
+        ({}, "not checked", "not trained with twice the epochs"),
+    ],
+)
+def test_a_training_is_long_enough_where_twice_the_epochs_improve_it_by_3_percent_at_most(
+    doubled, state, words
+):
+    row = checked_training("GRU", "1000", "not stated", {0: 1.0, 1: 2.0, 2: 9.0}, doubled)
+    assert (row.training, row.reason.endswith(words)) == (state, True)
+
+
+def test_parts_and_candidates_have_the_names_of_the_claims():
+    assert block_errors.part_name("tyre_a_fold_3") == "tyre_a_folds"
+    assert block_errors.part_name("real") == "real"
+    named = {
+        ("length_500", "NNTF_U"): "NNTF_U, 500 steps",
+        ("length_125", "NNTF_U"): "NNTF_U, 125 steps, constant batch",
+        ("length_125_samples", "NNTF_U"): "NNTF_U, 125 steps, constant samples",
+        ("real", "static map"): "static_map",
+        ("real", "NNTF_U"): "NNTF_U",
+    }
+    assert {key: block_errors.candidate_name(*key) for key in named} == named
+
+
+def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
+    def with_validation(factor):
+        metrics = part.metrics.copy()
+        rows = (metrics["test_set"] == VALIDATION) & (metrics["metric"] == "mse_weighted")
+        metrics.loc[rows, "value"] *= factor
+        return replace(part, metrics=metrics)
+
+    parts = {"real": part, "doubled": only(with_validation(0.8), "NNTF_UH")}
+    rows = {row.candidate: row for row in block_errors.training_rows(parts, "real")}
+    assert rows["NNTF_UH"].training == "insufficient"
+    assert "-20.0 %, 2 seeds" in rows["NNTF_UH"].reason
+    assert rows["NNTF_UH*"].training == "insufficient", "the same networks"
+    assert rows["NNT"].training == "not checked"
+    moved = replace(part, split=replace(part.split, tests={"tyre_a": SPLIT.tests["tyre_d"]}))
+    folds = {
+        f"tyre_a_fold_{fold}": replace(own, models=[model(part, "GRU")])
+        for fold, own in ((1, part), (2, moved))
+    }
+    found = block_errors.error_rows(folds)
+    vy = [row for row in found if row.metric == "rmse_vy" and row.test_set == "tyre_a"]
+    assert {row.part for row in vy} == {"tyre_a_folds"}
+    assert [row.block for row in vy] == [f"{name} {k}.00 s" for name in "ad" for k in range(3)]

@@ -313,17 +313,23 @@ def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
 
 
 def test_jobs_group_by_training_settings_that_come_in_groups():
-    def job(rate):
+    def job(rate, seed=0, **estimator):
         split = Split("any", (), (), {"test": (Span("any", "one", -math.inf, math.inf),)})
         plan = StagePlan("train", "any", {}, {}, "", Path())
         return TrainJob(
             plan,
-            {"name": "ksnn"},
+            {"name": "ksnn", **estimator},
             {"name": "sequences", "phase": {"learning_rate": rate}},
             split,
-            0,
+            seed,
             {},
         )
 
     assert hash(job(1e-3).group) == hash(job(1e-3).group)
     assert job(1e-3).group == job(1e-3).group != job(2e-3).group
+    assert job(1e-3, seed=1).group == job(1e-3).group, "seeds of a windowed network are one batch"
+    for name in ("learned_ukf", "velocity_gru"):
+        first = job(1e-3, name=name).group
+        assert job(1e-3, seed=1, name=name).group != first, "each seed ends and is published alone"
+    lower = job(1e-3, name="learned_ukf", start_friction=0.4).group
+    assert lower == job(1e-3, name="learned_ukf").group, "the same weights in other use"

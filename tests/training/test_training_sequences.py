@@ -259,6 +259,18 @@ def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
     assert rates == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_phase_of_no_epochs_is_left_out_with_any_schedule(schedule):
+    network = _network()
+    start = _flat(network)
+    left_out = _phase(network, "before", max_epochs=0, schedule=schedule)
+    records = train_phases([left_out], 3, FitContext())
+    assert torch.equal(_flat(network), start)
+    records = train_phases([left_out, _phase(network, max_epochs=2)], 3, FitContext())
+    assert [record.epochs for record in records] == [0, 2]
+    assert records[1].best_loss < records[1].start_loss
+
+
 @pytest.mark.parametrize("where", ["loss", "gradient"])
 def test_step_that_is_not_finite_is_skipped_and_counted(where):
     network = _network()

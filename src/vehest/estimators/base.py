@@ -137,6 +137,9 @@ class Estimator(ABC):
     ignores_initial_state: ClassVar[bool] = (
         False  # whether an initial state is left aside; else it is used, or refused as an error
     )
+    fits_seeds_together: ClassVar[bool] = (
+        True  # whether a fit of several seeds is one computation; else each is a training by itself
+    )
     slow_kernel: ClassVar[str] = (
         ""  # ``module:function`` that takes tens of seconds to compile; empty: none
     )

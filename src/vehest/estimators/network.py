@@ -20,6 +20,7 @@ class Network(Estimator):
     """
 
     learns = True  # always
+    fits_seeds_together = False
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)

@@ -48,7 +48,8 @@ class TrainJob:
     @property
     def group(self) -> tuple[Any, ...]:
         """Jobs of one group may be trained together."""
-        key = new_estimator(self.estimator).batch_key
+        estimator = new_estimator(self.estimator)
+        key = (estimator.batch_key, None if estimator.fits_seeds_together else self.seed)
         training = json.dumps(
             dict(self.training), sort_keys=True
         )  # may hold groups of settings, which have no hash

@@ -243,7 +243,7 @@ class _Run:
         settings = self.phase.settings
         size = settings.learning_rate
         if settings.schedule == "cosine":
-            progress = self.now.epochs / settings.max_epochs
+            progress = self.now.epochs / max(settings.max_epochs, 1)  # 0: a phase left out
             size = size * 0.5 * (1.0 + math.cos(math.pi * progress))
         return size * 0.5**self.now.halvings
 

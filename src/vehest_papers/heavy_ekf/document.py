@@ -14,6 +14,7 @@ from vehest.report.document import REPORT, Block, Column, Document, Table, as_co
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import (
     accuracy,
+    block_errors,
     claims,
     draws,
     laps,
@@ -35,6 +36,7 @@ from vehest_papers.heavy_ekf.subjects import (
     whole_drive,
 )
 from vehest_papers.kit import methods
+from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
@@ -120,9 +122,20 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *of_ferrari,
         *_how_it_was_made(artefacts),
     ]
-    return {
-        REPORT: Document(artefacts.title, blocks, {**twin_data, "twin_cells": every_cell(twin)})
+    rows = [*block_errors.drive_rows(TRUCK, truck), *block_errors.twin_rows(twin)]
+    if real:
+        rows += block_errors.drive_rows(FERRARI, real)
+    if DRAWS in artefacts.parts:
+        rows += block_errors.draw_rows(DRAWS, artefacts.parts[DRAWS])
+    if WHEELED in artefacts.parts:
+        rows += block_errors.wheel_rows(WHEELED, artefacts.parts[WHEELED])
+    data = {
+        **twin_data,
+        "twin_cells": every_cell(twin),
+        BLOCKS: frame(rows, BlockRow),
+        TRAINING: frame(block_errors.training_rows(), TrainingRow),
     }
+    return {REPORT: Document(artefacts.title, blocks, data)}
 
 
 def _lap_by_lap(

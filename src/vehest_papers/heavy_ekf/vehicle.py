@@ -128,16 +128,12 @@ def tracks_of(drive: Recording) -> tuple[float, float]:
 
 def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
     """Eqs. 61 to 64 on the AV-21's wheel speeds: tracks from the training range, then the test ranges."""
-    tracks = np.mean([tracks_of(drive) for drive in recordings_of(part, part.split.train)], axis=0)
+    tracks = trained_tracks(part)
     turning = np.where(tracks > LOCKED, tracks, 0.0)
-    wheels = SpeedFromWheels(
-        wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1])
-    )
     rows = []
     claims = []
-    for test, spans in part.split.tests.items():
-        parts = [drive for drive in recordings_of(part, spans) if (drive["vx_ref"] > SLOWEST).any()]
-        sums = [block_sums(drive, wheels) for drive in parts]
+    for test, of_drives in wheel_sums(part).items():
+        sums = of_drives.values()
         raw, corrected, raw_spread, spread, sizes = (
             np.concatenate(values) for values in zip(*sums, strict=True)
         )
@@ -198,6 +194,29 @@ def _locked_in_words(tracks: FloatArray) -> str:
         if locked
         else ""
     )
+
+
+def trained_tracks(part: PartArtefacts) -> FloatArray:
+    """Front and rear track by least squares on the training range, (2,) [m]."""
+    drives = recordings_of(part, part.split.train)
+    return np.asarray(np.mean([tracks_of(drive) for drive in drives], axis=0), dtype=np.float64)
+
+
+def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...]]]:
+    """Test set -> name of a drive -> `block_sums` of it; an axle whose wheels turn as one is left as it is."""
+    tracks = trained_tracks(part)
+    turning = np.where(tracks > LOCKED, tracks, 0.0)
+    wheels = SpeedFromWheels(
+        wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1])
+    )
+    return {
+        test: {
+            f"{drive.id} {drive.start_time:.2f} s": block_sums(drive, wheels)
+            for drive in recordings_of(part, spans)
+            if (drive["vx_ref"] > SLOWEST).any()
+        }
+        for test, spans in part.split.tests.items()
+    }
 
 
 def block_sums(

@@ -2,11 +2,12 @@
 
 Parts it knows: ``real`` and ``simulated``, of which it needs one, each with the test sets ``tyre_a`` and ``tyre_d``; and ``length_*``, the
 same candidate trained on sequences of different length, which it goes on without. The trials of searches are a table of their own.
+Tables ``blocks`` and ``training`` hold the errors by sequence and seed, and how far candidates were trained, which ``doubled`` checks.
 """
 
 from vehest_papers.learned_ukf.document import documents
 
 TAKES = "parts"
-VERSION = "2"  # trials of searches are in searches.csv and no longer in metrics.csv
+VERSION = "3"  # errors by block and seed, and whether trainings were long enough, are tables
 
 __all__ = ["TAKES", "VERSION", "documents"]

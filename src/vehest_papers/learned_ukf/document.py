@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.methods import absent_parts, kinds_of_parts
 from vehest_papers.kit.reading import with_interval, words_of_kinds
 from vehest_papers.kit.statements import corrected
 from vehest_papers.learned_ukf import (
     ablations,
+    block_errors,
     claims,
     coverage,
     friction,
@@ -51,6 +54,7 @@ class Outcome:
     front: list[Block] = field(default_factory=list)
     appendix: list[Block] = field(default_factory=list)
     added: list[Block] = field(default_factory=list)
+    rows: list[BlockRow] = field(default_factory=list)
     timed: bool = False
 
 
@@ -83,6 +87,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     for own in found.values():
         blocks += own.appendix
     blocks += how_it_was_made(artefacts, main, data)
+    rows = [
+        *block_errors.error_rows(artefacts.parts),
+        *(row for own in found.values() for row in own.rows),
+    ]
+    trained = block_errors.training_rows(artefacts.parts, next(iter(main)))
+    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
@@ -131,12 +141,10 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
         ]
         if paper.NN in groups and groups[paper.NN][0].training:
             words.append(
-                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it"
+                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step"
             )
         if words:
-            sentences.append(
-                f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md."
-            )
+            sentences.append(f"Epochs ({words_of_kinds(part)}): {', '.join(words)}.")
     return " ".join(sentences)
 
 
@@ -155,7 +163,7 @@ def _outcome(
     own.claims += [*claims.factor_claims(errors, kind), *claims.percentile_claims(errors, kind)]
     _accuracy(own, name, errors, kind, summary=name == MAIN[0] or MAIN[0] not in artefacts.parts)
     _friction(own, name, part, where, kind)
-    _instability(own, part, kind)
+    _instability(own, name, part, kind)
     beside = {
         title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind
     }
@@ -272,6 +280,14 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     times = friction.interval_of(trained.times(), friction.median)
     final = friction.interval_of(trained.final, friction.mean)
     own.claims += claims.friction_claims(times, final, kind)
+    measured = {
+        ("friction_settles_within_2_s", paper.NNTF_UH): trained.times(),
+        ("friction_ends_near_nominal", paper.NNTF_UH): np.abs(
+            trained.final - paper.NOMINAL_FRICTION["tyre_d"]
+        ),
+    }
+    seeds = [model.seed for model in models]
+    own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
     own.front += ["## Friction", friction.figure(tracks, skip, name, where)]
     own.appendix += [
         f"## Appendix: the start of the friction, {kind}",
@@ -280,17 +296,20 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     ]
 
 
-def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
+def _instability(own: Outcome, name: str, part: PartArtefacts, kind: str) -> None:
+    claim = {paper.NNT: "nnt_becomes_unstable", paper.NNT_U: "nnt_u_becomes_unstable"}
     groups = {
-        method: models
-        for method, models in models_by_candidate(part).items()
-        if method in (paper.NNT, paper.NNT_U)
+        method: models for method, models in models_by_candidate(part).items() if method in claim
     }
     lost = {}
     for method, models in groups.items():
         filters = [loaded(model) for model in models]
         drives = drives_of(part, filters[0], "tyre_d")
-        lost[method] = [lost_sequences(estimator, drives) for estimator in filters]
+        of_seeds = np.array([lost_sequences(estimator, drives) for estimator in filters])
+        lost[method] = [(int(of_seed.sum()), len(of_seed)) for of_seed in of_seeds]
+        measured = {(claim[method], method): of_seeds.astype(np.float64)}
+        seeds = [model.seed for model in models]
+        own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
     own.claims += claims.instability_claims(lost, kind)
 
 
@@ -328,6 +347,7 @@ def _prediction(
     drives = {test: drives_of(part, pairs[seeds[0]][0], test) for test in SETS}
     found = prediction.compared(pairs, drives, part.protocol)
     states, swaps = prediction.frames(found, seeds)
+    own.rows += block_errors.prediction_rows(name, part, found, drives, seeds)
     data |= {f"figure_5_{name}": states, f"figure_6_{name}": swaps}
     own.appendix += [
         "## Appendix: what learning through the filter changes",

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -110,10 +111,10 @@ def filtered(
         own.repair = kept
 
 
-def lost_sequences(estimator: LearnedUkf, drives: Drive) -> tuple[int, int]:
-    """Sequences whose covariances lose definiteness without repair, and all."""
+def lost_sequences(estimator: LearnedUkf, drives: Drive) -> NDArray[np.bool_]:
+    """Whether the covariance of each sequence loses definiteness without repair, (B,)."""
     means = filtered(estimator, drives, repair=False).steps.filtered.mean
-    return int(torch.isnan(means).flatten(1).any(1).sum()), len(means)
+    return np.asarray(torch.isnan(means).flatten(1).any(1).numpy(), dtype=np.bool_)
 
 
 def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> NonlinearFiltered:

@@ -104,3 +104,12 @@ NOMINAL_FRICTION: Mapping[str, float] = {
 }  # friction of the tyres (Section III-C)
 
 SLIP_99 = 40.0  # [deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)
+
+
+def epochs(candidate: str) -> str:
+    """Epochs of the paper's training (Section IV-A): one-step, then through the filter for those that learn through it."""
+    if candidate in (GRU, LSTM):
+        return "not stated"
+    if candidate in (NN_U, NNT_U, NNTF_U, NNTF_UH, NNTF_UH_LOW):
+        return "1000 + 1000"
+    return "1000" if candidate in CANDIDATES else ""

@@ -1,4 +1,4 @@
-"""Step sizes that were tried, and their validation errors: as many trials for the filter as for either recurrent network."""
+"""Step sizes and batches that were tried, and their validation errors: as many trials for the filter as for either recurrent network."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def trials_table(trials: Sequence[Trial]) -> Table:
         {
             "candidate": candidate_of(trial),
             "step_size": step_size(trial),
+            "batch": int(trial.training["batch_size"]),
             "start": str(trial.training.get("start_noise", MISSING)),
             "seed": trial.seed,
             "validation": trial.validation,
@@ -39,10 +40,11 @@ def trials_table(trials: Sequence[Trial]) -> Table:
     columns = {
         "candidate": Column("method"),
         "step_size": Column("step size", digits=1, each=True),
+        "batch": Column("sequences in a batch", decimals=0),
         "start": Column("noise starts from"),
         "seed": Column("seed", decimals=0),
         "validation": Column("MSE (weighted), validation", decimals=4),
         "chosen": Column("chosen"),
     }
-    caption = "Step sizes that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
+    caption = "Step sizes and batches that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
     return Table("trials", caption, frame, columns)

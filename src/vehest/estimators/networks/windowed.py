@@ -41,6 +41,7 @@ class WindowedEstimator(Network):
 
     channels = ("yaw_rate", "vx", "ay", "ax")
     training_type = SupervisedSettings
+    fits_seeds_together = True
     horizon_steps = 1  # a window predicts the velocity one sample after it
     rate_hz: float = rate(20.0)
     window: int = setting(30, "samples that it sees", least=1, most=MAX_WIDTH)

@@ -1,0 +1,121 @@
+"""Rows of tables/blocks.csv and tables/training.csv, from which claims are judged without models or recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+
+BLOCKS = "blocks"
+TRAINING = "training"
+BASELINES: Mapping[str, str] = {
+    "zero": "zero",
+    "static map": "static_map",
+}  # name in a report -> name in blocks.csv
+MOST_IMPROVED = 0.03  # by doubled epochs, up to which a training was long enough
+
+TrainingState = Literal["insufficient", "not checked", "sufficient", "not applicable"]
+
+
+@dataclass(frozen=True)
+class BlockRow:
+    """One error: of a seed of a candidate on a block of a test set."""
+
+    part: str  # of the study's pipeline
+    candidate: str
+    seed: int
+    test_set: str
+    metric: str
+    block: str  # a name that is unique within the test set
+    value: float  # sum of the loss over the block; squared errors where the metric is a root
+    size: float  # samples in the sum
+
+
+@dataclass(frozen=True)
+class TrainingRow:
+    """How far a candidate was trained."""
+
+    candidate: str
+    epochs: str  # of each phase
+    epochs_paper: str
+    training: TrainingState
+    reason: str
+
+
+def block_rows(
+    row: BlockRow, blocks: Sequence[str], values: FloatArray, sizes: FloatArray | float
+) -> list[BlockRow]:
+    """Rows of one seed, a row for each block.
+
+    Parameters
+    ----------
+    row
+        Part, candidate, seed, test set and metric; its block, value and size are replaced.
+    blocks
+        Names of the blocks, B of them.
+    values, sizes
+        Sum of the loss over each block and samples in it, (B,); one size for all blocks of equal length.
+    """
+    head = (row.part, row.candidate, row.seed, row.test_set, row.metric)
+    of_blocks = zip(
+        blocks, values.tolist(), np.broadcast_to(sizes, len(blocks)).tolist(), strict=True
+    )
+    return [BlockRow(*head, *of_block) for of_block in of_blocks]
+
+
+def frame(rows: Sequence[BlockRow] | Sequence[TrainingRow], row_type: type[Any]) -> pd.DataFrame:
+    """Rows as a table with the columns of their type."""
+    names = [field.name for field in fields(row_type)]
+    return pd.DataFrame([astuple(row) for row in rows], columns=names)
+
+
+def checked_training(
+    candidate: str,
+    epochs: str,
+    epochs_paper: str,
+    validation: Mapping[int, float],
+    doubled: Mapping[int, float],
+) -> TrainingRow:
+    """Whether a training was long enough, by the validation error that twice its epochs reach.
+
+    Parameters
+    ----------
+    candidate, epochs, epochs_paper
+        Of the row.
+    validation, doubled
+        Seed -> error on the validation range after the epochs of the tables, and after twice as many; compared over the seeds that both have.
+    """
+    seeds = sorted(validation.keys() & doubled.keys())
+    if not seeds:
+        return TrainingRow(
+            candidate, epochs, epochs_paper, "not checked", "not trained with twice the epochs"
+        )
+    before, after = (float(np.mean([own[seed] for seed in seeds])) for own in (validation, doubled))
+    state: TrainingState = (
+        "sufficient" if after >= (1.0 - MOST_IMPROVED) * before else "insufficient"
+    )
+    words = (
+        f"twice the epochs change the validation error by {100.0 * (after / before - 1.0):+.1f} %"
+    )
+    number = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+    return TrainingRow(candidate, epochs, epochs_paper, state, f"{words}, {number}")
+
+
+def names_of_blocks(
+    labels: NDArray[np.int64], recordings: Sequence[str], starts: FloatArray
+) -> list[str]:
+    """Name of each block: recording and time [s] of its first segment.
+
+    Parameters
+    ----------
+    labels, recordings, starts
+        Number of the block, recording and first time of each segment, (K,).
+    """
+    firsts = [int(np.flatnonzero(labels == label)[0]) for label in range(int(labels.max()) + 1)]
+    return [f"{recordings[first]} {starts[first]:.2f} s" for first in firsts]

@@ -1,0 +1,221 @@
+"""Errors of every candidate, sequence by sequence and seed by seed, and how far each was trained: blocks.csv and training.csv.
+
+A block is a sequence of 10 s, as the paper scores it. The four folds over tyre A are one part, ``tyre_a_folds``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.splits import VALIDATION
+from vehest.data.store import read_recording
+from vehest.evaluation.metrics import WEIGHTS, Scored, pieces_of, weighted_errors
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.training.through_filter import Drive
+from vehest_papers.kit.block_rows import (
+    BASELINES,
+    BlockRow,
+    TrainingRow,
+    block_rows,
+    checked_training,
+)
+from vehest_papers.kit.reading import metric_values
+from vehest_papers.learned_ukf import paper
+from vehest_papers.learned_ukf.candidates import models_by_candidate, scored_of
+from vehest_papers.learned_ukf.filtering import MOVING
+from vehest_papers.learned_ukf.prediction import AFTER, BEFORE, Compared
+
+DOUBLED = "doubled"
+FOLD = re.compile(r"(tyre_a_fold)_\d+")
+LENGTH = re.compile(r"length_(\d+)(_samples)?")
+LONGEST = 500  # samples of a sequence, which both ways of Figure 7 share
+WHEEL_SPEED = {"rim_speed": "wheel_speed"}  # name of a state -> name in a metric
+SWAPPED = f"{AFTER} predicting, {BEFORE} observing"
+
+
+def part_name(name: str) -> str:
+    """Part of the pipeline as blocks.csv has it."""
+    fold = FOLD.fullmatch(name)
+    return f"{fold[1]}s" if fold else name
+
+
+def candidate_name(part: str, candidate: str) -> str:
+    """Candidate of a part as blocks.csv has it: with the length of its training sequences where parts differ in it."""
+    length = LENGTH.fullmatch(part)
+    if length is None:
+        return BASELINES.get(candidate, candidate)
+    steps, by_samples = length.groups()
+    if int(steps) == LONGEST:
+        return f"{candidate}, {steps} steps"
+    return f"{candidate}, {steps} steps, constant {'samples' if by_samples else 'batch'}"
+
+
+def losses_of(scored: Scored) -> Iterator[tuple[str, float, int]]:
+    """Metric, sum of its loss over a sequence, and samples in the sum.
+
+    The weighted losses of Tables I and II; squared errors of vx, vy [m²/s²], yaw rate [rad²/s²] and sideslip [deg²]. ``ae99_weighted`` is the
+    sequence's 99th percentile times its samples.
+    """
+    samples = len(scored.vy)
+    absolute = weighted_errors(scored, np.abs)
+    yield "mse_weighted", float(weighted_errors(scored, np.square).sum()), samples
+    yield "mae_weighted", float(absolute.sum()), samples
+    yield "ae99_weighted", float(np.percentile(absolute, 99.0)) * samples, samples
+    for name in WEIGHTS:
+        yield f"rmse_{name}", float(np.square(scored.errors[name]).sum()), samples
+    turn = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+    squares = np.square(np.degrees(turn))[scored.is_sideslip_scored]
+    yield "rmse_sideslip", float(squares.sum()), len(squares)
+
+
+def sequence_names(part: PartArtefacts, test: str) -> list[str]:
+    """Name of each sequence of a test set: its recording and when it begins."""
+    pieces = pieces_of(
+        part.split.tests[test],
+        lambda span: read_recording(part.references[span.dataset, span.recording]),
+        part.protocol,
+    )
+    return [
+        f"{piece.recording} {max(piece.start, reference.start_time):.2f} s"
+        for reference, piece in pieces
+    ]
+
+
+def error_rows(parts: Mapping[str, PartArtefacts]) -> list[BlockRow]:
+    """Errors of every model on every sequence of its test sets."""
+    rows = []
+    for name, part in parts.items():
+        names = {test: sequence_names(part, test) for test in part.split.tests}
+        for candidate, models in models_by_candidate(part).items():
+            for model, test in ((model, test) for model in models for test in names):
+                for block, scored in zip(names[test], scored_of(part, model, test), strict=True):
+                    rows += [
+                        BlockRow(
+                            part_name(name),
+                            candidate_name(name, candidate),
+                            model.seed,
+                            test,
+                            metric,
+                            block,
+                            value,
+                            samples,
+                        )
+                        for metric, value, samples in losses_of(scored)
+                    ]
+    return rows
+
+
+def prediction_rows(
+    name: str,
+    part: PartArtefacts,
+    compared: Mapping[str, Compared],
+    drives: Mapping[str, Drive],
+    seeds: Sequence[int],
+) -> list[BlockRow]:
+    """Squared errors of one-step predictions, and the weighted loss of a filter that observes with another model than it predicts with.
+
+    Parameters
+    ----------
+    name, part
+        The part.
+    compared
+        Test set -> losses of both models.
+    drives
+        Test set -> its sequences, of T samples each.
+    seeds
+        Of the pairs of models.
+    """
+    rows = []
+    skip = round(part.protocol.skip_seconds * part.protocol.rate_hz)
+    for test, own in compared.items():
+        names = sequence_names(part, test)
+        samples = drives[test].states.shape[1]
+        for place, seed in enumerate(seeds):
+            for candidate, squares in zip((BEFORE, AFTER), own.one_step[:, place], strict=True):
+                for k, state in enumerate(MOVING):
+                    metric = f"one_step_rmse_{WHEEL_SPEED.get(state, state)}"
+                    head = BlockRow(name, candidate, seed, test, metric, "", 0.0, 0)
+                    rows += block_rows(head, names, (samples - 1) * squares[:, k], samples - 1)
+            head = BlockRow(name, SWAPPED, seed, test, "mse_weighted", "", 0.0, 0)
+            scored = samples - skip
+            rows += block_rows(head, names, scored * own.swaps[1, 0][place], scored)
+    return rows
+
+
+def measured_rows(
+    name: str,
+    part: PartArtefacts,
+    test: str,
+    measured: Mapping[tuple[str, str], FloatArray],
+    seeds: Sequence[int],
+) -> list[BlockRow]:
+    """Values of claims that need a measurement of their own: (claim's id, candidate) -> value of each seed and sequence, (S, B)."""
+    names = sequence_names(part, test)
+    rows = []
+    for (claim, candidate), values in measured.items():
+        for seed, of_seed in zip(seeds, values, strict=True):
+            rows += block_rows(
+                BlockRow(name, candidate, seed, test, claim, "", 0.0, 0), names, of_seed, 1
+            )
+    return rows
+
+
+def training_rows(parts: Mapping[str, PartArtefacts], main: str) -> list[TrainingRow]:
+    """How far every candidate was trained; those of the main part are checked by the part with twice the epochs."""
+    doubled = _validation(parts[DOUBLED]) if DOUBLED in parts else {}
+    rows: dict[str, TrainingRow] = {}
+    for name, part in parts.items():
+        if name == DOUBLED or FOLD.fullmatch(name):
+            continue
+        errors = _validation(part)
+        for candidate, models in models_by_candidate(part).items():
+            named = candidate_name(name, candidate)
+            if named in rows or candidate in paper.BASELINES:
+                continue
+            twice = doubled.get(_trained_as(candidate), {}) if name == main else {}
+            rows[named] = checked_training(
+                named, epochs_of(models[0]), paper.epochs(candidate), errors[candidate], twice
+            )
+    for baseline in paper.BASELINES:
+        named = BASELINES.get(baseline, baseline)
+        rows[named] = TrainingRow(named, "", "", "not applicable", "nothing is learnt in epochs")
+    return list(rows.values())
+
+
+def epochs_of(model: EvaluatedModel) -> str:
+    """Epochs of each phase, as configured."""
+    training = model.training
+    if "phase" in training:
+        return str(training["phase"]["max_epochs"])
+    phases = ["one_step", "through" if _learns_through(model) else "noise"]
+    words = " + ".join(str(training[phase]["max_epochs"]) for phase in phases)
+    return words if _learns_through(model) else f"{words} for the noise"
+
+
+def _learns_through(model: EvaluatedModel) -> bool:
+    """Whether the dynamics learn through the filter, by the subscript of the variant."""
+    return re.search(r"_uh?(_|$)", model.variant) is not None
+
+
+def _trained_as(candidate: str) -> str:
+    """The candidate whose training it has: NNTF_UH* differs from NNTF_UH in use alone."""
+    return paper.NNTF_UH if candidate == paper.NNTF_UH_LOW else candidate
+
+
+def _validation(part: PartArtefacts) -> dict[str, dict[int, float]]:
+    """Candidate -> seed -> weighted MSE on the validation range; baselines left out."""
+    values = metric_values(part)
+    return {
+        candidate: {
+            model.seed: values[
+                model.estimator, model.variant, model.seed, VALIDATION, "mse_weighted"
+            ]
+            for model in models
+        }
+        for candidate, models in models_by_candidate(part).items()
+        if candidate not in paper.BASELINES
+    }
