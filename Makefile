@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -80,6 +80,7 @@ lint: $(INSTALLED) ## style, types, layers of imports, published results that ar
 	$(BIN)/mypy docs/*.py
 	$(BIN)/lint-imports
 	$(BIN)/vehest report --check
+	$(BIN)/python -m vehest_papers.scorecard --check
 
 test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for the real recordings
 	$(BIN)/python -m pytest -m slow
@@ -130,14 +131,20 @@ ksnn: $(INSTALLED) ## every statement of the KS-NN paper, on simulated cars and,
 learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about a day on two cores
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
-learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with fewer candidates, in minutes
-	$(BIN)/vehest run pipelines/learned_ukf_sim.yaml
-
 heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
 cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/cnn_ukf.yaml
+
+scorecard: $(INSTALLED) ## four papers, published and ours, from committed claims and errors by block: results/scorecard.md (seconds)
+	$(BIN)/python -m vehest_papers.scorecard
+
+planted_truth: $(INSTALLED) ## how often the scorecard's verdicts are right: 18,000 simulated studies made of real errors (minutes)
+	$(BIN)/python -m vehest_papers.planted_truth
+
+error_traces: ferrari_drive ## the real errors that planted_truth is made of, from the study before; needs VEHEST_DATA
+	$(BIN)/python -m vehest_papers.planted_truth --evaluations "$${VEHEST_OUTPUT:-outputs}/evaluate"
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml

@@ -1,9 +1,11 @@
 """Every trained model in C against Python, over whole drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
-Models are those in the output root's train/ that learnt on the real Ferrari, the F1TENTH or, if on neither, the SIMULATED BMW, one a
-variant; drives are the Ferrari's test range, 550 to 700 s, a test run of the F1TENTH and a test drive of the BMW. All run under the
-contract with limits, health and bands. Python computes the same in float64 for the differences; its time is that of the model as it is.
-One core, the least of some passes over the whole drive in C, one pass in Python and in onnxruntime, all in the same run.
+Models are those in the output root's train/ that learnt on the real Ferrari, the F1TENTH or, if on
+neither, the SIMULATED BMW, one a variant, and the self-calibrating filter that comes with vehest;
+drives are the Ferrari's test range, 550 to 700 s, a test run of the F1TENTH and a test drive of the
+BMW. All run under the contract with limits, health and bands. Python computes the same in float64
+for the differences; its time is that of the model as it is. One core, the least of some passes over
+the whole drive in C, one pass in Python and in onnxruntime, all in the same run.
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "export"))
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 PASSES = 3
 DRIVES = {
     "ferrari_250lm": ("20140222_01_01_03_250lm", 550.0, 700.0),
@@ -48,6 +52,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     from vehest.estimators.model_files import read_description
     from vehest.export.program import exportable
     from vehest.run.calibrate import trust_of
+    from vehest.run.estimate import SELF_CALIBRATING, pretrained_folder
 
     found: dict[tuple[str, str, str], Path] = {}
     for folder in sorted((output / "train").glob("[!.]*")):
@@ -69,6 +74,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     kept = {
         key: folder for key, folder in found.items() if key[0] != "sim_bmw" or key[1:] not in real
     }
+    kept["ferrari_250lm", SELF_CALIBRATING, SELF_CALIBRATING] = pretrained_folder(SELF_CALIBRATING)
     return [
         (dataset, folder)
         for (dataset, _, _), folder in sorted(kept.items(), key=lambda entry: entry[0])
@@ -318,12 +324,20 @@ def report(table: pd.DataFrame) -> str:
 
 def main() -> None:
     """Measure, write, print."""
+    from vehest.estimators.model_files import read_description
+    from vehest.run.table_records import record_tables
+
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "export")
+    parser.add_argument("--only", help="one family; rows of the others stay as they are in --out")
     words = parser.parse_args()
     root = os.environ.get("VEHEST_DATA")
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
-    found = models(output)
+    found = [
+        (dataset, folder)
+        for dataset, folder in models(output)
+        if words.only in (None, read_description(folder).estimator)
+    ]
     if root is None or not found:
         sys.exit(
             "export_all needs VEHEST_DATA and models that learnt on real cars: make ferrari_drive, make real_cars, make learned_ukf"
@@ -336,9 +350,23 @@ def main() -> None:
         except Exception as error:  # one model that cannot be measured hides no other
             print(f"{folder.name} on {dataset}: {type(error).__name__}: {error}", file=sys.stderr)
     table = pd.DataFrame(rows)
+    if words.only and (words.out / "metrics.csv").is_file():
+        former = pd.read_csv(words.out / "metrics.csv")
+        table = pd.concat([former[former["family"] != words.only], table])
+        table = table.sort_values(["drive", "family", "variant", "precision"], ignore_index=True)
     words.out.mkdir(parents=True, exist_ok=True)
     table.to_csv(words.out / "metrics.csv", index=False, float_format="%.6g")
     (words.out / "report.md").write_text(report(table), encoding="utf-8")
+    record_tables(
+        [words.out / "metrics.csv", words.out / "report.md"],
+        "make export_all",
+        [
+            "script benchmarks/export.py",
+            *(f"data {dataset}" for dataset in sorted({row["drive"] for row in rows})),
+            *(f"calibrate {family}" for family in sorted({row["family"] for row in rows})),
+        ],
+        f"rows of other families than {words.only}" if words.only else "",
+    )
     print(report(table))
 
 

@@ -20,12 +20,16 @@ from pathlib import Path
 
 import numpy as np
 
+from vehest.run.table_records import record_tables
+
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "own_car"
 DRIVE = Path("revs") / "20140222_01_01_03_250lm"
 WHEELBASE = "2.4"
 MASS = "982"  # m, kg (data sheet)
 G = 9.80665
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 
 
 def write_log(data: Path, file: Path) -> None:
@@ -122,6 +126,11 @@ def main() -> None:
                     for key in keys
                 }
             )
+    record_tables(
+        [RESULTS / name for name in ("run.csv", "verdict.txt", "leaderboard.csv")],
+        "make own_car",
+        ["script benchmarks/own_car.py", "data ferrari_250lm", "report own_car"],
+    )
 
 
 if __name__ == "__main__":

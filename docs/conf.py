@@ -27,6 +27,7 @@ include_patterns = [
     "docs/*.md",
     "docs/estimators/*.md",
     "docs/sources/*.md",
+    "results/*.md",
     "results/*/*.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",

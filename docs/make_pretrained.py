@@ -127,6 +127,7 @@ def write_its_trust(step: str, output: Path) -> None:
         split,
         runner.data_for(split, float(config["estimator"]["rate_hz"]), config),
         output,
+        runner.cars(config, split.datasets),
     )
     if job is None:
         raise SystemExit(f"split '{split.name}' has no validation range")

@@ -34,7 +34,10 @@ from vehest.run.estimate import SELF_CALIBRATING, estimate_recording, open_model
 from vehest.run.identify import Normal, posterior_of, record_of
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
+from vehest.run.table_records import record_tables
 
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 ROOT = Path(__file__).resolve().parents[1]
 CHOICES = "conf/estimator/self_calibrating.yaml"
 TARGET = ROOT / "results" / "unseen_car"
@@ -608,6 +611,15 @@ def main() -> None:
         print(page)
     else:
         (TARGET / "report.md").write_text(page, encoding="utf-8")
+        record_tables(
+            [TARGET / "report.md", TARGET / "openings.csv"],
+            "make unseen_car",
+            [
+                "script docs/make_unseen_car.py",
+                "evaluate self_calibrating",
+                *(f"data {name}" for name in sorted({car.dataset for car in found})),
+            ],
+        )
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ from vehest.run.estimate import SELF_CALIBRATING, estimate_recording, open_model
 from vehest.run.identify import LATENESS, posterior_of, prior_of, record_of, without_prior
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
+from vehest.run.table_records import record_tables
 from vehest.simulation.plant.planar import VX, VY, YAW_RATE, Inputs, PlanarPlant
 from vehest.simulation.plant.planar_car import PlanarCar
 from vehest.simulation.sensors.levels import Mounting, Reference, SensorLevel, SensorLevels, Tilt
@@ -57,6 +58,8 @@ SHIFTS = np.arange(-0.12, 0.121, 0.03)  # s, of yaw rate
 SETTLED = 2.0
 STEP = 0.01  # s before the first sample, and between commands
 SHAPE = 1.4
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 EXPONENT = 0.25
 COMPARED = 0.8  # of the tyres' curve, of the filter's; share of the tyres' limit where they have the same slip
 PAGE = """# A car's record
@@ -706,6 +709,16 @@ def main() -> None:
         frame.to_csv(TARGET / f"{name}.csv", index=False, float_format="%.4g", lineterminator="\n")
     (TARGET / "record.md").write_text(
         report(pairs, rows, cars, shifts, seen, banked), encoding="utf-8"
+    )
+    names = ("agreement.csv", "carry_over.csv", "planted.csv", "lateness.csv", "scenes.csv")
+    record_tables(
+        [TARGET / name for name in (*names, "record.md")],
+        "make unseen_car_record",
+        [
+            "script docs/unseen_car_record.py",
+            "evaluate self_calibrating",
+            *(f"data {name}" for name in sorted({car.dataset for car in CARS if car.development})),
+        ],
     )
 
 

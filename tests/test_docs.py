@@ -338,6 +338,7 @@ def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers()
         "10.1109/ACCESS.2020.3012770",
         "10.1109/TVT.2024.3389493",
         "10.3390/s21165409",
+        "10.48550/arXiv.2408.15610",
     }
     assert {paper["doi"] for paper in papers if "doi" in paper} == known
 

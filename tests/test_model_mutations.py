@@ -10,7 +10,7 @@ import yaml
 from safetensors.numpy import load_file, save_file
 
 from every_estimator import drive_for, fitted
-from vehest.data.errors import VehestError
+from vehest.data.errors import DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, save_model
 from vehest.trust.contract import GuardedRun, limits_for
@@ -104,4 +104,63 @@ def test_a_network_without_a_yaw_rate_is_refused(tmp_path):
     tensors = load_file(tmp_path / WEIGHTS)
     save_file({**tensors, "yaw_rate_max": np.array(0.0)}, tmp_path / WEIGHTS)
     with pytest.raises(VehestError, match=r"safetensors': 'yaw_rate_max' must be positive, not 0"):
+        load_model(tmp_path)
+
+
+DAMAGES = {  # family, array -> (place, value, what is said of it)
+    ("rational_ekf", "levels"): [
+        (1, 0.0, "'ay' in 'levels' must be positive"),
+        (0, -0.01, "'yaw_rate' in 'levels' must be positive"),
+        (3, 1e13, "'tyres' in 'levels' must be a number of at most 1e+12"),
+    ],
+    ("rational_ekf", "curves"): [(1, 0.0, "'c2_front' in 'curves' must be positive")],
+    ("rational_ekf", "curve_covariance"): [
+        ((0, 1), 1.0, "it is not symmetric"),
+        ((0, 0), -1.0, "it has the eigenvalue -1"),
+        ((0, 0), 1e13, "must hold numbers of at most 1e+12"),
+    ],
+    ("dugoff_ukf", "levels"): [(0, 0.0, "'process_vy' in 'levels' must be positive")],
+    ("dugoff_ukf", "tyres"): [
+        (1, -1.0, "'friction_front' in 'tyres' must be positive"),
+        (2, -1e-3, "'reduction_front' in 'tyres' must be at least 0"),
+    ],
+    ("ensemble_ukf", "filter.levels"): [(2, -0.5, "'ay' in 'levels' must be positive")],
+    ("ensemble_ukf", "scaling"): [(1, 1e12, "'p2' in 'scaling' must lie between 0.2 and 2")],
+    ("ensemble_ukf", "network.unit"): [((), 0.0, "'unit' must be positive, not 0")],
+    ("cnn_ukf", "filter.tyres"): [(0, 0.0, "'cornering_stiffness_front' in 'tyres' must be")],
+    ("cnn_ukf", "network.input_span"): [(0, -1.0, "'input_span' must be positive, not -1")],
+    ("sideslip_ffnn", "input_span"): [(2, 0.0, "'input_span' must be positive, not 0")],
+    ("gru", "input_scale"): [(0, 0.0, "'input_scale' must be positive, not 0")],
+    ("velocity_lstm", "output_scale"): [(1, -2.0, "'output_scale' must be positive, not -2")],
+    ("learned_ukf", "dynamics.network.input_scale"): [
+        (4, 0.0, "'dynamics.network.input_scale' must be positive, not 0")
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "array"), DAMAGES)
+def test_a_number_that_no_fit_makes_is_one_line_that_names_the_file(tmp_path, name, array):
+    save_model(fitted(name), tmp_path)
+    load_model(tmp_path)
+    tensors = load_file(tmp_path / WEIGHTS)
+    for place, value, says in DAMAGES[name, array]:
+        damaged = tensors[array].copy()
+        damaged[place] = value
+        save_file({**tensors, array: damaged}, tmp_path / WEIGHTS)
+        with pytest.raises(DataError) as refused:
+            load_model(tmp_path)
+        assert str(refused.value).startswith(f"'{tmp_path / WEIGHTS}': ")
+        assert says in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+
+def test_settings_with_which_no_estimator_can_be_built_are_one_line(tmp_path, monkeypatch):
+    save_model(fitted("gru"), tmp_path)
+    kind = type(fitted("gru"))
+
+    def damaged(self):
+        raise TypeError("a defect")
+
+    monkeypatch.setattr(kind, "fewest_weights", damaged)
+    with pytest.raises(DataError, match=r"model\.yaml': no estimator can be built .*a defect"):
         load_model(tmp_path)

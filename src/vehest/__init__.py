@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 _API = (
+    "CarValues",
     "Estimate",
     "Estimator",
     "Recording",

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from vehest.data.car import UNKNOWN_CAR
+from vehest.data.car import CarValues as CarValues
 from vehest.data.estimate import Estimate as Estimate
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording as Recording
@@ -28,6 +30,7 @@ from vehest.estimators.model_files import model_digest
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.evaluation import metrics
 from vehest.run.calibrate import Stretch, learn_trust
+from vehest.run.car_record import ASSUMED, adapted, with_car_values
 from vehest.run.config import compose_config
 from vehest.run.downsample import resampled
 from vehest.run.estimate import (
@@ -80,7 +83,7 @@ def train(
     """Fit an estimator to recordings, which are brought to its rate first.
 
     Args:
-        estimator: its name, as in conf/estimator.
+        estimator: its name, as in conf/estimator. A wheelbase of null among its settings is that of the recordings' car.
         train: recordings to learn from, with ``vy_ref``, at any rate from the estimator's upwards.
         validation: recordings that decide when to stop, of the same kind; may be the same objects where the method does not stop early.
         overrides: as of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``.
@@ -91,6 +94,7 @@ def train(
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
     config = compose_config("train", [f"estimator={estimator}", *overrides])
+    config = with_car_values(config, [recording.car for recording in (*train, *validation)])
     model = new_estimator(config["estimator"])
     training = config["training"]
     if training.get("start_from") is not None:
@@ -117,6 +121,8 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     """Metrics of a model on whole recordings that have ``vy_ref``, over all of them together, on the grid and after the first seconds that
     conf/eval.yaml names. That the model has not learnt from them is for the caller to see to.
 
+    Each recording's car is used as by `estimate`, and its wheelbase gives the speed from which sideslip counts.
+
     Returns:
         Metric -> value: ``rmse_vy`` [m/s], ``rmse_sideslip`` [deg], ``fvu`` and others, as docs/estimators.md defines them.
 
@@ -131,14 +137,15 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     )
     parts = []
     for recording in recordings:
-        needed = prepared_recording(model, recording.without_references())
-        own = require_estimate(model, recording, model.estimate([needed])[0])
+        of_car, _ = _for_car(model, recording.car)
+        needed = prepared_recording(of_car, recording.without_references())
+        own = require_estimate(of_car, recording, of_car.estimate([needed])[0])
         parts.append(
             metrics.score(
                 own,
                 resampled(recording, protocol.rate_hz, model.preparation),
                 Span("", recording.id),
-                protocol,
+                protocol.with_wheelbases({"": recording.car.wheelbase}),
             )
         )
     return metrics.accuracy(parts)
@@ -168,7 +175,8 @@ def read_recording(
 
     Args:
         path: the file.
-        overrides: how to read it, for example ``["dataset=my_car"]``; by default columns carry the channels' names and SI units.
+        overrides: how to read it, for example ``["dataset=my_car"]``; by default columns carry the channels' names and SI units. The values
+            ``car`` of the data set become `Recording.car`; without a data set give them as ``["dataset.car.wheelbase=2.9"]``.
         references: whether the reference channels that a data set declares have to be there; else they are left aside. Columns that carry
             the channels' names are read in any case.
 
@@ -179,8 +187,18 @@ def read_recording(
     return read_table(Path(path), overrides, references=references)
 
 
-def estimate(model: Estimator, recording: Recording) -> Estimate:
+def estimate(
+    model: Estimator, recording: Recording, *, same_vehicle: bool | None = None
+) -> Estimate:
     """Run a model on a recording, brought to the model's rate in the way it was trained with, under the contract that holds online.
+
+    The values of ``recording.car`` are used as ``vehest estimate`` uses those of a data set: settings of the self-calibrating filter that
+    its training did not choose, and whether the bands apply.
+
+    Args:
+        model: fitted.
+        recording: as `read_recording` reads it.
+        same_vehicle: whether it is of the car that bands were calibrated on; None: by the values and the names of the cars.
 
     Returns:
         ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet. ``health`` (0 valid,
@@ -190,23 +208,42 @@ def estimate(model: Estimator, recording: Recording) -> Estimate:
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    return estimate_recording(model, recording, _TRUST.get(model))
+    of_car, trust = _for_car(model, recording.car)
+    return estimate_recording(of_car, recording, trust, same_vehicle)
+
+
+def _for_car(model: Estimator, car: CarValues) -> tuple[Estimator, Trust | None]:
+    """A model and its calibration for a car; warns where the model's wheelbase is an assumption."""
+    of_car, trust, remarks = adapted(model, _TRUST.get(model), car, {})
+    for remark in remarks:
+        if ASSUMED in remark:
+            warnings.warn(remark, stacklevel=3)
+    return of_car, trust
 
 
 def online(
-    model: Estimator, bus_rate_hz: float | None = None, *, elsewhere: bool = False
+    model: Estimator,
+    bus_rate_hz: float | None = None,
+    *,
+    elsewhere: bool = False,
+    car: CarValues = UNKNOWN_CAR,
 ) -> GuardedStepper:
     """A model that runs along with a drive: ``online(model).step({"vx": 21.3, …})`` a sample.
 
     Args:
         model: fitted, causal.
         bus_rate_hz: rate at which samples come, if it is above the model's: they then go through a causal anti-aliasing filter first.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are wider then.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are wider then. They are, too, where
+            the values of ``car`` say so.
+        car: values of the car, for example ``CarValues(wheelbase=2.9)`` or `Recording.car`; used as `estimate` does.
 
     Raises:
         ConfigurationError: the model is not causal, or the bus is slower than it.
     """
-    return GuardedStepper(model, _TRUST.get(model), bus_rate_hz, elsewhere=elsewhere)
+    of_car, trust = _for_car(model, car)
+    bands = None if trust is None else trust.bands
+    is_other = elsewhere or (bands is not None and bool(bands.difference_to(car)))
+    return GuardedStepper(of_car, trust, bus_rate_hz, elsewhere=is_other)
 
 
 def write_estimate(estimate: Estimate, path: str | Path) -> None:

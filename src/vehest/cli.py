@@ -582,7 +582,8 @@ def export(
         bool,
         typer.Option(
             "--elsewhere",
-            help="For a car or tyres that the model was not calibrated on: bands twice as wide.",
+            help="For a car or tyres that the model was not calibrated on: bands twice as wide. "
+            "With dataset=NAME the data set's car decides, too.",
         ),
     ] = False,
     vectors: Annotated[
@@ -608,24 +609,27 @@ def export(
 
     One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
     file, test vectors, and a README with units.
+
+    dataset=NAME gives the values of the car, as for `vehest estimate`, and so does dataset.car.wheelbase=2.7 without one.
     """
     from vehest.export.folder import export_model
-    from vehest.run.estimate import open_model, prepared_recording, read_table
+    from vehest.run.estimate import model_for_car, prepared_recording, read_table, split_settings
 
-    output = Path(_compose("estimate", overrides or [])["output"])
-    folder, fitted, trust = open_model(model, output, note)
+    settings, reading = split_settings(overrides or [])
+    folder, fitted, trust, is_other = model_for_car(model, settings, reading, note)
     if onnx and vectors is not None:
         raise ConfigurationError("--vectors are of C, --onnx writes none; leave one out")
     drive = (
         None
         if vectors is None
-        else prepared_recording(fitted, read_table(vectors, overrides or []), bus_rate)
+        else prepared_recording(fitted, read_table(vectors, reading), bus_rate)
     )
     if onnx:
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
     else:
+        elsewhere = elsewhere or is_other
         export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
     emit(as_json, {"out": str(out), "model": str(folder)})
 
@@ -995,8 +999,12 @@ def data_align(
         ),
     ] = None,
     cutoff: Annotated[
-        float, typer.Option("--cutoff", help="Low-pass that both sides go through [Hz].")
-    ] = 2.0,
+        float | None,
+        typer.Option(
+            "--cutoff",
+            help="Low-pass that both sides go through [Hz]; by default 2, or less below 23 Hz.",
+        ),
+    ] = None,
     max_delay: Annotated[
         float, typer.Option("--max-delay", help="Largest delay to look for, either way [s].")
     ] = 0.5,

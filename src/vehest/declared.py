@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, TypeVar, overload
+from typing import Any, ClassVar, TypeVar
 
 from vehest.data.errors import ConfigurationError
 
 LARGEST = (
     1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
 )
+UNSET: Any = None  # default of a number that has to be given, or else follows from others
 MAX_WIDTH = 4096  # of a layer, a window or an ensemble: more would take all memory
 
 T = TypeVar("T")
@@ -61,21 +62,6 @@ class Declaration:
         )
 
 
-@overload
-def setting(
-    default: None,
-    doc: str,
-    *,
-    unit: str = "",
-    positive: bool = False,
-    least: float | None = None,
-    most: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-) -> Any: ...
-
-
-@overload
 def setting(
     default: T,
     doc: str,
@@ -86,20 +72,7 @@ def setting(
     most: float | None = None,
     above: float | None = None,
     below: float | None = None,
-) -> T: ...
-
-
-def setting(
-    default: Any,
-    doc: str,
-    *,
-    unit: str = "",
-    positive: bool = False,
-    least: float | None = None,
-    most: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-) -> Any:
+) -> T:
     """A dataclass field with its default, text, unit and bounds, as in `Declaration`.
 
     Type checkers take it for a value of the default's type, as they do `dataclasses.field`: a default of another type than the annotation is

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from place import run_vehest
-from real_drives import real_drive
+from real_drives import real_drive, source_of
 from vehest.alignment.align import align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
@@ -27,7 +27,7 @@ from vehest.data.store import write_recording
 from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_from_config
 from vehest.run.align import FILES, override_of
 from vehest.run.config import compose_config
-from vehest.run.downsample import transforms_of
+from vehest.run.downsample import resampled, transforms_of
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.levels import PRESETS, SensorLevel, Tilt
@@ -301,6 +301,16 @@ def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
     assert ratio.max() < 1.4  # the standard deviation of 30 values is itself known to 13 %
 
 
+def test_log_of_20_hz_is_aligned_without_options():
+    slow = resampled(weaving(0), 20.0, {"method": "polyphase", "transforms": []})
+    found = align(slow, AlignmentSettings(IMU, tilt=0.0))
+    assert found.settings.cutoff_at(20.0) == pytest.approx(1.767, abs=1e-3)
+    assert found.settings.cutoff_at(22.0) < found.settings.cutoff_at(50.0) == 2.0
+    for parameter in found.parameters:
+        error = abs(parameter.value - PLANTED[parameter.name])
+        assert error < 3 * parameter.uncertainty < 0.3, parameter.name
+
+
 def test_unmeasured_tilt_adds_to_the_uncertainty():
     recording = weaving(0)
     level, tilted = (align(recording, replace(COVERED, tilt=tilt)) for tilt in (0.0, 0.002))
@@ -546,6 +556,24 @@ def test_the_ratio_of_a_fast_ferrari_is_uncertain_and_covered(data_root):
     assert ratio.low <= 1.0 <= ratio.high
     assert abs(ratio.value - 1.0) < ratio.uncertainty
     assert abs(ratio.value - 1.0) > 2.0 * ratio.scatter
+
+
+@pytest.mark.parametrize(
+    ("dataset", "wheelbase", "truth", "n_recordings"),
+    [("tum", 3.0, 1.0, 3), ("ferrari_250lm_unlabelled", 2.4, 13.955, 4)],
+)
+def test_a_ratio_lies_within_two_deviations_on_every_recording_of_known_ratio(
+    data_root, dataset, wheelbase, truth, n_recordings
+):
+    """The DevBot's road-wheel angles have a ratio of 1, and the Ferrari's is that of its handwheel to `delta` of the same drive."""
+    source = source_of(data_root, dataset)
+    errors = []
+    for recording in source.ids():
+        settings = AlignmentSettings(("steering_ratio",), wheelbase=wheelbase)
+        ratio = align(source.read(recording), settings)["steering_ratio"]
+        errors.append((ratio.value - truth) / ratio.uncertainty)
+    assert len(errors) == n_recordings
+    assert np.abs(errors).max() < 2.0
 
 
 def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused():

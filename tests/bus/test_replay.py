@@ -217,6 +217,14 @@ def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
     assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
 
 
+def test_an_output_that_links_to_itself_is_refused(tmp_path):
+    written = write_log(drive(2.0), tmp_path)
+    out = tmp_path / "out.csv"
+    out.symlink_to(out)
+    with pytest.raises(DataError, match="links lead to each other"):
+        replayed(written, out=out)
+
+
 def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(
     tmp_path,
 ):

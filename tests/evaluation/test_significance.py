@@ -1,14 +1,19 @@
 """Intervals and p-values of the paired block bootstrap, on losses whose differences are known."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import signal, stats
 
 from vehest.data.errors import DataError
 from vehest.evaluation.significance import (
+    Contrast,
     _degrees_of_freedom,
     difference_of_blocks,
     differences_of_blocks,
+    log_ratio_of_pooled,
+    mean_contrast,
     root_interval,
     root_intervals,
 )
@@ -133,3 +138,79 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides
         [seeds[0] + 2.0, seeds[1]],
     )
     assert found == pytest.approx((a + 2.0 * b) ** 2 / (a**2 / 39.0 + 2.0 * b**2 / 2.0))
+
+
+def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
+    """Expected squared error of the mean, worked out from the variances that the values are drawn with."""
+    rng = np.random.default_rng(2)
+    deviations = {"blocks": 0.5, "seeds": 0.3, "single": 0.8}
+    n_seeds = 4
+    n_blocks = 10
+    variances = []
+    covered = 0
+    for _ in range(2000):
+        values = (
+            deviations["seeds"] * rng.normal(size=(n_seeds, 1))
+            + deviations["blocks"] * rng.normal(size=n_blocks)
+            + deviations["single"] * rng.normal(size=(n_seeds, n_blocks))
+        )
+        contrast = mean_contrast(values)
+        variances.append(contrast.error**2)
+        low, high = contrast.interval()
+        covered += low <= 0.0 <= high
+    true = 0.25 / n_blocks + 0.09 / n_seeds + 0.64 / (n_seeds * n_blocks)
+    assert np.mean(variances) == pytest.approx(true, rel=0.15)
+    assert 0.92 < covered / 2000 < 0.98
+
+
+def test_mean_of_one_seed_has_student_s_interval():
+    values = np.random.default_rng(3).normal(size=(1, 9))
+    contrast = mean_contrast(values)
+    test = stats.ttest_1samp(values[0], 0.0)
+    assert contrast.p_value == pytest.approx(test.pvalue)
+    assert contrast.interval(0.9) == pytest.approx(tuple(test.confidence_interval(0.9)))
+    paired = mean_contrast(values + 1.0, values[:, ::-1])
+    expected = stats.ttest_rel(values[0] + 1.0, values[0, ::-1])
+    assert paired.p_value == pytest.approx(expected.pvalue)
+
+
+def test_paired_seeds_leave_out_what_both_trainings_share():
+    rng = np.random.default_rng(4)
+    shared = rng.normal(size=(3, 1))
+    first = shared + 0.1 * rng.normal(size=(3, 20))
+    second = shared + 0.1 * rng.normal(size=(3, 20))
+    independent = mean_contrast(first, second)
+    paired = mean_contrast(first, second, has_paired_seeds=True)
+    assert paired.value == pytest.approx(independent.value)
+    assert paired.error < 0.3 * independent.error
+
+
+def test_log_ratio_of_pooled_sums_has_the_error_of_the_delta_method():
+    rng = np.random.default_rng(5)
+    first = rng.gamma(4.0, size=(1, 400))
+    second = first * rng.gamma(20.0, 0.1, size=(1, 400))
+    contrast = log_ratio_of_pooled(first, second)
+    influence = (first / first.mean() - second / second.mean())[0]
+    assert contrast.value == pytest.approx(math.log(first.sum() / second.sum()))
+    assert contrast.error == pytest.approx(influence.std(ddof=1) / 20.0, rel=0.03)
+    assert contrast.dof == pytest.approx(399.0)
+
+
+def test_power_is_that_of_the_noncentral_t_and_grows_with_blocks():
+    contrast = Contrast(0.3, ((0.04, 11.0), (0.004, 2.0)), 12)
+    assert contrast.dof == pytest.approx(0.044**2 / (0.04**2 / 11.0 + 0.004**2 / 2.0))
+    expected = stats.nct.sf(stats.t.ppf(0.975, contrast.dof), contrast.dof, 0.5 / math.sqrt(0.044))
+    assert contrast.power(-0.5) == pytest.approx(expected)
+    needed = contrast.blocks_needed(0.5, 0.8)
+    assert contrast.with_blocks(needed).power(0.5) >= 0.8
+    assert contrast.with_blocks(needed - 1).power(0.5) < 0.8
+    assert contrast.blocks_needed(0.1, 0.8) is None  # the seeds' variance alone is too large
+
+
+def test_degrees_of_freedom_are_at_least_those_of_two_seeds():
+    """Seeds that add nothing beyond chance must not make the interval endless."""
+    rng = np.random.default_rng(0)
+    contrasts = [mean_contrast(rng.normal(size=(3, 14))) for _ in range(300)]
+    assert min(contrast.dof for contrast in contrasts) == 1.0
+    covered = [low <= 0.0 <= high for low, high in (own.interval() for own in contrasts)]
+    assert 0.93 < np.mean(covered) <= 1.0

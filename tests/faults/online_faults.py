@@ -30,11 +30,14 @@ import torch
 import vehest
 from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
+from vehest.run.table_records import record_tables
 from vehest.sources.base import open_source
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.watch import STARTED
 
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 SETTLE = 4.0
 LASTS = 4.0
 COMES_BACK = 8.0
@@ -64,6 +67,7 @@ FERRARI = {
     "static_map": (),
     "kinematic": (),
     "data_sheet": ("estimator.wheelbase=2.4", "estimator.cg_to_rear_axle=1.07"),
+    "self_calibrating": ("estimator.wheelbase=2.4", "estimator.cg_to_rear_axle=1.07"),
     "luenberger": (),
     "kalman": (),
     "factor_graph": ("estimator.window=0.5",),
@@ -96,11 +100,12 @@ FERRARI = {
     ),
 }
 SMALL_CAR = {
+    "self_calibrating": ("estimator.wheelbase=0.33",),
     "learned_ukf": (
         "estimator.dynamics=pacejka",
         "training.one_step.max_epochs=60",
         "training.noise.max_epochs=3",
-    )
+    ),
 }
 SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
 Ground = namedtuple("Ground", "data kind train validation trial families")
@@ -112,6 +117,7 @@ def grounds():
     bmw = {
         **FERRARI,
         "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"),
+        "self_calibrating": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"),
     }
     own = "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, cg_to_rear_axle: 1.423, cg_height: 0.42}"
     bmw = {
@@ -261,7 +267,9 @@ def main():
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--only", help="one estimator")
+    parser.add_argument(
+        "--only", help="one estimator; rows of the others stay as they are in --out"
+    )
     parser.add_argument("--data", help="one data set")
     asked = parser.parse_args()
     cases = [
@@ -273,6 +281,10 @@ def main():
     cases = [case for case in cases if asked.only in (None, case[1])]
     cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
     started = time.monotonic()
+    former = pd.DataFrame(columns=HEADER)
+    if asked.only and asked.out.is_file():
+        former = pd.read_csv(asked.out, dtype=str, keep_default_na=False)
+        former = former[former["estimator"] != asked.only]
     tables = {}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
@@ -280,16 +292,24 @@ def main():
             cases, pool.map(try_family, *zip(*cases, strict=True)), strict=True
         ):
             tables[ground.data, name] = rows
-            table = pd.DataFrame(
-                [row for done in sorted(tables) for row in tables[done]], columns=HEADER
-            )
-            table.to_csv(
+            table = pd.DataFrame([row for rows in tables.values() for row in rows], columns=HEADER)
+            pd.concat([former, table]).sort_values(["data", "estimator"], kind="stable").to_csv(
                 asked.out, index=False
             )  # so that what is done stands there if the rest is not awaited
             print(
                 f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s",
                 flush=True,
             )
+    record_tables(
+        [asked.out],
+        "make online_faults",
+        [
+            "script tests/faults/online_faults.py",
+            *(f"data {data}" for data in sorted({ground.data for ground, _ in cases})),
+            *(f"train {name}" for name in sorted({name for _, name in cases})),
+        ],
+        f"rows of other estimators than {asked.only}" if len(former) else "",
+    )
     held = {
         "finite": table["finite"],
         "without an exception": table["exceptions"] == 0,

@@ -16,11 +16,15 @@ import tempfile
 import time
 from pathlib import Path
 
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
+
 
 def main():
     """Exit code 1 if any row is bad."""
     options = _options()
     from fuzz.runner import Fuzzer, described, summary, write_rows
+    from vehest.run.table_records import record_tables
 
     with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as made:
         started = time.monotonic()
@@ -47,6 +51,7 @@ def main():
         fuzzer.run(indices, options.jobs, report)
         if options.out:
             write_rows(rows, Path(options.out))
+            record_tables([Path(options.out)], "make fuzz", ["script tests/fuzz/__main__.py"])
         if options.only and options.folder:
             print(f"files: {', '.join(str(folder / f'{index:06d}') for index in indices)}")
         bad = sum(row.verdict != "ok" for row in rows)

@@ -30,7 +30,10 @@ from processes import end_all, is_alive, start
 from vehest.data.errors import VehestError
 from vehest.run.artefacts import read_artefact
 from vehest.run.evaluate import TIMES
+from vehest.run.table_records import record_tables
 
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 EXIT_CODES = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}
 SIGNALS = tuple(EXIT_CODES)
 STUDY = ("run", "quickstart", "training.max_epochs=3", "training.checkpoint_seconds=0")
@@ -344,6 +347,7 @@ def main():
             bad = rounds(missing, random.Random(given.seed), Path(scratch), out)
         finally:
             end_all()
+    record_tables([out], "make kills", ["script tests/kills/kills.py"])
     print(f"{given.kills} kills, {bad} of them bad: {out}")
     sys.exit(1 if bad else 0)
 

@@ -259,7 +259,7 @@ def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets
     assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(
         lambda: runs_of(replace(part, metrics=metrics))
     )
-    assert "needs one of the parts: real, simulated" in refusal(
+    assert "needs the part 'real'" in refusal(
         lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
     )
     other = replace(
@@ -275,18 +275,18 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
 ):
     undrawn(monkeypatch)
     titles = {
-        "real": "Real tyre sets",
-        "simulated": "Simulated tyre sets",
+        "real": "Tyre sets",
+        "curvature": "Curved tyres",
         "likelihood": "With likelihood",
     }
     parts = {
-        "simulated": part,
+        "real": part,
         **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)},
         "likelihood": part,
     }
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
-    remark = "part 'simulated' does not use what the search 'trial_gru' chose"
+    remark = "part 'real' does not use what the search 'trial_gru' chose"
     artefacts = StudyArtefacts(
         "learned_ukf",
         "t",
@@ -294,7 +294,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
         "c",
         titles,
         parts,
-        ["real"],
+        ["curvature"],
         trials=gru_trials(),
         search_remarks=[remark],
     )
@@ -303,20 +303,20 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     text = (tmp_path / "report.md").read_text()
     figures = {block.name for block in document.blocks if isinstance(block, Figure)}
     assert figures == {
-        *(f"figure_{number}_simulated" for number in (3, 4, 5, 6)),
+        *(f"figure_{number}_real" for number in (3, 4, 5, 6)),
         "figure_7",
-        "friction_simulated",
+        "friction_real",
     }
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {
         "claims",
         "claims_added",
-        "additions_simulated",
-        "additions_budget_simulated",
+        "additions_real",
+        "additions_budget_real",
         "overview",
         "sequence_length",
         *(
-            f"{name}_simulated"
+            f"{name}_real"
             for name in (
                 "table_1",
                 "table_2",
@@ -355,12 +355,12 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert len(text.split("## Appendix")[0].split()) < 2500
     assert "Not run here, for their budget: the E terms of Equation 3." in text
     assert set(document.data) >= {
-        f"{name}_simulated"
+        f"{name}_real"
         for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")
     }
-    assert "Simulated tyre sets: SIMULATED data" in text
-    assert "Not in this report, since the recordings are missing: Real tyre sets" in text
-    assert "authors' public code" not in text
+    assert "Tyre sets: SIMULATED data" in text
+    assert "Not in this report, since the recordings are missing: Curved tyres" in text
+    assert "authors' public code" in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
     assert f"P{remark[1:]}." in text
@@ -368,7 +368,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert blocks.columns.tolist() == list(BlockRow.__dataclass_fields__)
     assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
     keys = ["candidate", "seed", "metric"]
-    ours = blocks[(blocks["part"] == "simulated") & (blocks["test_set"] == "tyre_a")]
+    ours = blocks[(blocks["part"] == "real") & (blocks["test_set"] == "tyre_a")]
     ours = ours.groupby(keys)[["value", "size"]].sum()
     known = metric_values(part)
     for candidate, models in models_by_candidate(part).items():
@@ -377,13 +377,13 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
                 value, size = ours.loc[(candidate, own.seed, metric)]
                 figure = known[own.estimator, own.variant, own.seed, "tyre_a", metric]
                 assert (value / size) ** power == pytest.approx(figure, rel=1e-9)
-    swaps = document.data["figure_6_simulated"].set_index(
-        ["test_set", "seed", "predicts", "observes"]
-    )["mse"]
+    swaps = document.data["figure_6_real"].set_index(["test_set", "seed", "predicts", "observes"])[
+        "mse"
+    ]
     value, size = ours.loc[("NNTF_U predicting, NNTF observing", 1, "mse_weighted")]
     assert value / size == pytest.approx(swaps["tyre_a", 1, "NNTF_U", "NNTF"])
     assert size == ours.loc[("NNTF", 1, "mse_weighted"), "size"]
-    one_step = document.data["figure_5_simulated"].set_index(["test_set", "seed", "task", "state"])
+    one_step = document.data["figure_5_real"].set_index(["test_set", "seed", "task", "state"])
     value, size = ours.loc[("NNTF", 0, "one_step_rmse_wheel_speed")]
     assert value / size == pytest.approx(
         one_step.loc[("tyre_a", 0, "one_step", "rim_speed"), "before"]

@@ -18,7 +18,10 @@ from vehest.data.files import written_aside
 from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import questions_of
 from vehest.run.own_car.write import write
+from vehest.run.table_records import record_tables
 
+VERSION = "1"
+"""Raised when the numbers of its tables move."""
 ANSWERS = Path(__file__).parent / "answers.yaml"
 COLUMNS = ("log", "column", "right answer", "proposed", "evidence", "decided/asked", "correct")
 WHOLE = ("left_right", "rate", "radius")
@@ -171,6 +174,11 @@ def main():
             rows += rows_of(log, answers[log], outcome_of(write_log(log, Path(data), Path(folder))))
     with written_aside(out) as aside:
         pd.DataFrame(rows, columns=COLUMNS).to_csv(aside, index=False)
+    record_tables(
+        [out],
+        "make own_car_proposals",
+        ["script tests/proposals/own_car_proposals.py", "data ferrari_250lm"],
+    )
     wrong = [row for row in rows if row["correct"] == "no"]
     for row in wrong:
         print(

@@ -175,9 +175,20 @@ def test_families_that_lack_channels_are_named_with_them(part):
 
 def test_the_terminal_says_what_the_report_says(part):
     artefacts = StudyArtefacts(
-        "toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], []
+        "toy",
+        "A toy study",
+        "",
+        "vehest run toy",
+        {"": ""},
+        {"": part},
+        report_command="vehest report toy output=there training.patience=5",
+        location="output=there",
     )
     lines = verdict(artefacts)
+    estimate, export, report = lines[lines.index("next:") + 1 :]
+    assert " output=there -o beta.csv" in estimate
+    assert " output=there -o on_the_car" in export
+    assert "vehest report toy output=there training.patience=5 " in report
     assert lines[0].replace("*", "") in str(documents(artefacts)["report"].blocks[0]).replace(
         "*", ""
     ).replace("`", "")

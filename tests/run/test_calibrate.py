@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from conftest import planar_drive
+from vehest.data.errors import DataError
 from vehest.data.store import read_estimate
 from vehest.run.artefacts import read_artefact
 from vehest.run.calibrate import STAGE, calibration_of, trust_of
@@ -160,6 +161,42 @@ def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_fo
     assert trust_of(model, place.folder / "outputs", remarks.append).about.note == "mine"
     assert "does not say which model" in remarks[0]
     assert trust_of(tmp_path / "nothing", tmp_path) is None
+
+
+def _truncate(file):
+    file.write_bytes(file.read_bytes()[:-5])
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("trust.yaml", Path.unlink),
+        ("trust.yaml", _truncate),
+        ("trust.yaml", lambda file: file.write_text(file.read_text().replace("0", "1"))),
+        ("manifest.json", Path.unlink),
+        ("manifest.json", _truncate),
+        ("manifest.json", lambda file: file.write_text("[]")),
+        ("manifest.json", lambda file: file.write_text(file.read_text().replace("stage", "x", 1))),
+    ],
+)
+def test_a_damaged_calibration_is_an_error_and_not_a_model_without_bands(evaluated, name, damage):
+    place, model, _ = evaluated
+    calibration = calibration_of(model, place.folder / "outputs").folder
+    damage(calibration / name)
+    drive = planar_drive(20.0, 100.0).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    place.refused("estimate", str(model), "lap.csv", "-o", "out.csv", says=str(calibration))
+    assert not Path("out.csv").exists()
+    calibration.rename(calibration.with_name(f"another-{calibration.name}"))
+    if name == "manifest.json":
+        assert trust_of(model, place.folder / "outputs") is None, "of another model, by its name"
+
+
+def test_a_damaged_model_is_not_taken_for_one_without_a_calibration(evaluated):
+    place, model, _ = evaluated
+    (model / "manifest.json").write_text("{")
+    with pytest.raises(DataError, match=r"manifest\.json"):
+        calibration_of(model, place.folder / "outputs")
 
 
 def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_along(evaluated):

@@ -12,12 +12,13 @@ import yaml
 
 import vehest
 from conftest import planar_drive
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_estimate
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import CarRecord, Number, adapted, with_car_values
 from vehest.run.estimate import pretrained_folder
-from vehest.sources.base import CarValues
+from vehest.sources.base import car_of
 from vehest.trust.record import describe_band, is_other_vehicle, read_trust
 
 TABLE = {
@@ -122,16 +123,16 @@ def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
     )
 
     def values(config, *datasets):
-        settings = with_car_values(config, datasets)["estimator"]
+        settings = with_car_values(config, map(car_of, datasets))["estimator"]
         return settings["wheelbase"], settings["cg_to_rear_axle"]
 
     assert values(config, first) == (2.4, 1.1)
     assert values(config, first, second) == (2.4, None)
     assert values(config, first, other) == (None, None)
     given = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
-    assert with_car_values(given, [first]) is given
+    assert with_car_values(given, [car_of(first)]) is given
     without = {"estimator": {"name": "zero"}}
-    assert with_car_values(without, [first]) is without
+    assert with_car_values(without, [car_of(first)]) is without
 
 
 def test_the_steering_ratio_is_aligned_with_the_wheelbase_of_the_data_set(place):
@@ -215,3 +216,152 @@ def test_settings_are_refused_for_a_model_that_has_none_to_change(model):
     with pytest.raises(ConfigurationError, match="are for the self-calibrating filter"):
         adapted(model, None, CarValues(), {"wheelbase": 2.4})
     assert adapted(model, None, CarValues(wheelbase=2.4), {})[0] is model
+
+
+def test_the_python_functions_use_the_car_of_a_data_set_as_the_commands_do(place):
+    write_lap()
+    write_dataset("f1", car={"wheelbase": 0.33})
+    place.done("estimate", "lap.csv", "dataset=f1", "-o", "command.parquet")
+    expected = read_estimate(Path("command.parquet"))["vy"]
+    model = vehest.load_model("self_calibrating")
+    for overrides in (["dataset=f1"], ["dataset.car.wheelbase=0.33"]):
+        recording = vehest.read_recording("lap.csv", overrides)
+        assert recording.car == CarValues(wheelbase=0.33)
+        np.testing.assert_array_equal(vehest.estimate(model, recording)["vy"], expected)
+    assert model.settings.wheelbase == 2.7, "the caller's model stays as it is"
+    stepper = vehest.online(model, car=CarValues(wheelbase=0.33))
+    assert stepper.estimator.settings.wheelbase == 0.33
+    unknown = vehest.read_recording("lap.csv")
+    with pytest.warns(UserWarning, match="the wheelbase is assumed to be 2.7 m"):
+        assumed = vehest.estimate(model, unknown)["vy"]
+    assert np.abs(assumed - expected).max() > 0.05
+    with_reference = replace(unknown, car=CarValues(wheelbase=0.33))
+    small = vehest.score(model, [with_reference])
+    with pytest.warns(UserWarning, match="the wheelbase is assumed"):
+        large = vehest.score(model, [unknown])
+    assert small["rmse_sideslip"] != large["rmse_sideslip"]
+    with_car = replace(planar_drive(20.0, 100.0, seed=1), car=CarValues(2.4, 1500.0, 1.1))
+    trained = vehest.train("data_sheet", [with_car], [with_car])
+    assert (trained.settings.wheelbase, trained.settings.cg_to_rear_axle) == (2.4, 1.1)
+
+
+def test_compare_scores_a_small_car_by_the_wheelbase_of_its_data_set(place):
+    write_lap()
+    write_dataset("f1", car={"wheelbase": 0.33})
+    place.done("estimate", "lap.csv", "dataset=f1", "-o", "mine.parquet")
+
+    def min_speed(*words):
+        out, _ = place.done("compare", "lap.csv", "mine.parquet", *words, "--json")
+        return json.loads(out)["min_sideslip_speed"]
+
+    small = pytest.approx((0.33 / 2.7) ** 0.5)
+    assert min_speed() == 1.0
+    assert min_speed("dataset=f1") == small
+    assert min_speed("dataset.car.wheelbase=0.33") == small
+    assert min_speed("estimator.wheelbase=0.33") == small
+    code, _, err = place("compare", "lap.csv", "mine.parquet", "estimator.wheelbase=short")
+    assert code == 2
+    assert "estimator.wheelbase" in err
+
+
+def test_an_export_is_of_the_car_of_its_data_set(place):
+    write_dataset("f1", car={"wheelbase": 0.33})
+
+    def exported(*words):
+        _, err = place.done("export", "self_calibrating", "-o", "c", *words)
+        source = Path("c/vehest_method.c").read_text(encoding="utf-8")
+        vectors = Path("c/expected.csv").read_text(encoding="utf-8")
+        return source + vectors, err
+
+    of_dataset, said = exported("dataset=f1")
+    assert "wheelbase 0.33 m: of the data set" in said
+    assert of_dataset == exported("dataset.car.wheelbase=0.33")[0]
+    assert of_dataset == exported("estimator.wheelbase=0.33")[0]
+    default, said = exported()
+    assert of_dataset != default
+    assert "the wheelbase is assumed to be 2.7 m" in said
+
+
+def test_a_band_is_doubled_on_a_car_whose_values_are_others(place):
+    """Data sets without the car's name, as `vehest new` writes them: values of car decide."""
+    car = CarValues(wheelbase=2.7, mass=1500.0)
+    drives = [replace(planar_drive(30.0, 100.0, seed=seed, noise=0.02), car=car) for seed in (1, 2)]
+    drives = [replace(drive, vehicle="unknown") for drive in drives]
+    options = ("training.grid=1", "training.max_evaluations=5")
+    vehest.save_model(vehest.train("luenberger", drives[:1], drives[1:], options), "own")
+    write_lap(references=False)
+    for name, values in {
+        "same": {"wheelbase": 2.75, "mass": 1600},
+        "no_values": None,
+        "ratio_only": {"steering_ratio": 15},
+        "f1": {"wheelbase": 0.33},
+        "lorry": {"wheelbase": 2.7, "mass": 4000},
+    }.items():
+        write_dataset(name, **({"car": values} if values else {}))
+    write_dataset("named", car={"wheelbase": 0.33}, vehicle="my_f1")
+
+    def band(*words):
+        said = json.loads(place.done("estimate", "own", "lap.csv", *words, "--json")[0])
+        return said["band_sideslip_deg"]["median"], said["band"]
+
+    alone, basis = band("dataset=same")
+    assert "assumed to be of the same car, as neither names nor values of car differ" in basis
+    for name in ("no_values", "ratio_only"):
+        assert band(f"dataset={name}")[0] == alone
+    for name, difference in {
+        "f1": "wheelbase 0.33 m, not 2.7 m",
+        "lorry": "mass 4000 kg, not 1500 kg",
+        "named": "wheelbase 0.33 m, not 2.7 m",
+    }.items():
+        doubled, basis = band(f"dataset={name}")
+        assert doubled == pytest.approx(2.0 * alone, abs=1e-3)
+        assert f"another car ({difference}): band doubled" in basis
+        assert band(f"dataset={name}", "same_vehicle=true")[0] == alone
+    model = vehest.load_model("own")
+
+    def median(overrides, **options):
+        estimate = vehest.estimate(model, vehest.read_recording("lap.csv", overrides), **options)
+        return np.degrees(np.nanmedian(estimate["band_sideslip"]))
+
+    assert median(["dataset=same"]) == pytest.approx(alone, abs=1e-3)
+    assert median(["dataset=f1"]) == pytest.approx(2.0 * alone, abs=1e-3)
+    assert median(["dataset=f1"], same_vehicle=True) == pytest.approx(alone, abs=1e-3)
+
+    def exported(*words):
+        place.done("export", "own", "-o", "c", *words)
+        return Path("c/expected.csv").read_text(encoding="utf-8")
+
+    assert exported("dataset=f1") == exported("--elsewhere") != exported("dataset=same")
+    assert exported("dataset=same") == exported()
+
+
+def test_calibrations_keep_the_cars_of_their_data_sets(model, tmp_path):
+    """The values go into trust.yaml; one without them, of before, is read as before."""
+    vehest.save_model(model, tmp_path / "before")
+    assert "cars" not in (tmp_path / "before/trust.yaml").read_text(encoding="utf-8")
+    assert read_trust(tmp_path / "before").bands.cars == ()
+    drives = [
+        replace(planar_drive(30.0, 100.0, seed=seed, noise=0.02), car=CarValues(2.7, 1500.0))
+        for seed in (1, 2)
+    ]
+    with_car = vehest.train(
+        "luenberger", drives[:1], drives[1:], ("training.grid=1", "training.max_evaluations=5")
+    )
+    vehest.save_model(with_car, tmp_path / "after")
+    assert read_trust(tmp_path / "after").bands.cars == (CarValues(2.7, 1500.0),)
+
+
+@pytest.mark.parametrize(
+    ("car", "other", "difference"),
+    [
+        (CarValues(2.55), CarValues(2.647), ""),  # two sources on one Volvo V40
+        (CarValues(2.7), CarValues(2.9), "wheelbase 2.7 m, not 2.9 m"),
+        (CarValues(None, 2000.0), CarValues(2.7, 1500.0), "mass 2000 kg, not 1500 kg"),
+        (CarValues(2.7, 1800.0), CarValues(2.7, 1500.0), ""),
+        (CarValues(), CarValues(2.7, 1500.0), ""),
+    ],
+)
+def test_cars_differ_by_wheelbase_and_mass_beyond_what_sources_and_load_explain(
+    car, other, difference
+):
+    assert car.difference_to(other) == difference

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -133,7 +134,7 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     shutil.rmtree(next((place.folder / "outputs" / "train").glob("gru-*")))
     code, out, err = place("report", "small", "tracking=none", "--json")
     assert code == 0
-    assert "'vehest run pipelines/small.yaml' goes on with them" in err
+    assert "'vehest run small tracking=none' goes on with them" in err
     drawn = json.loads(out)
     assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger", "ksnn"}
     ((name, reason),) = drawn["failed"].items()
@@ -441,10 +442,46 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
     assert f"left out: gru-states_2-seed0: {NO_TIME}" in out
     told, err = place.done("report", "small", "tracking=none")
     assert told == out, "the same report"
-    assert "gru-states_2-seed0; 'vehest run pipelines/small.yaml' goes on with them" in err
+    assert "gru-states_2-seed0; 'vehest run small tracking=none' goes on with them" in err
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
     assert "GRU" in out
+
+
+def test_the_next_command_that_is_printed_finds_data_and_results_elsewhere(place, monkeypatch):
+    folder = place.folder / "my results"
+    monkeypatch.setenv("VEHEST_DATA", str(place.folder))
+    words = ["small", f"root='{place.folder}/raw'", f"output='{folder}'", "tracking=none"]
+
+    def printed_command(err):
+        (line,) = (line for line in err.splitlines() if "'vehest " in line)
+        command = line[line.index("vehest ") :]
+        for ending in ("' goes on with them", "' first"):
+            command = command.split(ending)[0]
+        return shlex.split(command)[1:]
+
+    code, _, err = place("report", *words)
+    assert code == 4
+    again = printed_command(err)
+    assert again == ["run", *words]
+    place.done(*again)
+    shutil.rmtree(next((folder / "train").glob("gru-*")))
+    _, err = place.done("report", *words)
+    assert printed_command(err) == ["run", *words]
+    place.done(*printed_command(err))
+    assert [file.name for file in folder.glob("train/gru-*")]
+    assert not (place.folder / "outputs").exists()
+
+
+def test_the_training_that_an_evaluation_asks_for_can_be_pasted(place):
+    words = ["estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=20"]
+    words += ["output=my results", "tracking=none"]
+    others = ["evaluation.rate_hz=10", "fault=frozen", "fault.channel=yaw_rate"]
+    _, line = place.refused("eval", *words, *others, code=4)
+    command = shlex.split(line[line.index("vehest ") : line.index("' first")])
+    assert command == ["vehest", "train", *words]
+    place.done(*command[1:])
+    place.done("eval", *words)
 
 
 def test_only_the_study_as_it_is_written_is_published(place):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from refusals import refusal
 
@@ -14,6 +15,7 @@ from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.data.store import write_estimate
 from vehest.run.compare_files import compare_estimates, compare_files, read_estimate_table
 from vehest.run.inspect_data import check
 
@@ -142,6 +144,61 @@ def test_an_unknown_unit_in_a_name_is_an_error_and_not_si(drive, tmp_path, name)
     )
 
 
+def _rewritten(file, change):
+    """Write an estimate of vehest anew with another description beside its table."""
+    table = pq.read_table(file)
+    described = table.schema.metadata[b"vehest"]
+    pq.write_table(table.replace_schema_metadata(change(described)), file)
+
+
+def _described_as(content):
+    return lambda text: {b"vehest": json.dumps({**json.loads(text), **content}).encode()}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: {b"vehest": text[:-3]}, "cannot be read as JSON"),
+        (lambda text: {b"vehest": b"[]"}, "is damaged (it is no mapping)"),
+        (_described_as({"content": "estimat"}), "names neither a recording nor an estimate"),
+        (_described_as({"rate_hz": "20"}), "rate_hz"),
+        (_described_as({"format": 99}), "format 99"),
+    ],
+)
+def test_an_estimate_with_a_damaged_description_is_no_table_of_another_tool(
+    drive, tmp_path, change, says
+):
+    file = _stored_estimate(drive, tmp_path)
+    _rewritten(file, change)
+    assert says in refusal(lambda: read_estimate_table(file, drive))
+
+
+def _stored_estimate(drive, folder):
+    vy = drive["vy_ref"] + 0.1
+    band = np.full(len(drive), 0.2)
+    channels = {"vy": vy, "sideslip": np.arctan2(vy, drive["vx"]), "band_vy": band}
+    estimate = Estimate(drive.id, "ksnn", drive.rate_hz, drive.start_time, channels)
+    file = folder / "mine.parquet"
+    write_estimate(estimate, file)
+    return file
+
+
+def test_an_estimate_without_its_description_is_read_with_a_warning(drive, tmp_path, capsys):
+    file = _stored_estimate(drive, tmp_path)
+    complete = read_estimate_table(file, drive)
+    assert capsys.readouterr().err == ""
+    _rewritten(file, lambda text: None)
+    without = read_estimate_table(file, drive)
+    assert "has columns of 'vehest estimate' (1 (band_vy)), but not its description" in (
+        capsys.readouterr().err
+    )
+    np.testing.assert_array_equal(without["vy"], complete["vy"])
+    plain = pq.read_table(file).select(["time", "vy"])
+    pq.write_table(plain, file)
+    read_estimate_table(file, drive)
+    assert capsys.readouterr().err == ""
+
+
 def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):
     estimates = {
         name: read_estimate_table(written(tmp_path, name, drive, size), drive)
@@ -210,9 +267,16 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
     )
     rows = {row["estimate"] for row in json.loads(out)["rows"]}
     assert rows == {"mine", "luenberger", "pretrained", "zero", "static_map"}
-    assert "learnt on this recording" not in err
-    _, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
-    assert "warning: 'luenberger' learnt on this recording: its row is no test" in err
+    assert "trained on this recording" not in err
+    out, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
+    assert "warning: 'luenberger' was trained on this recording: its row is no test" in err
+    assert "No estimator can be called best: 'luenberger' was trained on this recording." in out
+    trained_on = "'luenberger' was trained on this recording"
+    for recording, is_named in (("one", True), ("three", False)):
+        _, err = place.done(
+            "estimate", "luenberger", f"{raw}/{recording}.csv", "dataset=mine", "-o", "of.csv"
+        )
+        assert (trained_on in err) == is_named
     assert (
         place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1]
         == "error: name at least one estimate to compare"

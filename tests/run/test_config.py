@@ -11,6 +11,7 @@ from refusals import refusal
 
 from place import run_vehest
 from vehest.data.errors import ConfigurationError, MissingError
+from vehest.run import config
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices, packaged
 from vehest.run.setting_lines import config_as_commented_yaml
@@ -207,6 +208,25 @@ def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, 
     assert err.count("\n") == 1
     assert "mine" in {row["dataset"] for row in json.loads(out)}
     assert place("data", "show", "mine")[0] == 0
+
+
+def test_jobs_with_the_same_choices_share_what_is_composed_but_no_values(elsewhere, monkeypatch):
+    composed = []
+    compose = config.compose
+    monkeypatch.setattr(config, "compose", lambda *a, **k: composed.append(a) or compose(*a, **k))
+    split = elsewhere / "conf" / "split" / "mine.yaml"
+    split.parent.mkdir(parents=True)
+    split.write_text("name: first\n")
+    with_value = compose_config("train", ["split=mine", "training.patience=3", "+split.more=1"])
+    assert (with_value["training"]["patience"], with_value["split"]["more"]) == (3, 1)
+    default = compose_config("train", ["split=mine"])
+    assert (default["training"]["patience"], default["split"]) == (25, {"name": "first"})
+    assert len(composed) == 1
+    with_value["split"]["name"] = "changed"
+    assert compose_config("train", ["split=mine"]) == default
+    split.write_text("name: third\n")
+    assert compose_config("train", ["split=mine"])["split"] == {"name": "third"}
+    assert len(composed) == 2
 
 
 def test_references_of_an_override_are_bounded_too(elsewhere):

@@ -1,10 +1,14 @@
 """Recordings that take long to make are kept as soon as they are done; an ingest that was interrupted goes on with the rest."""
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from vehest.data.errors import DataError
+from vehest.run import ingest
+from vehest.run.ingest import _make_part
 from vehest.run.launchers.local import launch
 from vehest.sources.tabular import TabularSource
 
@@ -39,7 +43,8 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monke
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
         code, _, err = place("ingest", "mine")
-        assert (code, err.strip()) == (3, "error: 'three.csv' is unwell")
+        named = "error: data set 'mine', recording 'three': 'three.csv' is unwell"
+        assert (code, err.strip()) == (3, named)
         assert [
             folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")
         ] == []
@@ -75,3 +80,26 @@ def test_the_second_process_compiles_health_first(place, slow, monkeypatch):
     slow.clear()
     place("ingest", "mine", "--jobs", "1", "--force")
     assert slow == ["one", "three", "two"]
+
+
+def killed(dataset, recording_id, parts, *_):
+    """Make a recording as an ingest does, but be killed at two of the three."""
+    if recording_id != "two":
+        os.kill(os.getpid(), signal.SIGKILL)
+    _make_part(dataset, recording_id, parts)
+
+
+def test_killed_workers_are_named_by_their_recordings(place, slow, monkeypatch):
+    make_part = _make_part
+    with monkeypatch.context() as broken:
+        broken.setattr(ingest, "_make_part", killed)
+        code, _, err = place("ingest", "mine", "--jobs", "2")
+    assert code == 4
+    first, other = ("one", "three") if "recording 'one'" in err else ("three", "one")
+    assert (
+        f"error: data set 'mine', recording '{first}': a worker process was ended by SIGKILL" in err
+    )
+    assert err.strip().endswith(f"the same command goes on (and 1 more: '{other}')")
+    assert ingest._make_part is make_part
+    folder = Path(place.told("ingest", "mine", "--jobs", "1")["folder"])
+    assert len(list(folder.glob("*.parquet"))) == 3

@@ -10,6 +10,7 @@ from vehest.data.recording_summary import RecordingSummary
 from vehest.estimators.gru import Gru
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
+from vehest.run.keys import changed_keys
 from vehest.run.train import training_options
 
 STUDY = PIPELINE | {
@@ -114,3 +115,25 @@ def test_rate_that_is_left_out_is_lowered_to_that_of_the_recordings_too():
         lowered, notes = lower_rate(short, group, slow)
         assert lowered[group]["rate_hz"] == 10.0
         assert "10 Hz instead of" in notes[0][1]
+
+
+def test_published_keys_are_compared_by_cause_and_those_of_absent_raw_files_are_not():
+    recorded = {
+        "ingest mine": {"code": "ingest=1", "configuration": "a", "data": "d"},
+        "train gru": {"code": "train=1 gru=1", "configuration": "b"},
+        "train lstm": {"code": "train=1 lstm=1", "configuration": "c"},
+    }
+    today = {
+        "ingest mine": {"code": "ingest=1", "configuration": "a"},
+        "train gru": {"code": "train=1 gru=2", "configuration": "b2"},
+        "train ksnn": {"code": "train=1 ksnn=1", "configuration": "c"},
+    }
+    assert changed_keys(recorded, recorded) == []
+    assert changed_keys(recorded, today) == [
+        ("train gru", "code"),
+        ("train gru", "configuration"),
+        ("train ksnn added", "configuration"),
+        ("train lstm removed", "configuration"),
+    ]
+    with_other_data = recorded | {"ingest mine": recorded["ingest mine"] | {"data": "e"}}
+    assert changed_keys(recorded, with_other_data) == [("ingest mine", "data")]

@@ -54,7 +54,7 @@ def held(position):
 
 
 def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
-    said = log.typed("lap.csv", answers=["", "2.7", "1500", ""])
+    said = log.typed("lap.csv", answers=["", "2.7", "1500", "15"])
     for words in (
         "yaw_rate: column Gyro, deg/s: ay and vx·yaw_rate agree",
         "in a left turn, does column 'Gyro' count up?",
@@ -173,7 +173,7 @@ def test_json_says_all_of_it_to_a_script(log):
 
 
 def test_run_takes_what_was_written(log):
-    log.new("lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500")
+    log.new("lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500", "--steering-ratio", "15")
     code, _, err = log("run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
     planned = [

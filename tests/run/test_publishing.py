@@ -454,7 +454,6 @@ def test_the_list_of_stale_studies_only_shrinks():
         "heavy_ekf",
         "ksnn",
         "learned_ukf",
-        "learned_ukf_sim",
         "leave_one_out",
         "reference_minutes",
         "sim_to_real",
@@ -462,6 +461,10 @@ def test_the_list_of_stale_studies_only_shrinks():
     }
     results = Path(__file__).parents[2] / "results"
     entries = yaml.safe_load((results / "stale.yaml").read_text(encoding="utf-8"))
+    # Tables of other commands were not compared at all before they had records (`table_records`).
+    may_be_listed |= {"examples", "export", "own_car", "reliability", "unseen_car"}
+    # learned_ukf_sim ended with its pipeline: untrained, and learned_ukf is the same on real tyre sets.
+    assert not (results / "learned_ukf_sim").exists()
     assert set(entries) <= may_be_listed
     assert [name for name in may_be_listed if not (results / name / PROVENANCE).is_file()] == [], (
         "deleting a study does not end its entry"

@@ -1,12 +1,14 @@
 """A finished study is recognised by what it was made from, and prints what a run in full would print."""
 
+import json
 import os
 import subprocess
 import sys
 
 import pytest
 
-from vehest.run.run_cache import RunCache, stamp_of
+from vehest.data.files import stamp_of
+from vehest.run.run_cache import RunCache
 
 HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
 WORDS = ("small", "tracking=none")
@@ -104,6 +106,8 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
         changed(file, file.read_bytes() + b"\n# a comment\n")
     manifest = next((study.folder / "outputs" / "evaluate").glob("*/manifest.json"))
     changed(manifest, manifest.read_bytes().replace(b'"sha256": "', b'"sha256": "0', 1))
+    key = json.loads(manifest.read_bytes())["key"]
+    changed(manifest, manifest.read_bytes().replace(key.encode(), key[::-1].encode(), 1))
     estimate = next((study.folder / "outputs" / "evaluate").glob("*/test/0.parquet"))
     changed(estimate, b"")
     record = next((study.folder / "outputs" / "finished").glob("*.json"))
@@ -139,9 +143,9 @@ def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_ov
 def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
     (tmp_path / "again").symlink_to(tmp_path)  # walked once
     (tmp_path / "lap.csv").write_text("1")
-    before = stamp_of(str(tmp_path))
+    before = stamp_of(tmp_path)
     about = (tmp_path / "lap.csv").stat()
     (tmp_path / "new.csv").write_text("2")
     os.utime(tmp_path / "new.csv", ns=(about.st_atime_ns, about.st_mtime_ns))
     os.replace(tmp_path / "new.csv", tmp_path / "lap.csv")
-    assert stamp_of(str(tmp_path)) != before
+    assert stamp_of(tmp_path) != before

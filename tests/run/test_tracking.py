@@ -327,6 +327,17 @@ def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(
     assert not list(tmp_path.rglob("*.db*"))
 
 
+def test_a_store_that_links_to_itself_is_one_warning(tmp_path):
+    warnings = []
+    output = tmp_path / "outputs"
+    output.mkdir()
+    (output / "mlflow.db").symlink_to("mlflow.db")
+    Tracker({"name": "mlflow"}, output, warnings.append).log(_small_artefact(tmp_path / "model"))
+    [warning] = warnings
+    assert "going on without tracking" in warning
+    assert (output / "mlflow.db").is_symlink()
+
+
 def test_the_output_root_of_the_environment_may_have_quotes_a_newline_and_a_hash(
     place, monkeypatch
 ):

@@ -602,15 +602,18 @@ PLUGINS = {
 
 @pytest.fixture
 def plugins(tmp_path, monkeypatch):
-    """An installed package whose estimators and whose study fail in one way each."""
+    """An installed package whose estimators and whose study fail in one way each, but for the estimator `sound`."""
     info = tmp_path / "plugins" / "broken-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    points = "\n".join(f"{name} = {name}:Plugin" for name in PLUGINS)
+    modules = {name: code for name, (code, _) in PLUGINS.items()} | {
+        "sound": "class Plugin(Zero): name = 'sound'"
+    }
+    points = "\n".join(f"{name} = {name}:Plugin" for name in modules)
     (info / "entry_points.txt").write_text(
         f"[vehest.estimators]\n{points}\n[vehest.studies]\nbroken_study = broken_import\n"
     )
-    for name, (code, _) in PLUGINS.items():
+    for name, code in modules.items():
         code = f"from vehest.estimators.zero import ESTIMATOR as Zero\n{code}\n"
         (info.parent / f"{name}.py").write_text(code)
     monkeypatch.syspath_prepend(str(info.parent))
@@ -633,6 +636,22 @@ def test_plugins_that_fail_are_named_and_the_others_are_listed():
     assert loadable <= set(registry.estimator_classes())
     assert {"broken_import", "broken_class"}.isdisjoint(registry.estimator_classes())
     assert "ksnn" in exportable()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
+    place.add_steered()
+    logs = [f"raw/steered/{name}.csv" for name in ("first", "second")]
+    said, _ = place.done("new", "my_car", *logs, "--yes")
+    lacking = dict(
+        line.removeprefix("left out: ").split(": ", 1)
+        for line in said.splitlines()
+        if line.startswith("left out: ")
+    )
+    assert "is not there" not in said
+    assert lacking["sound"].startswith("there is no conf/estimator/sound.yaml; write one with")
+    for name in ("broken_constructor", "broken_property"):
+        assert f"of another package cannot be {PLUGINS[name][1]}" in lacking[name]
 
 
 @pytest.mark.usefixtures("plugins")
@@ -660,3 +679,32 @@ def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
     for command in ("run", "report"):
         place.refused(command, "odd", "tracking=none", code=2, says=said)
     place.done("data", "list")
+
+
+BAD_ESTIMATORS = {
+    "aliases": "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 7)),
+    "nameless": "rate_hz: 20\n",
+    "no_yaml": "{{: [",
+    "round": "defaults: [roundabout, _self_]\nname: zero\n",
+    "roundabout": "defaults: [round, _self_]\nname: zero\n",
+}
+
+
+def test_a_file_of_an_estimator_that_cannot_be_read_is_a_row_with_the_reason(tmp_path, monkeypatch):
+    folder = tmp_path / "conf" / "estimator"
+    folder.mkdir(parents=True)
+    for name, text in BAD_ESTIMATORS.items():
+        (folder / f"{name}.yaml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("vehest.run.usable.choices", lambda group: [*BAD_ESTIMATORS, "zero"])
+    monkeypatch.setattr("vehest.run.usable.estimator_names", lambda: ["zero"])
+    rows = all_usabilities([summary_of(planar_drive(20.0, 50.0))])
+    reasons = {row.estimator: row.to_give for row in rows if row.usable == "no"}
+    assert [row.estimator for row in rows] == [*BAD_ESTIMATORS, "zero"]
+    assert "zero" not in reasons
+    assert "aliases.yaml' nests deeper than 60 levels or holds more than" in reasons["aliases"]
+    assert reasons["nameless"] == "estimator.name is missing"
+    assert "no_yaml.yaml' cannot be read as YAML" in reasons["no_yaml"]
+    assert reasons["round"].startswith("the defaults of 'conf/estimator/round.yaml' and ")
+    assert "'conf/estimator/roundabout.yaml' lead back to themselves" in reasons["round"]

@@ -61,3 +61,15 @@ def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
     assert [
         path.name for path in file.parent.iterdir() if path.stat().st_size and path != file
     ] == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not limit memory")
+def test_of_what_was_unpacked_the_packed_size_counts_towards_memory(file, tmp_path):
+    unpacked = tmp_path / "unpacked.bin"
+    with open(unpacked, "wb") as stream:
+        stream.truncate(300_000_000)  # ten times as much would be enough for the reader
+    reader = "limited_readers:takes_memory"
+    with use_limits(Limits(memory=1_000_000_000)):
+        assert len(read_limited(reader, unpacked).arrays["vx"]) == 250_000_000
+        with pytest.raises(DataError, match="takes more than 1000 MB of memory"):
+            read_limited(reader, unpacked, packed=file)

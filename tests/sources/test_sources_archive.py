@@ -99,3 +99,14 @@ def test_an_archive_that_understates_its_size_is_refused(tmp_path):
         raw[at : at + 4] = (10).to_bytes(4, "little")
     file.write_bytes(raw)
     assert "not a sound zip archive" in refused(file)
+
+
+def test_entries_packed_by_a_method_whose_memory_an_entry_chooses_are_refused(tmp_path):
+    file = tmp_path / "bag.zip"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("data.db3", bytes(1000))
+    assert "by another method than deflate; unpack it by hand" in refused(file)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("data.db3", bytes(1000))
+    with unpacked(file) as folder:
+        assert (folder / "data.db3").read_bytes() == bytes(1000)

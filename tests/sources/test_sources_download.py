@@ -163,7 +163,10 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
     server.breaks = [4 * CHUNK, 0, 0, 0, 0, 0]
     message = refused(download(server, tmp_path))
     assert message.startswith(f"cannot fetch {server.url}/a.csv: ")
-    assert message.endswith("the same command goes on after what has arrived")
+    assert message.endswith(
+        "put the file into the data set's folder by hand; "
+        "when the server answers again, the same command goes on after what has arrived"
+    )
     assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[: 4 * CHUNK]
     assert not (tmp_path / CHECKSUMS).exists()
     server.breaks = []
@@ -247,9 +250,9 @@ def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one
     server.asked = []
     server.statuses = [503, 404]  # the first passes
     message = refused(download(server, tmp_path))
-    assert (
-        message
-        == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
+    assert message == (
+        f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; "
+        "correct download.url or put the file into the data set's folder by hand"
     )
     assert (len(server.asked), files(tmp_path)) == (2, {})
     (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
@@ -335,3 +338,26 @@ def test_ingest_fetches_what_is_missing_then_ingests(server, tmp_path, monkeypat
         assert [path for path, _, _ in server.asked] == ["/files/one.csv", "/files/two.csv"]
     (stored,) = (tmp_path / "outputs" / "ingest").glob("mine-*/two.parquet")
     assert read_recording(stored)["vx"][0] == 21.0
+
+
+def test_without_an_address_the_remedy_names_the_data_sets_that_have_one_past_a_bad_file(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "conf" / "dataset"
+    folder.mkdir(parents=True)
+    dataset = {"name": "mine", "source": "tabular", "path": "${root}", "rate_hz": 100}
+    address = {"url": "https://example.org/files", "files": ["one.csv"]}
+    (folder / "mine.yaml").write_text(yaml.safe_dump(dataset))
+    (folder / "other.yaml").write_text(
+        yaml.safe_dump(dataset | {"name": "other", "download": address})
+    )
+    (folder / "bad.yaml").write_text("{{: [")
+    monkeypatch.setattr("vehest.run.ingest.choices", lambda group: ["bad", "mine", "other"])
+    code, _, err = run_vehest(capsys, "ingest", "mine", "--download", "root=data", "output=outputs")
+    assert code == 2
+    (line,) = err.splitlines()
+    assert "'mine' does not say where its files can be fetched from" in line
+    assert line.endswith(
+        "put them into its folder by hand, or declare download in its file; data sets that do: other"
+    )

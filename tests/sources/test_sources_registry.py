@@ -8,6 +8,7 @@ import yaml
 from refusals import refusal
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config, missing_keys
 from vehest.run.ingest import plan_ingest
@@ -15,7 +16,6 @@ from vehest.simulation.fleet import SensorVariation, variations_from_config, var
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.simulation.sensors.levels import SensorLevels
 from vehest.sources.base import (
-    CarValues,
     car_of,
     kind_of,
     open_source,

@@ -17,6 +17,8 @@ from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.base import open_source
+from vehest.sources.limited import read_limited
+from vehest.sources.rosbag.topics import read_bag
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -393,6 +395,24 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
     data.unlink()
     np.testing.assert_array_equal(read(folder)["ax"], expected["ax"])
     assert "raise unpacked_limit" in refused(folder, unpacked_limit=1e-5)
+    zeros = zstd.compress(bytes(80 * 2**20))
+    data.with_name("lap.db3.zstd").write_bytes(zstd.compress(content) + zeros)
+    assert "would unpack to more than the limit of 0.0671 GB; unpack it by hand" in refused(folder)
+
+
+def test_the_packed_size_of_a_bag_counts_towards_memory(folder, monkeypatch):
+    sizes = []
+
+    def limited(reader, bag, *, packed, **request):
+        sizes.append((bag.name, packed))
+        return read_limited(reader, bag, packed=packed, **request)
+
+    monkeypatch.setattr("vehest.sources.rosbag.topics.read_limited", limited)
+    archive = Path(shutil.make_archive(str(folder / "packed"), "zip", folder, "lap"))
+    servo = ["/servo", "std_msgs/msg/Float64", ["data"]]
+    bag = read_bag(archive, "read_topics", topics=[servo], layouts=LAYOUTS)
+    assert len(bag.arrays["/servo.data"]) == len(drive()["/servo"].times)
+    assert sizes == [("lap", archive)]
 
 
 def test_a_misspelt_declaration_is_refused(bags):

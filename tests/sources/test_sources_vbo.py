@@ -9,6 +9,7 @@ from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
 from vehest.data.errors import DataError
 from vehest.sources.base import open_source
+from vehest.sources.clock_times import past_midnight
 from vehest.sources.surveys import survey
 from vehest.sources.vbo import read_log
 
@@ -144,3 +145,10 @@ def test_a_damaged_log_is_one_clear_line(tmp_path, old, new, message):
     said = refusal(lambda: read(tmp_path))
     assert "lap.vbo" in said
     assert re.search(message, said)
+
+
+def test_a_stray_time_of_day_is_no_midnight():
+    late = np.array([86_399.98, 86_399.99, 0.0, 0.01])
+    np.testing.assert_allclose(past_midnight(late), [86_399.98, 86_399.99, 86_400.0, 86_400.01])
+    stray = np.array([38_870.0, 86_399.99, 38_870.02, 38_870.03])
+    np.testing.assert_array_equal(past_midnight(stray), stray)

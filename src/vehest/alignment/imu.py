@@ -19,7 +19,12 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from vehest.alignment.motion import rms
-from vehest.alignment.settings import TILT_LAG_GAIN, AlignmentSettings
+from vehest.alignment.settings import (
+    LARGEST_CUTOFF,
+    SHORTEST_KERNEL,
+    TILT_LAG_GAIN,
+    AlignmentSettings,
+)
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.limits import check_limit
@@ -43,10 +48,6 @@ FEWEST_BLOCKS = 8
 LEAST_CORRELATION = 0.5
 LARGEST_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
 LARGEST_NOISE_SHARE = 0.05
-SHORTEST_KERNEL = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
-LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (
-    2.0 * math.pi * SHORTEST_KERNEL
-)  # of the sampling rate
 KERNEL_REACH = 6.0  # standard deviations
 N_ITERATIONS = 60
 SETTLED = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
@@ -196,7 +197,7 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
         level = np.zeros(len(recording))
         roll, pitch = (recording.channels.get(name, level) for name in ("roll", "pitch"))
         gravity = GRAVITY * (-np.sin(pitch) + 1j * np.sin(roll) * np.cos(pitch))
-    smoothing = smoothing_of(recording, settings.cutoff_hz)
+    smoothing = smoothing_of(recording, settings.cutoff_at(recording.rate_hz))
     lags = settings.max_delay * recording.rate_hz
     what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
     check_limit("filter_samples", lags, what, ConfigurationError)

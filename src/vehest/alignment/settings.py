@@ -13,6 +13,10 @@ TILT_LAG_GAIN = 0.005
 The body follows late, say 0.1 times 50 ms.
 """
 
+USUAL_CUTOFF = 2.0  # Hz
+SHORTEST_KERNEL = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
+LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (2.0 * math.pi * SHORTEST_KERNEL)  # of the rate
+
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "lever_arm": ("lever_x", "lever_y"),
     "mounting": ("yaw",),
@@ -28,7 +32,7 @@ class AlignmentSettings:
     """Quantities to estimate, and how. Raises `ConfigurationError`: nothing or something unknown is asked for, or a value is wrong."""
 
     estimate: tuple[str, ...]  # names in `QUANTITIES`
-    cutoff_hz: float = 2.0  # -3 dB frequency of the low-pass filter that both sides go through [Hz]
+    cutoff_hz: float | None = None  # of the low-pass that both sides go through [Hz]; `cutoff_at`
     max_delay: float = 0.5  # largest delay that is looked for, either way [s]
     tilt: float = 0.001  # standard deviation of roll and pitch beside those that follow the accelerations [rad]; 0: levelled
     wheelbase: float | None = None  # needed for the steering ratio [m]
@@ -53,6 +57,12 @@ class AlignmentSettings:
             raise ConfigurationError(
                 f"alignment: tilt must be zero or positive [rad], not {self.tilt}"
             )
+
+    def cutoff_at(self, rate_hz: float) -> float:
+        """-3 dB frequency of the low-pass [Hz]: as set, or 2 Hz, or what a rate below 23 Hz allows."""
+        if self.cutoff_hz is not None:
+            return self.cutoff_hz
+        return min(USUAL_CUTOFF, LARGEST_CUTOFF * rate_hz)
 
     @property
     def kinematic(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.text_files import first_line
 from vehest.sources.can import channel_values, channels_by_message, decoded, is_on, never_occurs
 from vehest.sources.can.logs import Frames
+from vehest.trust.clock import RESET_SECONDS, STOPPED, SampleClock
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0
@@ -140,18 +141,25 @@ class Replay:
         self.speed = bus.speed or 1.0
         self.begin = 0.0  # time of the clock on the wall at the first frame [s]
         self.last = self.first  # time of the last frame that was sent [s]
+        self.clock = SampleClock(1.0 / timing.periods[timing.clock])
         self.over = threading.Event()  # all frames were sent, or it was stopped
         self.failure: BaseException | None = None
 
     def run(
-        self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View
+        self,
+        make_stepper: Callable[[SampleClock | None], GuardedStepper],
+        out: Path | None,
+        view: View,
     ) -> Figures:
         """Estimate at the rate of the samples; the first stepper is for warming up.
 
+        ``make_stepper`` takes the clock that judges the stamps of frames; None in real time, where the
+        receiver's clock stamps them.
+
         Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
         """
-        names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
-        self.stepper = make_stepper()
+        names = warmed_up(make_stepper(None), self.timing.rate_hz, tuple(self.signals.wanted))
+        self.stepper = make_stepper(self.clock if self.bus.speed is None else None)
         self.view = view
         horizon = self.stepper.horizon_steps / self.stepper.estimator.settings.rate_hz
         self.ahead = horizon - self.stepper.delay - self.timing.offset
@@ -160,11 +168,8 @@ class Replay:
             closing(Output(out, names, self.frames.identifiers[0])) as self.output,
             _undisturbed(),
         ):
-            frames = (
-                frame
-                for frame in self.log
-                if frame.timestamp >= self.first and is_on(frame, self.signals.bus)
-            )
+            of_bus = (frame for frame in self.log if is_on(frame, self.signals.bus))
+            frames = dropwhile(lambda frame: frame.timestamp < self.first, of_bus)
             if self.bus.speed is None:
                 self._as_fast_as_possible(frames)
             else:
@@ -252,6 +257,8 @@ class Replay:
         message = self.signals.database.messages.get((frame.arbitration_id, frame.is_extended_id))
         if message is None or frame.is_error_frame or frame.is_remote_frame:
             return
+        if self.bus.speed is None and self.timing.clock in self.channels_of[message.name]:
+            self._judge_clock(stamp)
         self._advance(stamp)
         self.figures.frames_received += 1
         try:
@@ -265,18 +272,41 @@ class Replay:
             {name: value * self.signals.factors[name] for name, value in values.items()}, stamp
         )
 
+    def _judge_clock(self, stamp: float) -> None:
+        """Take the stamp [s] of a frame of the clock's channel; samples go on where it stands still or jumps.
+
+        Such frames come once a period, so that they count time while stamps stand still.
+        """
+        verdict = self.clock.missing_before(stamp)
+        if self.figures.samples == 0:
+            return
+        next_time = self.sampler.next_time
+        if verdict == STOPPED:
+            cycles = self.timing.periods[self.timing.clock] / self.sampler.cycle
+            for _ in range(max(round(cycles), 1)):
+                self._deal_with(self.sampler.sample())
+            self.sampler.next_time = next_time
+        elif stamp >= next_time + RESET_SECONDS:
+            self._advance(next_time + RESET_SECONDS)
+            self.sampler.skip_to(stamp)
+        elif stamp <= next_time - RESET_SECONDS:
+            self.sampler.skip_to(stamp)
+
     def _advance(self, now: float) -> None:
         """Deal with the samples whose instant lies before now [s]."""
         for sample in self.sampler.samples_before(now):
-            started = time.perf_counter()
-            self._estimate(sample)
-            took = (
-                time.perf_counter() - started
-                if self.bus.speed is None
-                else self._on_bus(time.time()) - sample.time
-            )
-            self._count(sample, took)
-            self.view.show(self.figures, self.stepper.last, sample.time - self.first)
+            self._deal_with(sample)
+
+    def _deal_with(self, sample: Sample) -> None:
+        started = time.perf_counter()
+        self._estimate(sample)
+        took = (
+            time.perf_counter() - started
+            if self.bus.speed is None
+            else self._on_bus(time.time()) - sample.time
+        )
+        self._count(sample, took)
+        self.view.show(self.figures, self.stepper.last, sample.time - self.first)
 
     def _estimate(self, sample: Sample) -> None:
         last = self.stepper.last

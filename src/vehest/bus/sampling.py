@@ -131,6 +131,11 @@ class Sampler:
         while self.next_time < now:
             yield self.sample()
 
+    def skip_to(self, stamp: float) -> None:
+        """Go on with the first instant after a stamp [s], whole cycles from the next one."""
+        cycles = math.ceil((stamp - self.next_time) / self.cycle)
+        self.next_time += cycles * self.cycle
+
     def sample(self) -> Sample:
         """The sample at ``next_time``, which moves on by a cycle."""
         time = self.next_time

@@ -86,6 +86,14 @@ def regular_file(path: Path) -> Path:
     return path
 
 
+def without_links(path: Path) -> Path:
+    """The absolute path behind all links; raises `DataError` where links lead to each other."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # the latter up to Python 3.12
+        raise DataError(f"cannot follow '{path}': its links lead to each other") from None
+
+
 def file_name(name: str, ending: str = "") -> str:
     """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
     at 100 bytes, and the start of its hash added."""
@@ -182,6 +190,31 @@ def sha256_of(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
+
+
+def stamp_of(*paths: Path) -> str:
+    """Hash of names, sizes, times and inodes of files and of all files below folders, but for compiled code; links are followed.
+
+    Times of inodes show files that were replaced by others of the same size and date.
+    """
+    files = {str(path) for path in paths}
+    visited: set[str] = set()
+    for path in paths:
+        for folder, folders, names in os.walk(path, followlinks=True):
+            if os.path.realpath(folder) in visited or folder.endswith("__pycache__"):
+                folders.clear()
+                continue
+            visited.add(os.path.realpath(folder))
+            files.update(os.path.join(folder, name) for name in names)
+    states = []
+    for file in sorted(files):
+        with suppress(OSError):  # a link to nothing
+            about = os.stat(file)
+            if not stat.S_ISDIR(about.st_mode):
+                states.append(
+                    (file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino)
+                )
+    return hashlib.sha256(repr(states).encode("utf-8", "surrogateescape")).hexdigest()
 
 
 @cache

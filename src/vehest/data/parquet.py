@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked
+from vehest.data.parquet_pages import largest_page
 from vehest.data.text_files import first_line
 
 DAMAGE = (
@@ -73,7 +74,8 @@ def number_batches(
     n_rows = file.metadata.num_rows
     done = 0
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
-    check_unpacked(path, path.stat().st_size, 8 * n_rows * len(names))
+    n_bytes = 8 * n_rows * len(names) + _bytes_of_pages(path, file, names)
+    check_unpacked(path, path.stat().st_size, n_bytes)
     for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(names), use_threads=False):
         done += batch.num_rows
         yield batch
@@ -81,6 +83,19 @@ def number_batches(
         raise DataError(
             f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again"
         )
+
+
+def _bytes_of_pages(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> int:
+    """Memory that one page of each column takes at a time [bytes]: the largest, unpacked."""
+    largest = dict.fromkeys(names, 0)
+    metadata = file.metadata
+    with open(path, "rb") as stream:
+        for group in map(metadata.row_group, range(metadata.num_row_groups)):
+            for column in map(group.column, range(group.num_columns)):
+                name = column.path_in_schema
+                if name in largest:
+                    largest[name] = max(largest[name], largest_page(stream, column))
+    return sum(largest.values())
 
 
 def read_numbers(

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 
@@ -42,6 +43,7 @@ class Recording:
     provenance: Mapping[str, Any] = field(
         default_factory=dict
     )  # where samples come from (JSON values only); not part of the data
+    car: CarValues = UNKNOWN_CAR  # values of its data set; a stored recording has none
 
     def __post_init__(self) -> None:
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:

@@ -98,12 +98,29 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 
 def is_stored_recording(path: Path) -> bool:
     """Whether ``path`` is a Parquet file that vehest wrote as a recording. Raises `DataError`: its description is damaged."""
+    return _content_of(path) == "recording"
+
+
+def is_stored_estimate(path: Path) -> bool:
+    """Whether ``path`` is a Parquet file that vehest wrote as an estimate. Raises `DataError`: its description is damaged."""
+    return _content_of(path) == "estimate"
+
+
+def _content_of(path: Path) -> str:
+    """What vehest wrote into a Parquet file: ``recording`` or ``estimate``; empty for a file of another tool, whatever it is."""
     try:
         with parquet_file(path) as file:
             schema = file.schema_arrow
     except (DataError, MissingError):
-        return False
-    return _metadata(schema, path).get("content") == "recording"
+        return ""  # the reader of tables says why
+    if _METADATA_KEY not in (schema.metadata or {}):
+        return ""
+    content = str(_metadata(schema, path).get("content"))
+    if content not in ("recording", "estimate"):
+        raise DataError(
+            f"'{path}': the description beside the table names neither a recording nor an estimate; make it again"
+        )
+    return content
 
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
@@ -257,4 +274,8 @@ def _metadata(schema: pa.Schema, path: Path) -> dict[str, Any]:
         (schema.metadata or {}).get(_METADATA_KEY, b"{}"),
         f"'{path}': the description beside the table",
     )
-    return described if isinstance(described, dict) else {}
+    if not isinstance(described, dict):
+        raise DataError(
+            f"'{path}': the description beside the table is damaged (it is no mapping); make it again"
+        )
+    return described

@@ -449,9 +449,9 @@ def require_shapes(
 
 
 def require_within_bounds(
-    values: Mapping[str, float], declarations: Mapping[str, Declaration]
+    values: Mapping[str, float], declarations: Mapping[str, Declaration], array: str = ""
 ) -> None:
-    """Raise `DataError` for a loaded number that its setting could not have; NaN is not checked."""
+    """Raise `DataError` for a loaded number, perhaps of an ``array``, that its setting could not have; NaN is not checked."""
     for name, value in values.items():
         problem = (
             declarations[name].problem(value)
@@ -459,7 +459,8 @@ def require_within_bounds(
             else ""
         )
         if problem:
-            raise DataError(f"'{name}' {problem}")
+            place = f" in '{array}'" if array else ""
+            raise DataError(f"'{name}'{place} {problem}")
 
 
 def require_positive(name: str, value: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.declared import setting
+from vehest.declared import UNSET, setting
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
@@ -34,14 +34,17 @@ class DataSheet(Recursive):
     ignores_initial_state = True
     template = "static"
     rate_hz: float = rate(20.0)
-    wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", least=0.05, most=20.0)
+    wheelbase: float = setting(UNSET, "wheelbase; has to be given", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(
-        None,
+        UNSET,
         "distance of the centre of gravity from the rear axle; null: half the wheelbase",
         unit="m",
     )
     cornering_coefficient: float = setting(
-        10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True
+        10.0,
+        "cornering stiffness of the rear axle over its load; assumed",
+        unit="1/rad",
+        positive=True,
     )
 
     def check(self) -> None:

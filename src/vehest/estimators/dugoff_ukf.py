@@ -19,7 +19,13 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial, require_shapes
+from vehest.estimators.base import (
+    FitData,
+    FitRecord,
+    Trial,
+    require_shapes,
+    require_within_bounds,
+)
 from vehest.estimators.filtering.dugoff_fit import fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.filtering.track_filter import (
@@ -183,7 +189,9 @@ class DugoffUkf(SigmaPointEstimator):
         "full",
         "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car",
     )
-    curve: Literal["plain", "smooth"] = setting("plain", "tyres of Eq. 9 (plain) or 10 (smooth)")
+    curve: Literal["plain", "smooth"] = setting(
+        "plain", "tyres of Eq. 9 (plain) or 10 (smooth), as in training through the filter"
+    )
     minimum_speed: float = setting(
         3.0,
         "speed below which wheels roll without slip, and nothing counts as measured",
@@ -202,8 +210,11 @@ class DugoffUkf(SigmaPointEstimator):
         "low-pass of f Hz",
         positive=True,
     )
-    noise: TrackLevels = setting(TrackLevels(), "levels of noise")
-    tyres: AxleTyres = setting(AxleTyres(), "of both axles")
+    noise: TrackLevels = setting(TrackLevels(), "standard deviations; null: found by the training")
+    tyres: AxleTyres = setting(
+        AxleTyres(),
+        "of both axles, all or none; null: identified on training recordings with a reference",
+    )
     car: LoadedCar = setting(
         BMW_545I, "BMW 545i of Bertipaglia et al. 2024; replace by your car's parameters"
     )
@@ -579,12 +590,18 @@ class DugoffUkf(SigmaPointEstimator):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take tyres and levels back."""
+        """Take tyres and levels back; raises `DataError`: they do not fit, or are out of their settings' bounds."""
         require_shapes(
             self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()}
         )
-        self.axle_tyres = np.array(weights["tyres"], dtype=np.float64)
-        self.levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
+        tyres = np.array(weights["tyres"], dtype=np.float64)
+        levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
+        require_within_bounds(
+            dict(zip(TYRES, tyres.tolist(), strict=True)), AxleTyres.declarations(), "tyres"
+        )
+        require_within_bounds(levels, TrackLevels.declarations(), "levels")
+        self.axle_tyres = tyres
+        self.levels = levels
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
         """``vy_ref`` where a level is searched, or tyres are identified without a sideslip angle."""

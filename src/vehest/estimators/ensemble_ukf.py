@@ -26,6 +26,7 @@ from vehest.training.sequences import PhaseSettings
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
 STARTS = ((-2.0, 2.0), (0.5, 1.5))
+ROUNDING = 1e-9  # by which a search may end beyond the box
 LEAST_SPREAD = 1e-12  # rad², of models that agree to the last digit
 MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
 
@@ -171,12 +172,17 @@ class EnsembleUkf(NetworkUkf):
         return {**super().weights(), "scaling": self.scaling.copy()}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back."""
+        """Take them back; raises `DataError`: they do not fit, or p₁ or p₂ is outside the box that is searched."""
         scaling = np.array(weights.get("scaling", ()), dtype=np.float64)
         if scaling.shape != (2,):
             raise DataError(
                 f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of another shape"
             )
+        for name, value, (low, high) in zip(("p1", "p2"), scaling.tolist(), BOX, strict=True):
+            if not low - ROUNDING <= value <= high + ROUNDING:
+                raise DataError(
+                    f"'{name}' in 'scaling' must lie between {low:g} and {high:g}, not at {value:g}"
+                )
         super().load_weights(
             {name: values for name, values in weights.items() if name != "scaling"}
         )

@@ -102,7 +102,8 @@ class KalmanFilter(SideslipFilter):
     )
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
     offsets: SensorOffsets = setting(
-        SensorOffsets(), "standard deviations of offsets that are states"
+        SensorOffsets(),
+        "standard deviations of offsets that are states; null: none, as in the paper",
     )
     initial_deviation: float = setting(
         100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True

@@ -6,7 +6,6 @@ The method is patented by its authors (PCT/IT2023/050058).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.declared import MAX_WIDTH, setting
-from vehest.estimators.base import Trial, largest_absolute, require_positive
+from vehest.estimators.base import Trial, largest_absolute
 from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator
 
@@ -90,11 +89,6 @@ class Ksnn(WindowedEstimator):
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of parameters, and of the buffer ``yaw_rate_max``."""
         return kernel.shapes_of(self.n_local, self.n_hidden, bias=self.bias) | {"yaw_rate_max": ()}
-
-    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the network back; raises `DataError`: it does not fit, or spans no yaw rate."""
-        super().load_weights(weights)
-        require_positive("yaw_rate_max", float(weights["yaw_rate_max"]))
 
     def fewest_weights(self) -> int:
         """All of `weight_shapes`."""

@@ -183,8 +183,12 @@ def _built(
         own = validated(kind.settings_type, dict(settings), f"'{path}'", group="settings")
         try:
             needed = kind(own).fewest_weights()
-        except (RuntimeError, NotImplementedError, TypeError, ValueError, OverflowError):
-            needed = 0  # building it needs values
+        except NotImplementedError:  # of torch, where building it needs values of tensors
+            needed = 0
+        except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+            raise DataError(
+                f"'{path}': no estimator can be built with these settings ({first_line(error)})"
+            ) from error
         if needed > n_weights:
             raise DataError(
                 f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its settings: they need {needed}"

@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from vehest.estimators.base import Estimator, FitData, FitRecord, require_shapes
+from vehest.estimators.base import (
+    Estimator,
+    FitData,
+    FitRecord,
+    require_positive,
+    require_shapes,
+)
 from vehest.training.context import FitContext
+
+SCALES = ("input_scale", "output_scale", "input_span", "unit", "yaw_rate_max")
+"""Buffers of networks by which inputs and outputs are scaled; every fit makes them positive."""
 
 
 class Network(Estimator):
@@ -93,10 +102,13 @@ class Network(Estimator):
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take parameters and ranges back, in the precision they were trained in.
 
-        Raises `DataError`: a name or shape does not fit the settings.
+        Raises `DataError`: a name or shape does not fit the settings, or a scale is not positive.
         """
         expected = self.weight_shapes()
         require_shapes(self, weights, expected)
+        for name, values in weights.items():
+            if name.rpartition(".")[2] in SCALES:
+                require_positive(name, float(values.min()))
         dtype = next(iter(weights.values())).dtype
         self._loaded = {name: np.array(weights[name], dtype=dtype) for name in expected}
         vars(self).pop("network", None)

@@ -17,8 +17,16 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.declared import LARGEST as LARGEST_SETTING
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial, rate, require_shapes
+from vehest.estimators.base import (
+    FitData,
+    FitRecord,
+    Trial,
+    rate,
+    require_shapes,
+    require_within_bounds,
+)
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import (
     NORMAL_95,
@@ -53,6 +61,7 @@ WITHIN = 3.0  # standard deviations at the start that tyre parameters may leave 
 FORCE_SCALE = 0.05  # of axle forces from accelerations, one standard deviation: scale of the accelerometer, and what it feels of body roll
 SLIP_OFFSET = math.radians(0.15)  # of slip angles by the reference, likewise: its mounting
 FRICTION_START = 0.1  # standard deviation of its logarithm
+ROUNDING = 1e-6  # of its largest entry, by which a covariance in a file may miss being one
 GIVEN_DEVIATION = 0.1  # of the logarithms of curves that nobody fitted
 BOXES = {
     "ay": (-1.0, 5.0),
@@ -159,8 +168,14 @@ class RationalFilter(SideslipFilter):
         unit="m/s²",
         least=0.0,
     )
-    noise: TrackNoise = setting(TrackNoise(), "levels of noise")
-    curves: AxleCurves = setting(AxleCurves(), "axle curves")
+    noise: TrackNoise = setting(
+        TrackNoise(),
+        "standard deviations, the first three all or none; null: found by the training",
+    )
+    curves: AxleCurves = setting(
+        AxleCurves(),
+        "of the axles at friction 1, all or none; null: fitted to the reference sideslip",
+    )
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -604,14 +619,27 @@ class RationalFilter(SideslipFilter):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take curves and levels back."""
+        """Take curves, their covariance and levels back.
+
+        Raises `DataError`: they do not fit, are out of their settings' bounds, or the covariance is none.
+        """
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
         curves = np.array(weights["curves"], dtype=np.float64)
+        covariance = np.array(weights["curve_covariance"], dtype=np.float64)
+        levels = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
+        by_name = dict(zip(CURVES, curves.tolist(), strict=True))
+        require_within_bounds(
+            {name: by_name[name] for name in self.curve_names}, AxleCurves.declarations(), "curves"
+        )
+        require_within_bounds(
+            {name: levels[name] for name in self.level_names}, TrackNoise.declarations(), "levels"
+        )
+        _require_covariance("curve_covariance", covariance)
         self.axle_curves = np.where(curves == 0.0, math.inf, curves)
-        self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)
-        self.values = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
+        self.curve_covariance = covariance
+        self.values = levels
 
     def c_values(self) -> dict[str, Any]:
         """Its car, curves, levels of noise and gate; raises `ConfigurationError`: its filter is unscented."""
@@ -673,6 +701,20 @@ def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording
             f"training.curves_from '{pattern}' matches no training recording ({known})"
         )
     return found
+
+
+def _require_covariance(name: str, values: FloatArray) -> None:
+    """Raise `DataError` for a loaded matrix that is no covariance: not symmetric, not positive semidefinite, or beyond any bound."""
+    largest = float(np.abs(values).max())
+    if not largest <= LARGEST_SETTING:
+        raise DataError(
+            f"'{name}' must hold numbers of at most {LARGEST_SETTING:g}, not {largest:g}"
+        )
+    if not np.allclose(values, values.T, rtol=0.0, atol=ROUNDING * largest):
+        raise DataError(f"'{name}' is no covariance: it is not symmetric")
+    lowest = float(np.linalg.eigvalsh(values)[0])
+    if lowest < -ROUNDING * largest:
+        raise DataError(f"'{name}' is no covariance: it has the eigenvalue {lowest:g}")
 
 
 def _covariances_of_logarithms(

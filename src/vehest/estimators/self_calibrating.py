@@ -14,7 +14,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.declared import setting
+from vehest.declared import UNSET, setting
 from vehest.estimators.base import rate, require_positive, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import c_tables, packed
@@ -63,7 +63,7 @@ class SelfCalibrating(Recursive):
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(
-        None,
+        UNSET,
         "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases",
         unit="m",
     )

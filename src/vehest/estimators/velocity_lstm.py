@@ -67,9 +67,10 @@ class VelocityLstm(RecurrentVelocityEstimator):
     title = "Velocity LSTM"
     trials = (TRIAL,)
     network_type = VelocityLstmNetwork
+    n_states: int = setting(64, "size of the hidden state; assumed", least=1, most=MAX_WIDTH)
     dropout: float = setting(
         0.075,
-        "share of the hidden state that is hidden from the dense layers in training",
+        "share of the hidden state that is hidden from the dense layers in training; assumed",
         least=0.0,
         below=1.0,
     )

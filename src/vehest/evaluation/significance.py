@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -14,6 +17,7 @@ from vehest.data.errors import DataError
 Pair = tuple[FloatArray, FloatArray]
 
 CONFIDENCE = 0.95
+MAX_BLOCKS = 100_000  # that a needed number of blocks is sought up to
 DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
 
@@ -154,6 +158,204 @@ def unexplained_interval(
     if not value > 0:
         return Interval(value, value, value, 1.0)
     return _logarithmic(value, fraction(drawn), len(sizes) - 1)
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A mean or a difference of means over blocks and seeds, with the parts of its variance.
+
+    Attributes
+    ----------
+    value : float
+        The mean or difference; a logarithm where ratios are compared.
+    parts : tuple of (float, float)
+        Variance of ``value`` and degrees of freedom of that variance: first what drawing other
+        blocks would change, then what training other seeds of each estimator would change.
+    n_blocks : int
+        Blocks that it rests on.
+
+    Source: Satterthwaite, An approximate distribution of estimates of variance components,
+    Biometrics Bulletin 2 (6), 1946, for the degrees of freedom of a sum of variances.
+    """
+
+    value: float
+    parts: tuple[tuple[float, float], ...]
+    n_blocks: int
+
+    @property
+    def error(self) -> float:
+        """Standard error."""
+        return math.sqrt(sum(variance for variance, _ in self.parts))
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of Student's t."""
+        spread = sum(variance**2 / free for variance, free in self.parts)
+        total = sum(variance for variance, _ in self.parts)
+        if spread == 0:
+            return float(self.parts[0][1])
+        # below 1 by chance where the seeds' variance is small: two seeds alone have 1
+        return max(total**2 / spread, 1.0)
+
+    def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Both ends of the interval."""
+        half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
+        return self.value - half, self.value + half
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided, of the hypothesis that ``value`` is zero."""
+        if self.error == 0:
+            return 0.0 if self.value else 1.0
+        return 2.0 * float(scipy.special.stdtr(self.dof, -abs(self.value) / self.error))
+
+    def power(self, true_value: float, level: float = 1.0 - CONFIDENCE) -> float:
+        """Probability that the two-sided test at ``level`` finds ``true_value``, on its side.
+
+        From the noncentral t distribution (Johnson, Kotz & Balakrishnan, Continuous univariate
+        distributions 2, 1995, chapter 31).
+        """
+        if self.error == 0:
+            return 1.0
+        critical = float(scipy.special.stdtrit(self.dof, 1.0 - level / 2.0))
+        noncentrality = abs(true_value) / self.error
+        return 1.0 - float(scipy.special.nctdtr(self.dof, noncentrality, critical))
+
+    def with_blocks(self, n_blocks: int) -> Contrast:
+        """The same contrast as it would be with ``n_blocks`` blocks of this kind."""
+        (variance, _), *of_seeds = self.parts
+        of_blocks = (variance * self.n_blocks / n_blocks, n_blocks - 1.0)
+        return Contrast(self.value, (of_blocks, *of_seeds), n_blocks)
+
+    def blocks_needed(
+        self, true_value: float, power: float, level: float = 1.0 - CONFIDENCE
+    ) -> int | None:
+        """Fewest blocks with which the test at ``level`` finds ``true_value`` with ``power``.
+
+        Returns
+        -------
+        int or None
+            None where `MAX_BLOCKS` do not suffice: then the seeds' variance limits the power.
+        """
+
+        def suffices(n_blocks: int) -> bool:
+            return self.with_blocks(n_blocks).power(true_value, level) >= power
+
+        # by doubling, since with many blocks the seeds' few degrees of freedom can lower the power
+        enough = 2
+        while not suffices(enough):
+            enough *= 2
+            if enough > MAX_BLOCKS:
+                return None
+        too_few = enough // 2
+        while enough - too_few > 1:
+            middle = (too_few + enough) // 2
+            too_few, enough = (too_few, middle) if suffices(middle) else (middle, enough)
+        return enough
+
+
+def mean_contrast(
+    first: FloatArray, second: FloatArray | None = None, *, has_paired_seeds: bool = False
+) -> Contrast:
+    """Mean over blocks and seeds, or the difference of two such means over the same blocks.
+
+    Values of seed s and block b are mu + a_s + b_b + e_sb. The variance of the mean over blocks has
+    the parts of b and e in it, that of the mean over seeds the parts of a and e: the latter is
+    reduced by the mean square of e, so that e is not counted twice.
+
+    Parameters
+    ----------
+    first, second : array, shape (S, B) and (S', B)
+        A value of each seed and block; all blocks count alike.
+    has_paired_seeds : bool
+        The two are the same trainings, row by row; otherwise their seeds are independent. Seeds
+        of an estimator with one seed are taken to have all the same outcome.
+
+    Raises
+    ------
+    DataError
+        There are fewer than two blocks.
+
+    Source: Scheffé, The analysis of variance, 1959, section 7.4 (two crossed random factors);
+    Student's t for one seed.
+    """
+    n_blocks = first.shape[1]
+    if n_blocks < 2:
+        raise DataError(f"there are {n_blocks} blocks, a variance needs at least two")
+    sides = [first]
+    if second is not None:
+        sides = [first - second] if has_paired_seeds else [first, -second]
+    of_blocks = np.sum([side.mean(axis=0) for side in sides], axis=0)
+    parts = [(float(of_blocks.var(ddof=1)) / n_blocks, n_blocks - 1.0)]
+    parts += [part for side in sides for part in _variance_of_seeds(side)]
+    return Contrast(float(of_blocks.mean()), tuple(parts), n_blocks)
+
+
+def log_ratio_of_pooled(
+    first: FloatArray,
+    second: FloatArray,
+    *,
+    has_paired_seeds: bool = False,
+    n_resamples: int = 4000,
+) -> Contrast:
+    """Logarithm of the ratio of two sums over blocks, each the mean over its seeds.
+
+    Blocks and seeds are drawn as in `differences_of_blocks`; the resamples give the standard
+    error, and the mean's influences of blocks and seeds its parts. With samples in each block, (1, B), in
+    place of ``second`` it is the logarithm of a mean loss.
+
+    Parameters
+    ----------
+    first, second : array, shape (S, B) and (S', B)
+        Sum of the losses of each seed over each block; their totals are above zero.
+    has_paired_seeds : bool
+        The two are the same trainings, row by row.
+
+    Source: Künsch 1989, Rao & Wu 1988, as in `differences_of_blocks`.
+    """
+    generator = np.random.default_rng(1)
+    counts = _counts_of_ratios(first.shape[1], n_resamples)
+    drawn = np.zeros(n_resamples)
+    rows: NDArray[np.int64] | None = None
+    for sign, side in ((1.0, first), (-1.0, second)):
+        if rows is None or not has_paired_seeds:
+            rows = generator.integers(len(side), size=(n_resamples, max(len(side) - 1, 1)))
+        with np.errstate(divide="ignore"):
+            drawn += sign * np.log(np.take_along_axis(counts @ side.T, rows, axis=1).mean(axis=1))
+    variance = float(np.var(drawn[np.isfinite(drawn)]))
+    totals = [float(side.sum(axis=1).mean()) for side in (first, second)]
+    influences = mean_contrast(
+        *(
+            side * first.shape[1] / total
+            for side, total in zip((first, second), totals, strict=True)
+        ),
+        has_paired_seeds=has_paired_seeds,
+    )
+    scale = variance / influences.error**2 if influences.error > 0 else 0.0
+    parts = tuple((scale * part, free) for part, free in influences.parts)
+    return Contrast(math.log(totals[0] / totals[1]), parts, first.shape[1])
+
+
+@lru_cache(maxsize=4)
+def _counts_of_ratios(n_blocks: int, n: int) -> FloatArray:
+    """`_counts`, which are the same for all ratios over as many blocks and take longer than the rest."""
+    return _counts(n_blocks, n, np.random.default_rng(0))
+
+
+def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
+    """Variance of the mean of (S, B) by its seeds beyond that by single values, and its degrees of freedom."""
+    n_seeds, n_blocks = values.shape
+    if n_seeds < 2:
+        return []
+    of_seeds = values.mean(axis=1)
+    residuals = values - of_seeds[:, None] - values.mean(axis=0) + values.mean()
+    n_free = (n_seeds - 1.0) * (n_blocks - 1.0)
+    total = float(of_seeds.var(ddof=1)) / n_seeds
+    single = float(np.sum(np.square(residuals))) / n_free / (n_seeds * n_blocks)
+    if total <= single:
+        return []
+    spread = total**2 / (n_seeds - 1.0) + single**2 / n_free
+    return [(total - single, (total - single) ** 2 / spread)]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -82,7 +82,7 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "rate_hz": drive.rate_hz,
         "duration": drive.duration,
         "estimated": alignment.settings.estimate,
-        "cutoff_hz": alignment.settings.cutoff_hz,
+        "cutoff_hz": alignment.settings.cutoff_at(drive.rate_hz),
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
             {"channel": one.channel, "unit": one.unit}
@@ -171,9 +171,10 @@ def _report(alignment: Alignment) -> str:
     from vehest.report.document import as_text
 
     shown = in_words(alignment, None)[:-1]  # without the override, which stands below
+    cutoff_hz = alignment.settings.cutoff_at(alignment.recording.rate_hz)
     parts = [
         f"# Alignment of {as_text(alignment.recording.id)}",
-        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {alignment.settings.cutoff_hz:g} Hz.",
+        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {cutoff_hz:.3g} Hz.",
         *(as_text(one) if isinstance(one, str) else _markdown(one) for one in shown),
         "Transforms that would correct it, in this order, for `downsample`:",
         f"```yaml\n{_transforms(alignment).rstrip()}\n```",

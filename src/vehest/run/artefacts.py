@@ -1,6 +1,6 @@
 """Artefacts: one folder a stage, with a manifest; a folder is complete, or it does not exist.
 
-StagePlan -> `find`, or `make` under its lock -> Artefact
+StagePlan -> `find`, or `make` under its lock -> Artefact; folder, key -> `valid_artefact` -> Artefact or none
 
 The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration (`keys`), the
 digests of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
@@ -141,15 +141,30 @@ class Manifest:
 
 
 def find(plan: StagePlan, warn: Callable[[str], None] = lambda text: None) -> Artefact | None:
-    """The complete artefact of a plan; none where it is missing, damaged (which ``warn`` is told), interrupted or another's."""
+    """The artefact of a plan, as `valid_artefact`."""
+    return valid_artefact(plan.folder, plan.key, warn)
+
+
+def valid_artefact(
+    folder: Path,
+    key: str,
+    warn: Callable[[str], None] = lambda text: None,
+    *,
+    hash_files: bool = True,
+) -> Artefact | None:
+    """The artefact of a folder, if it is valid for a key; there is no other check of that.
+
+    None where it is missing, damaged (which ``warn`` is told), interrupted or of another key. ``hash_files`` is that of
+    `read_artefact`.
+    """
     try:
-        artefact = read_artefact(plan.folder)
+        artefact = read_artefact(folder, hash_files=hash_files)
     except MissingError:
         return None
     except DataError as error:
         warn(f"damaged, and not used: {error}")
         return None
-    return artefact if artefact.key == plan.key and artefact.status == "complete" else None
+    return artefact if artefact.key == key and artefact.status == "complete" else None
 
 
 def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
@@ -168,18 +183,7 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
         The manifest is damaged, or a file differs from it.
     """
     path = folder / MANIFEST
-    try:
-        content = read_json(path)
-    except MissingError:
-        raise MissingError(
-            f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it"
-        ) from None
-    if not isinstance(content, dict):
-        raise DataError(
-            f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again"
-        )
-    check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
-    manifest = validated(Manifest, content, f"'{path}'")
+    manifest = read_manifest(folder)
     files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
     for name, output in manifest.outputs.items():
         if files.get(name) != output.bytes:
@@ -193,6 +197,23 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
             )
     outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
     return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """What the manifest of a stage's folder says, its files not looked at; raises as `read_artefact`."""
+    path = folder / MANIFEST
+    try:
+        content = read_json(path)
+    except MissingError:
+        raise MissingError(
+            f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it"
+        ) from None
+    if not isinstance(content, dict):
+        raise DataError(
+            f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again"
+        )
+    check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
+    return validated(Manifest, content, f"'{path}'")
 
 
 def _digest_of(path: Path, stat: os.stat_result) -> str:

@@ -10,14 +10,16 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import DataError, VehestError
+from vehest.data.files import file_name
 from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
@@ -29,7 +31,7 @@ from vehest.estimators.model_files import (
     model_digest,
     read_description,
 )
-from vehest.run.artefacts import Artefact, StagePlan, read_artefact
+from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, read_artefact, read_manifest
 from vehest.run.train import file_digest, recording_file
 from vehest.run.versions import code_of
 from vehest.trust.bands import Piece, band_inputs, calibrated
@@ -43,9 +45,16 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 
 def plan_calibrate(
-    model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path
+    model: Artefact,
+    split: Split,
+    data: Mapping[str, Artefact],
+    output: Path,
+    cars: Mapping[str, CarValues],
 ) -> tuple[StagePlan, Callable[[Path], None]] | None:
-    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range."""
+    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range.
+
+    ``cars`` are values of the cars of data sets.
+    """
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
@@ -55,19 +64,33 @@ def plan_calibrate(
         for own in spans.values()
         for span in own
     }
-    config = {role: [str(span) for span in own] for role, own in spans.items()}
+    config: dict[str, Any] = {role: [str(span) for span in own] for role, own in spans.items()}
+    calibrated_cars = {
+        name: asdict(cars[name])
+        for name in sorted({span.dataset for span in split.validation})
+        if cars.get(name, UNKNOWN_CAR) != UNKNOWN_CAR
+    }
+    if calibrated_cars:
+        config["cars"] = calibrated_cars
     code = code_of(STAGE, read_description(model.folder).estimator)
-    plan = StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output)
-    return plan, partial(_write, model.folder, split, data)
+    plan = StagePlan(STAGE, _label(model), config, inputs, code, output)
+    return plan, partial(_write, model.folder, split, data, cars)
 
 
-def _write(model_folder: Path, split: Split, data: Mapping[str, Artefact], folder: Path) -> None:
+def _write(
+    model_folder: Path,
+    split: Split,
+    data: Mapping[str, Artefact],
+    cars: Mapping[str, CarValues],
+    folder: Path,
+) -> None:
     """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
 
     def stretch(span: Span) -> Stretch:
         recording = read_recording(recording_file(data[span.dataset], span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
+        recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))
         return Stretch(
             recording, max(span.start, recording.start_time), span.dataset, span.describe()
         )
@@ -122,6 +145,13 @@ def learn_trust(
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
             horizon_steps=estimator.horizon_steps,
+            cars=tuple(
+                dict.fromkeys(
+                    stretch.recording.car
+                    for stretch in validation
+                    if stretch.recording.car != UNKNOWN_CAR
+                )
+            ),
         )
     except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))
@@ -209,18 +239,37 @@ def trust_of(
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
     """The calibration of a model in its own output root or in another; the newest of several.
 
-    Raises `DataError`: it was changed after it was made.
+    Raises `DataError`: the model or a calibration of it is damaged or was changed after it was made; also one whose manifest cannot be
+    read, where its folder has the model's name.
     """
-    found = []
-    with suppress(VehestError):
-        digest = read_artefact(model_folder, hash_files=False).digest
-        roots = {model_folder.resolve().parent.parent, output.resolve()}
-        for folder in sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")}):
-            with suppress(VehestError):
-                artefact = read_artefact(folder, hash_files=False)
-                if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
-                    found.append(artefact)
+    if not os.path.lexists(model_folder / MANIFEST):
+        return None  # a model that was saved from Python, which no calibration names
+    model = read_artefact(model_folder, hash_files=False)
+    roots = {model_folder.resolve().parent.parent, output.resolve()}
+    folders = sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")})
+    calibrations = [folder for folder in folders if _calibrates(folder, model)]
     newest = max(
-        found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None
+        map(read_artefact, calibrations),
+        key=lambda artefact: str(artefact.provenance.get("created", "")),
+        default=None,
     )
-    return None if newest is None else read_artefact(newest.folder)
+    return newest
+
+
+def _calibrates(folder: Path, model: Artefact) -> bool:
+    """Whether a folder holds the calibration of a model; raises `DataError` where its manifest is damaged and its name is the model's."""
+    try:
+        manifest = read_manifest(folder)
+    except VehestError as error:
+        if not folder.name.startswith(file_name(_label(model), "-")):
+            return False  # of another model
+        raise DataError(
+            f"'{folder}' may be the calibration of this model, and cannot be read ({error}); "
+            f"remove the folder, and the stage '{STAGE}' makes it again"
+        ) from None
+    return manifest.stage == STAGE and manifest.inputs.get("model") == model.digest
+
+
+def _label(model: Artefact) -> str:
+    """Start of the name of a model's calibration."""
+    return f"{model.label}-trust"

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
 from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
-from vehest.sources.base import CarValues, car_of
 from vehest.trust.record import Trust
 
 FORMAT = 1
@@ -28,6 +28,8 @@ LIMITS = {
     "grip": (1.0, 60.0),
 }
 """Beyond which a number is not one of a car."""
+ASSUMED = "the wheelbase is assumed to be"
+"""Beginning of the remark that no wheelbase was given."""
 CAR_SETTINGS = {"wheelbase": "m", "cg_to_rear_axle": "m"}
 """Settings of the self-calibrating filter that are values of the car -> unit."""
 Positive = Annotated[float, Field(gt=0.0)]
@@ -129,7 +131,7 @@ def adapted(
         has_wheelbase = record is not None or "wheelbase" in {*settings, *taken}
         if not has_wheelbase and not _is_changed(model, "wheelbase"):
             remarks.append(
-                f"the wheelbase is assumed to be {model.wheelbase:g} m; give your car's, such as "
+                f"{ASSUMED} {model.wheelbase:g} m; give your car's, such as "
                 "estimator.wheelbase=2.9, or car: {wheelbase: 2.9} in conf/dataset/NAME.yaml"
             )
     if record is not None:
@@ -141,21 +143,19 @@ def adapted(
     return model, trust, remarks
 
 
-def with_car_values(
-    config: dict[str, Any], datasets: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """The configuration of a training in which a wheelbase of null is that of its data sets' one car, as is the centre of gravity.
+def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[str, Any]:
+    """The configuration of a training in which a wheelbase of null is that of its recordings' one car, as is the centre of gravity.
 
-    Settings with values stay, and so do all where the data sets have no wheelbase or different ones.
+    Settings with values stay, and so do all where the cars have no wheelbase or different ones.
     """
     settings = config["estimator"]
     if settings.get("wheelbase", 0.0) is not None:
         return config
-    cars = {car_of(dataset) for dataset in datasets}
-    if len({car.wheelbase for car in cars}) != 1:
+    different_cars = set(cars)
+    if len({car.wheelbase for car in different_cars}) != 1:
         return config
-    car = cars.pop()
-    if cars:  # of one wheelbase, with different centres of gravity
+    car = different_cars.pop()
+    if different_cars:  # of one wheelbase, with different centres of gravity
         car = CarValues(car.wheelbase)
     values = {name: getattr(car, name) for name in CAR_SETTINGS if settings.get(name, 0.0) is None}
     return {**config, "estimator": {**settings, **values}}

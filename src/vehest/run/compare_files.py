@@ -16,13 +16,14 @@ import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.car import CarValues
+from vehest.data.errors import ConfigurationError, DataError, listed, printable
 from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
+from vehest.data.schema import validated
 from vehest.data.splits import Span
-from vehest.data.store import read_estimate
-from vehest.estimators.model_files import read_description
+from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
@@ -34,12 +35,14 @@ from vehest.run.downsample import resampled
 from vehest.run.estimate import (
     estimate_recording,
     finding_in_words,
+    is_training_recording,
     open_model,
     same_vehicle_from_config,
     split_settings,
 )
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
-from vehest.sources.base import car_of, read_single
+from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
+from vehest.sources.base import read_single
 from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
@@ -59,10 +62,10 @@ SPELLINGS = {
     },
 }
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
+OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
+"""Columns that estimates of vehest have, and those of other tools do not."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-CHECKS_OF_ESTIMATES = ("impossible", "sign", "unit", "stuck")
-"""What concerns how an estimate was written; that it departs from the kinematics is for its score to say."""
 LEAST_SECONDS = 5.0
 LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
@@ -78,8 +81,8 @@ def compare_files(
     files = [Path(word) for word in words if is_file_name(word)]
     settings, overrides = split_settings([word for word in words if not is_file_name(word)])
     config = compose_config("estimate", overrides)
-    car = car_of(config["dataset"])
     notes: list[str] = []
+    trained_here: list[str] = []
     with use_limits(limits_from_config(config["limits"])):
         drive = read_single(config["dataset"], recording)
         findings = [
@@ -98,18 +101,27 @@ def compare_files(
             )
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
-            model, trust, remarks = adapted(model, trust, car, settings)
+            model, trust, remarks = adapted(model, trust, drive.car, settings)
             notes += [f"'{name}': {remark}" for remark in remarks]
-            about = read_description(folder).about
-            if any(
-                span.startswith((f"{drive.id} [", f"{drive.id} ("))
-                for span in (*about.trained_on, *about.validated_on)
-            ):
-                complain(f"warning: '{name}' learnt on this recording: its row is no test")
+            if is_training_recording(folder, drive.id):
+                trained_here.append(f"'{name}'")
+                complain(f"warning: '{name}' was trained on this recording: its row is no test")
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, same_vehicle_from_config(config)
             )
-        found = compare_estimates(drive, estimates, car.wheelbase)
+        wheelbase = drive.car.wheelbase
+        if "wheelbase" in settings:
+            of_command = {"wheelbase": settings["wheelbase"]}
+            wheelbase = validated(
+                CarValues, of_command, "", error=ConfigurationError, group="estimator"
+            ).wheelbase
+        found = compare_estimates(drive, estimates, wheelbase)
+    if trained_here:
+        found["verdict"] = (
+            f"No estimator can be called best: {listed(trained_here)} "
+            f"{'was' if len(trained_here) == 1 else 'were'} trained on this recording. "
+            "Compare on another one."
+        )
     for text in notes:
         note(text)
     cells = [
@@ -117,9 +129,7 @@ def compare_files(
         for row in found["rows"]
     ]
     scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
-    of_wheelbase = (
-        "wheelbase not known" if car.wheelbase is None else f"wheelbase {car.wheelbase:g} m"
-    )
+    of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
         f", sideslip from {found['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
         f"{100 * found['share_below_min_speed']:.1f} % of the samples"
@@ -138,10 +148,14 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     is a `DataError`. Where only β is there, v = u tan β with the recording's u. Prints a warning where unit or sign contradict the
     recording.
     """
-    if file.suffix == ".parquet":
-        with suppress(DataError):  # a table of another tool
-            return read_estimate(file)
+    if file.suffix == ".parquet" and is_stored_estimate(file):
+        return read_estimate(file)
     names = column_names(file)
+    if file.suffix == ".parquet" and OF_VEHEST.intersection(names):
+        complain(
+            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            "description: another program has written it anew; it is read like another tool's table"
+        )
     found: dict[str, dict[str, str]] = {}
     for quantity, spellings in SPELLINGS.items():
         for name in names:
@@ -203,7 +217,7 @@ def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recordin
         concerns = finding.channel == channel or (
             not finding.channel and channel in finding.message
         )
-        if concerns and finding.check in CHECKS_OF_ESTIMATES:
+        if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
             complain(
                 f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
             )

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording_summary import RecordingSummary
 from vehest.data.splits import Split
@@ -21,6 +22,7 @@ from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
 from vehest.run.group import Group, Member
+from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
@@ -50,6 +52,7 @@ class Comparison:
     ] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
+    cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
     found: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
@@ -90,8 +93,10 @@ class Comparison:
         try:
             split = runner.split(usable[0].config)
             contents = runner.contents(usable[0].config)
+            runner.warn_of_references(split, usable[0].config)
+            self.cars = runner.cars(usable[0].config, split.datasets)
             for job in usable:
-                job.config = with_car_values(job.config, runner.datasets_of(job.config))
+                job.config = with_car_values(job.config, self.cars.values())
             notes = dict.fromkeys(
                 note for job in usable for note in _fit_to_recordings(job, split, contents)
             )
@@ -119,7 +124,10 @@ class Comparison:
             reasons = "; ".join(
                 dict.fromkeys(job.failure.message for job in usable if job.failure is not None)
             )
-            known = ", ".join(f"'vehest data usable {name}'" for name in split.datasets)
+            location = location_of_config(usable[0].config)
+            known = ", ".join(
+                f"'{command_line('data usable', [name, *location])}'" for name in split.datasets
+            )
             raise DataError(
                 f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
                 f"{known} shows what each estimator needs"
@@ -161,6 +169,7 @@ class Comparison:
                 replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None,
                 force,
                 label,
+                self.cars,
             )
             for (_, faults, label), own in groups.items()
         ]

@@ -11,14 +11,16 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import ConfigSearchPath
@@ -28,10 +30,11 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import Container, OmegaConf
+from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
+from vehest.data.files import stamp_of
 from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import check_yaml_size, first_line, read_text
@@ -108,6 +111,8 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
 class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
     """The files of ./conf: each is read within the limits on text and values before OmegaConf copies what its aliases repeat."""
 
+    with_defaults: ClassVar[list[Path]] = []  # files with a list of defaults, in their order
+
     @staticmethod
     def scheme() -> str:
         return LOCAL_SCHEME
@@ -115,7 +120,10 @@ class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(os.path.relpath(self.path), self._normalize_file_name(config_path))
         check_yaml_size(read_text(file), f"'{file}'", MAX_CONFIG_VALUES)
-        return super().load_config(config_path)
+        loaded = super().load_config(config_path)
+        if isinstance(loaded.config, DictConfig) and "defaults" in loaded.config:
+            self.with_defaults.append(file)
+        return loaded
 
 
 @contextmanager
@@ -175,29 +183,49 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     read = [parsed(text) for text in overrides]
     for override in read:
         _check(override)
-    if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
-        Plugins.instance().register(_LocalFirst)
-    SourcesRegistry.instance().register(_LimitedFiles)
+    of_groups = tuple(str(one.input_line) for one in read if _is_group(str(one.key_or_group)))
+    values = [one for one in read if one.input_line not in of_groups]
     try:
-        with (
-            _limited_references(),
-            initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"),
-        ):
-            composed = compose(
-                command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in read)]
-            )
+        with _limited_references():
+            composed = deepcopy(_composed(command, of_groups, stamp_of(*conf_folders())))
+            ConfigLoaderImpl._apply_overrides_to_config(values, composed)
             resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except VehestError as error:
         raise ConfigurationError(str(error)) from None
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing
+        if isinstance(error, RecursionError) and (files := _LimitedFiles.with_defaults):
+            names = " and ".join(f"'{file}'" for file in files)
+            raise ConfigurationError(
+                f"the defaults of {names} lead back to themselves; remove an entry of them"
+            ) from None
         raise ConfigurationError(_one_line(error, command)) from None
     validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]
     return {str(key): value for key, value in resolved.items()} | (
         {GIVEN: chosen} if chosen else {}
     )
+
+
+def _is_group(key: str) -> bool:
+    """Whether a key names a folder of choices, as Hydra looks for one; a value is anything else."""
+    return any(os.path.isdir(folder / key) for folder in conf_folders())
+
+
+@lru_cache(maxsize=256)
+def _composed(command: str, of_groups: tuple[str, ...], stamp: str) -> DictConfig:
+    """A configuration as Hydra composes it from choices of groups, before any value is set.
+
+    Hydra reads and merges the same files for all jobs with the same choices, which takes 0.1 s; values it sets afterwards, with
+    `ConfigLoaderImpl._apply_overrides_to_config`. ``stamp`` is that of the files, so that changed files are read anew.
+    """
+    if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
+        Plugins.instance().register(_LocalFirst)
+    SourcesRegistry.instance().register(_LimitedFiles)
+    _LimitedFiles.with_defaults.clear()
+    with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
+        return compose(command, overrides=[OWN_SEARCH_PATH, *of_groups])
 
 
 def _check(override: Override) -> None:
@@ -337,6 +365,14 @@ def has_key(config: Config, key: str) -> bool:
     return (
         isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
     )
+
+
+def quoted(text: Any) -> str:
+    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
+    escaped = re.sub(
+        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
+    )
+    return f"'{escaped}'"
 
 
 def as_yaml(config: Config) -> str:

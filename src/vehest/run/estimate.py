@@ -27,7 +27,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.data.recording import Recording, joined
+from vehest.data.recording import UNNAMED_VEHICLE, Recording, joined
 from vehest.data.store import estimate_columns, write_estimate_parts
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
@@ -108,6 +108,44 @@ def open_model(
     return folder, model, trust
 
 
+def model_for_car(
+    name: str,
+    settings: Mapping[str, Any],
+    overrides: Sequence[str],
+    say: Callable[[str], None],
+) -> tuple[Path, Estimator, Trust | None, bool]:
+    """A model as `open_model` finds it, for the car of the data set that overrides of conf/estimate.yaml name, without a recording.
+
+    Returns
+    -------
+    tuple
+        Folder, model, calibration, and whether bands are for another car: by the answer ``same_vehicle``,
+        by values of the car, and by its name where a data set is named.
+    """
+    config = compose_config("estimate", overrides)
+    folder, model, trust = open_model(name, Path(config["output"]), say)
+    dataset = config["dataset"]
+    car = car_of(dataset)
+    same_vehicle = same_vehicle_from_config(config)
+    names_dataset = any(key_of(override) == "dataset" for override in overrides)
+    is_other = False
+    if names_dataset or same_vehicle is not None:
+        vehicle = vehicle_of(dataset)
+        is_other = is_other_vehicle(trust, vehicle, same_vehicle, car)
+    elif trust is not None and trust.bands is not None:
+        is_other = bool(trust.bands.difference_to(car))
+    model, trust, remarks = adapted(model, trust, car, settings)
+    for remark in remarks:
+        say(remark)
+    return folder, model, trust, is_other
+
+
+def vehicle_of(dataset: Mapping[str, Any]) -> str:
+    """The name of a data set's car; `UNNAMED_VEHICLE` where it has none."""
+    vehicle = dataset.get("vehicle")
+    return vehicle if isinstance(vehicle, str) and vehicle else UNNAMED_VEHICLE
+
+
 def estimate_file(
     words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None
 ) -> dict[str, Any]:
@@ -155,17 +193,20 @@ def estimate_file(
             settings["measured_ax"] = False
             remarks.append("there is no channel ax: estimator.measured_ax=false")
         record = None if car is None else read_car(car)
-        model, trust, of_car = adapted(model, trust, car_of(dataset), settings, record)
+        model, trust, of_car = adapted(model, trust, first.car, settings, record)
         remarks += of_car
+        if is_training_recording(folder, first.id):
+            remarks.append(
+                f"'{name}' was trained on this recording: its errors here are no test of it"
+            )
         if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
         same_vehicle = same_vehicle_from_config(config)
-        band = describe_band(trust, first.vehicle, same_vehicle)
-        run = GuardedRun(
-            model, trust, elsewhere=is_other_vehicle(trust, first.vehicle, same_vehicle)
-        )
+        band = describe_band(trust, first.vehicle, same_vehicle, first.car)
+        elsewhere = is_other_vehicle(trust, first.vehicle, same_vehicle, first.car)
+        run = GuardedRun(model, trust, elsewhere=elsewhere)
         log = out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
@@ -214,6 +255,15 @@ def _estimates(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate
             if len(going) > 1:
                 yield going.pop(0).result()
         yield going.pop().result()
+
+
+def is_training_recording(model_folder: Path, recording_id: str) -> bool:
+    """Whether a model was trained or validated on some part of a recording."""
+    about = read_description(model_folder).about
+    return any(
+        span.startswith((f"{recording_id} [", f"{recording_id} ("))
+        for span in (*about.trained_on, *about.validated_on)
+    )
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -361,7 +411,7 @@ def estimate_recording(
 ) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
     needed = prepared_recording(model, recording)
-    elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle)
+    elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle, recording.car)
     run = GuardedRun(model, trust, elsewhere=elsewhere)
     return require_estimate(model, recording, run(needed.channels, needed))
 

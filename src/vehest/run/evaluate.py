@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -123,6 +124,7 @@ class Evaluation:
     protocol: Protocol
     output: Path
     faults: tuple[FaultSettings, ...] = ()
+    cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
 
     def of(
         self, model: Artefact, calibration: Artefact | None
@@ -161,6 +163,9 @@ class Evaluation:
             "kinds": dict(self.kinds),
             "split": self.split.name,
         }
+        cars = {name: asdict(car) for name, car in self.cars.items() if car != UNKNOWN_CAR}
+        if calibration is not None and cars:
+            config["cars"] = cars  # they decide whether bands apply
         if self.faults:
             config["faults"] = [asdict(fault) for fault in self.faults]
         code = code_of(STAGE, read_description(model.folder).estimator, faults=bool(self.faults))
@@ -182,6 +187,7 @@ class Evaluation:
     def measured(self, span: Span) -> Recording:
         """A range as the estimator sees it: no references, and a warm-up before it."""
         recording = read_recording(recording_file(self.data[span.dataset], span))
+        recording = replace(recording, car=self.cars.get(span.dataset, UNKNOWN_CAR))
         return recording.cut(
             span.start - self.protocol.warm_up_seconds, span.stop
         ).without_references()
@@ -231,7 +237,8 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
             ):  # wider on vehicles without calibration and on test sets that the protocol names
                 measured = how.measured(piece)
                 other_vehicle = (
-                    not bands.are_of(measured.vehicle) or name in protocol.sets_elsewhere
+                    not bands.are_of(measured.vehicle, measured.car)
+                    or name in protocol.sets_elsewhere
                 )
                 estimates[position] = with_bands(
                     estimates[position], measured, bands, elsewhere=other_vehicle
@@ -416,6 +423,9 @@ def _training_rows(how: Evaluation, model: Artefact, estimator: Estimator) -> li
         estimates = _estimates(estimator, how, sequences(spans, how.reference, how.protocol))
         figures = accuracy(how.score(spans, estimates))
     except DataError:
+        for span in spans:  # what cannot be read is an error, a gap in it is not
+            how.reference(span)
+            how.measured(span)
         return []
     return _rows(
         _head(how, model, estimator, TRAINING, spans),

@@ -158,7 +158,7 @@ def errors_under(
         start = max(span.start - recording.start_time, 0.0)
         fault = settings.within(start, recording.duration - start, position)
         samples = inject(recording.channels, recording.rate_hz, fault)
-        elsewhere = other_vehicle or is_other_vehicle(trust, recording.vehicle)
+        elsewhere = other_vehicle or is_other_vehicle(trust, recording.vehicle, car=recording.car)
         estimate = GuardedRun(estimator, trust, state, elsewhere=elsewhere)(samples, recording)
         onset = recording.start_time + fault.onset
         lost = np.isnan(estimate["vy"]) & (estimate.time >= onset)

@@ -5,13 +5,14 @@ Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluatio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
+from vehest.data.car import CarValues
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
@@ -53,6 +54,7 @@ class Group:
     evaluation: Evaluation | None = None  # none if they are only trained
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     label: str = ""  # what members have in common; the estimator and its variant if empty
+    cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
 
     @property
     def name(self) -> str:
@@ -132,7 +134,7 @@ def _member(
     if model is None or model.status != "complete":
         return Member(job, model)
     calibration = evaluation = None
-    calibrating = plan_calibrate(model, group.split, job.data, job.plan.output)
+    calibrating = plan_calibrate(model, group.split, job.data, job.plan.output, group.cars)
     if calibrating is not None:
         calibration = made(*calibrating)
         if calibration is None:

@@ -25,6 +25,7 @@ from vehest.run.config_files import choices
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
+from vehest.run.next_commands import command_line
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.versions import code_of
 from vehest.sources.base import SIMULATED, Source, open_source
@@ -33,6 +34,7 @@ from vehest.trust.health import SLOW_KERNEL, compile_health
 STAGE = "ingest"
 PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
+MAX_NAMES = 6  # of recordings in an error
 Report = Callable[
     [int, int, str], None
 ]  # recordings done, recordings in all, name of one that was begun
@@ -98,14 +100,14 @@ def write_ingest(
         tasks.insert(1, compile_health)
         missing.insert(1, "")
     done = len(ids) - len(missing) + missing.count("")
-    failures = []
+    failures: list[tuple[str, Failure]] = []  # with the recordings that were not made
 
     def begun(at: int, _: object) -> None:
         report(done, len(ids), missing[at])
 
     for end in launch(tasks, jobs, stop, begun):
         if isinstance(end.outcome, Failure) and missing[end.position]:
-            failures.append(end.outcome)
+            failures.append((missing[end.position], end.outcome))
         else:
             done += missing[end.position] != ""
             report(done, len(ids), "")
@@ -113,17 +115,27 @@ def write_ingest(
         parts.rmdir()  # unless something was made
     stop.raise_if_requested()
     if failures:
-        error = DataError(
-            failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else "")
-        )
-        error.exit_code = failures[0].exit_code
-        raise error
+        raise _error_of(source.name, failures)
     for recording_id in ids:
         file = recording_file(recording_id)
         try:
             os.link(parts / file, folder / file)
         except OSError:  # not every file system has links
             shutil.copyfile(parts / file, folder / file)
+
+
+def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataError:
+    """The first failure with its recording, the names of other recordings that failed, and its exit code."""
+    (recording_id, first), *others = failures
+    place = f"data set '{dataset}', recording '{recording_id}'"
+    message = first.message if first.message.startswith(place) else f"{place}: {first.message}"
+    if others:
+        names = [f"'{name}'" for name, _ in others[:MAX_NAMES]]
+        more = ", …" if len(others) > MAX_NAMES else ""
+        message += f" (and {len(others)} more: {', '.join(names)}{more})"
+    error = DataError(message)
+    error.exit_code = first.exit_code
+    return error
 
 
 def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
@@ -168,7 +180,8 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
     if config["dataset"].get("source") != SIMULATED:
         raise ConfigurationError(
-            f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'"
+            f"data set '{dataset}' is not simulated but read from files; "
+            f"run '{command_line('ingest', [dataset, *overrides])}'"
         )
     return config
 
@@ -186,20 +199,26 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
     }
 
 
+def _datasets_with_download() -> list[str]:
+    """Names of the data sets whose files can be fetched; those whose configuration cannot be read are left out."""
+    names = []
+    for name in choices("dataset"):
+        with suppress(ConfigurationError):
+            if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download"):
+                names.append(name)
+    return names
+
+
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
     """Fetch a data set's missing files and record or compare the others' checksums; raises as `Download.fetch`, or `ConfigurationError`."""
     from vehest.sources.download import download_of
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
-        known = [
-            name
-            for name in choices("dataset")
-            if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")
-        ]
+        others = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"data sets that do: {', '.join(known) or 'none'}"
+            f"put them into its folder by hand, or declare download in its file; data sets that do: {others}"
         )
     download = download_of(source)
     if dry_run:

@@ -1,6 +1,7 @@
 """What of a configuration enters keys: options that differ from their defaults.
 
 settings -> `changed_options` -> key of an artefact (`artefacts.StagePlan`) and keys of a published study (`published`)
+keys of a published study, keys of today -> `changed_keys` -> what has changed
 
 An option that has its default is left out, so that a new option, and a line of YAML that only repeats a default, change no key. The
 defaults themselves belong to the version of the class that declares them (tests/golden/defaults.json).
@@ -13,6 +14,26 @@ import json
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
+
+Keys = dict[str, dict[str, str]]
+"""Keys of a study: what is made, for example ``scheme_1: train ksnn`` -> cause (``code``, ``configuration``, ``data``) -> version or hash."""
+
+CONFIGURATION = "configuration"
+
+
+def changed_keys(recorded: Keys, today: Keys) -> list[tuple[str, str]]:
+    """Pairs of what has another key today than results were recorded with, and the cause; they are valid where there are none.
+
+    A cause that today's keys leave out, as that of raw files which are not here, is not compared.
+    """
+    changes = [
+        (name, cause)
+        for name, keys in recorded.items()
+        for cause, key in today.get(name, {}).items()
+        if keys.get(cause) != key
+    ]
+    changes += [(f"{name} added", CONFIGURATION) for name in today if name not in recorded]
+    return changes + [(f"{name} removed", CONFIGURATION) for name in recorded if name not in today]
 
 
 def hash_of(content: Any) -> str:

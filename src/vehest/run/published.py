@@ -25,19 +25,16 @@ from vehest.run.console import Messages
 from vehest.run.evaluate import evaluation_options
 from vehest.run.evaluate_faults import all_of, faults_of
 from vehest.run.ingest import PROSE, plan_ingest
-from vehest.run.keys import changed_options, hash_of
+from vehest.run.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.table_records import changes_of_tables
 from vehest.run.train import estimator_rate, training_options
 from vehest.run.versions import code_of, is_of_other_stages
 
-Keys = dict[str, dict[str, str]]
-"""What is made, for example ``scheme_1: train ksnn`` -> ``code``, ``configuration`` and, of an ingest, ``data`` -> version or hash."""
-
 CODE = "code"
-CONFIGURATION = "configuration"
 DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
@@ -242,6 +239,12 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
     if published is None:
         changes = []
         note = f"there is nothing in '{RESULTS / study}' that vehest published"
+    elif published.tables:
+        changes, note = changes_of_tables(
+            published.tables, published.keys, RESULTS / study, overrides
+        )
+        complete = not any(record.without_keys for record in published.tables.values())
+        state = "stale" if changes else "up to date" if complete else "not known"
     elif not published.keys:
         changes = []
         note = "published before keys were recorded; run it again"
@@ -281,16 +284,8 @@ def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
-    then = published.keys
     today = keys_of_study(study, jobs, published.absent, runner, inputs)
-    changes = [
-        (what, cause)
-        for what in then
-        for cause, own in today.get(what, {}).items()
-        if then[what].get(cause) != own
-    ]
-    changes += [(f"{what} added", CONFIGURATION) for what in today if what not in then]
-    changes += [(f"{what} removed", CONFIGURATION) for what in then if what not in today]
+    changes = changed_keys(published.keys, today)
     parts = _firsts(study, jobs)
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):

@@ -21,6 +21,7 @@ from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json
 from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
+from vehest.run.keys import Keys, changed_keys
 from vehest.run.locks import Lock, held
 
 RESULTS = Path("results")
@@ -39,7 +40,17 @@ class Publication:
     absent: Mapping[
         str, str
     ]  # name of a part or data set that the study went on without -> the same for people
-    keys: dict[str, dict[str, str]]  # `vehest.run.published.keys_of_study`
+    keys: Keys  # `vehest.run.published.keys_of_study`
+
+
+@dataclass(frozen=True)
+class TableRecord:
+    """How a table that no pipeline publishes was made (`vehest.run.table_records`)."""
+
+    __pydantic_config__ = FURTHER_KEYS
+    command: str
+    commit: str
+    without_keys: str = ""  # what of the table was made before keys were recorded; empty: nothing
 
 
 @dataclass(frozen=True)
@@ -50,9 +61,8 @@ class Published:
     kinds: dict[str, str] = field(default_factory=dict)  # data set -> ``real`` or ``simulated``
     parts: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
-    keys: dict[str, dict[str, str]] = field(
-        default_factory=dict
-    )  # empty where they were not recorded yet
+    keys: Keys = field(default_factory=dict)  # empty where they were not recorded yet
+    tables: dict[str, TableRecord] = field(default_factory=dict)  # of a folder without a pipeline
 
 
 def published_in(folder: Path) -> Published | None:
@@ -133,11 +143,11 @@ def _contents(report: Artefact) -> dict[str, bytes]:
     return {name: published_content(report.folder / name) for name in names}
 
 
-def _is_published(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+def _is_published(report: Artefact, folder: Path, keys: Keys) -> bool:
     """Whether a folder holds these results already, its provenance aside."""
     check_results_folder(folder)
     former = published_in(folder)
-    if former is None or former.keys != keys:
+    if former is None or changed_keys(former.keys, keys):
         return False
     present = {
         file.relative_to(folder).as_posix(): sha256_of(file)
@@ -150,7 +160,7 @@ def _is_published(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str
     return {**present, PROVENANCE: ""} == {**needed, PROVENANCE: ""}
 
 
-def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> None:
+def _publish(report: Artefact, folder: Path, keys: Keys) -> None:
     contents = _contents(report)
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():

@@ -15,9 +15,10 @@ from vehest.bus.outputs import output_files
 from vehest.bus.outputs import write_dbc as write_dbc_file
 from vehest.bus.replay import Bus, Replay, survey
 from vehest.bus.view import View
+from vehest.data.car import UNKNOWN_CAR
 from vehest.data.errors import ConfigurationError
+from vehest.data.files import without_links
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
 from vehest.run.car_record import adapted
@@ -28,8 +29,9 @@ from vehest.run.estimate import (
     open_model,
     same_vehicle_from_config,
     split_settings,
+    vehicle_of,
 )
-from vehest.sources.base import CarValues, car_of
+from vehest.sources.base import car_of
 from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import describe_band, is_other_vehicle
@@ -65,19 +67,20 @@ def replay_log(
         )
     written = output_files(out) + ([write_dbc] if write_dbc else [])
     for path in written:
-        if any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
+        inputs = [without_links(file) for file in (log, dbc) if file is not None]
+        if without_links(path) in inputs:
             raise ConfigurationError(f"'{path}' is an input; name another file")
     settings, others = split_settings(overrides)
     config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *others])
     folder, fitted, trust = open_model(model, Path(config["output"]), say)
-    car = car_of(config["dataset"]) if dataset else CarValues()
+    car = car_of(config["dataset"]) if dataset else UNKNOWN_CAR
     fitted, trust, remarks = adapted(fitted, trust, car, settings)
     for remark in remarks:
         say(remark)
-    vehicle = str(config["dataset"].get("vehicle") or UNNAMED_VEHICLE)
+    vehicle = vehicle_of(config["dataset"])
     same_vehicle = same_vehicle_from_config(config)
-    elsewhere = is_other_vehicle(trust, vehicle, same_vehicle)
-    band = describe_band(trust, vehicle, same_vehicle)
+    elsewhere = is_other_vehicle(trust, vehicle, same_vehicle, car)
+    band = describe_band(trust, vehicle, same_vehicle, car)
     with use_limits(limits_from_config(config["limits"])):
         wanted = _signals(config if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
@@ -91,7 +94,9 @@ def replay_log(
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
         figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
-            lambda: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere), out, view
+            lambda clock: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere, clock=clock),
+            out,
+            view,
         )
     return {
         "log": str(log),

@@ -7,6 +7,7 @@ comparison of a sweep -> table of jobs -> SweepArtefacts -> `vehest.studies.swee
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.keys import changed_options
+from vehest.run.next_commands import command_line, location_overrides
 from vehest.run.printing import (
     TerminalSummary,
     summary_of_leaderboard,
@@ -95,6 +97,8 @@ def draw_report(
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
         trials=trials,
         search_remarks=search_remarks,
+        report_command=command_line("report", study.words),
+        location=shlex.join(location_overrides(study.words[1:])),
     )
     config: dict[str, Any] = {
         **{

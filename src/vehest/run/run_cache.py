@@ -1,9 +1,9 @@
-"""Recognises a finished study or sweep without the libraries that made it.
+"""Remembers the keys of a finished study or sweep, so that it is recognised without the libraries that compute them.
 
-command, files of conf/, pipelines/ and code, environment -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
+command, environment, files that determine keys -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
 
-A record in the output root holds a hash of these, stamps of the raw files, the digests of all artefacts and the printed summary. While
-nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide which artefacts are up to date.
+A record in the output root holds a hash of these inputs, the key of each artefact and the printed summary. Inputs that are unchanged
+have unchanged keys, and `valid_artefact` decides by them; otherwise the study runs in full, which computes the keys.
 """
 
 from __future__ import annotations
@@ -15,17 +15,22 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vehest.data.errors import JobsFailedError, VehestError
-from vehest.data.files import file_name, regular_file, remove_leftovers, written_aside
+from vehest.data.files import (
+    file_name,
+    regular_file,
+    remove_leftovers,
+    stamp_of,
+    written_aside,
+)
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
-from vehest.run.artefacts import Artefact, library_versions, read_artefact
+from vehest.run.artefacts import Artefact, library_versions, valid_artefact
 from vehest.run.config_files import conf_folders, find_pipeline, packaged
 from vehest.run.console import WARNING, Messages
 from vehest.run.launchers.base import RunOptions
@@ -36,7 +41,7 @@ if TYPE_CHECKING:
     from vehest.run.runner import Runner
 
 FINISHED = "finished"  # folder of the records in an output root
-FORMAT = 4
+FORMAT = 5
 _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 
@@ -55,9 +60,11 @@ class Ran:
 class Record:
     """A finished study."""
 
-    key: str  # of its `RunCache`
+    inputs: str  # of its `RunCache`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
-    made: dict[str, str]  # folder of an artefact in the output root -> digest; the report last
+    made: tuple[
+        tuple[str, str, str], ...
+    ]  # folder in the output root, key and digest, which is in later keys; the report last
     notes: tuple[
         tuple[str, str, str, str], ...
     ]  # that the next run in full would print too: status, stage, label, detail
@@ -74,7 +81,7 @@ class RunCache:
 
     Attributes:
         file: of the record; none where the output root depends on more than overrides and environment.
-        key: hash of the command and of all files and variables that determine its meaning; empty if these are not all that does.
+        inputs: hash of the command, files and variables that determine keys, but raw files; empty if these are not all that does.
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
@@ -94,7 +101,7 @@ class RunCache:
             if plain
             else None
         )
-        self.key = self._key()
+        self.inputs = self._inputs()
 
     def load(self) -> tuple[Record, list[Artefact]] | None:
         """The finished study and its artefacts, if nothing has changed since and all of it is there."""
@@ -103,18 +110,20 @@ class RunCache:
         output = self.file.parents[1]
         try:
             record = validated(Record, read_json(self.file), f"'{self.file}'")
-            if record.key != self.key or any(
-                stamp_of(path) != stamp for path, stamp in record.raw.items()
+            if record.inputs != self.inputs or any(
+                stamp_of(Path(path).expanduser()) != stamp for path, stamp in record.raw.items()
             ):
                 return None
-            made = [read_artefact(output / folder, hash_files=False) for folder in record.made]
         except VehestError:
             return None
-        whole = all(
-            own.status == "complete" and own.digest == digest
-            for own, digest in zip(made, record.made.values(), strict=True)
-        )
-        return (record, made) if whole and (output / record.store).exists() else None
+        artefacts = [
+            artefact
+            for folder, key, digest in record.made
+            if (artefact := valid_artefact(output / folder, key, hash_files=False)) is not None
+            and artefact.digest == digest
+        ]
+        is_complete = len(artefacts) == len(record.made) and (output / record.store).exists()
+        return (record, artefacts) if is_complete else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
         """The finished study, notes printed first, published as a run in full would; none without a valid record, or under force."""
@@ -144,17 +153,20 @@ class RunCache:
         output = runner.output
         if (
             self.file is None
-            or not self.key
+            or not self.inputs
             or output != self.file.parents[1]
             or not tracker.complete
-            or self._key() != self.key
+            or self._inputs() != self.inputs
         ):
             return
         made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
         record = Record(
-            key=self.key,
+            inputs=self.inputs,
             raw=raw,
-            made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
+            made=tuple(
+                (artefact.folder.relative_to(output).as_posix(), artefact.key, artefact.digest)
+                for artefact in made
+            ),
             notes=tuple(
                 line
                 for line in runner.messages.printed
@@ -173,52 +185,26 @@ class RunCache:
         except VehestError as error:
             runner.messages.warn(f"{error}; the next run looks at everything again")
 
-    def _key(self) -> str:
-        digest = hashlib.sha256(
-            repr(
-                (FORMAT, sys.version_info[:2], self._words, os.getcwd(), library_versions())
-            ).encode()
-        )
-        texts = list(self._overrides)
+    def _inputs(self) -> str:
         try:
-            for file in [*_configuration(self._pipeline), *_code()]:
-                content = regular_file(file).read_bytes()
-                digest.update(
-                    repr((str(file), hashlib.sha256(content).hexdigest())).encode(
-                        "utf-8", "surrogateescape"
-                    )
-                )
-                if file.suffix == ".yaml":
-                    texts.append(content.decode("utf-8", "replace"))
+            texts = {
+                str(file): regular_file(file).read_bytes().decode("utf-8", "replace")
+                for file in _configuration(self._pipeline)
+            }
+            code = stamp_of(*_code())
         except (OSError, VehestError, ImportError, ValueError):
             return ""
-        for resolver, variable in sorted(
-            {pair for text in texts for pair in _RESOLVED.findall(text)}
-        ):
-            if resolver != "oc.env":
-                return ""  # its value may differ each time
-            digest.update(
-                repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape")
-            )
-        return digest.hexdigest()
-
-
-def stamp_of(path: str) -> str:
-    """Hash of names, sizes, times and inodes of all files below a folder, links followed; times of inodes show replaced files."""
-    entries: list[tuple[str, int, int, int, int]] = []
-    visited: set[str] = set()
-    for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
-        if os.path.realpath(folder) in visited:
-            folders.clear()
-            continue
-        visited.add(os.path.realpath(folder))
-        for file in (os.path.join(folder, name) for name in names):
-            with suppress(OSError):  # a link to nothing
-                about = os.stat(file)
-                entries.append(
-                    (file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino)
-                )
-    return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
+        references = {
+            reference
+            for text in (*self._overrides, *texts.values())
+            for reference in _RESOLVED.findall(text)
+        }
+        if any(resolver != "oc.env" for resolver, _ in references):
+            return ""  # its value may differ each time
+        variables = {name: os.environ.get(name) for _, name in sorted(references)}
+        libraries = (sys.version_info[:2], library_versions())
+        content = (FORMAT, libraries, self._words, os.getcwd(), texts, variables, code)
+        return hashlib.sha256(repr(content).encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def _configuration(pipeline: str) -> Iterator[Path]:
@@ -233,21 +219,17 @@ def _configuration(pipeline: str) -> Iterator[Path]:
 
 
 def _code() -> Iterator[Path]:
-    """Files of vehest and of every package that offers it estimators, sources or studies."""
-    found = metadata.entry_points()
-    points = [
-        point
-        for group in found.groups
+    """Folders, or files, of vehest and of every package that offers it estimators, sources or studies."""
+    points = metadata.entry_points()
+    packages = {
+        point.module.partition(".")[0]
+        for group in points.groups
         if group.startswith("vehest.")
-        for point in found.select(group=group)
-    ]
-    for package in sorted({"vehest", *(point.module.partition(".")[0] for point in points)}):
+        for point in points.select(group=group)
+    }
+    for package in sorted({"vehest", *packages}):
         spec = importlib.util.find_spec(package)
-        if spec is not None and spec.origin and not spec.submodule_search_locations:
+        if spec is not None and spec.submodule_search_locations:
+            yield from map(Path, spec.submodule_search_locations)
+        elif spec is not None and spec.origin:
             yield Path(spec.origin)
-        for top in (spec and spec.submodule_search_locations) or ():
-            for folder, folders, names in os.walk(top):
-                folders[:] = sorted(
-                    name for name in folders if name not in ("__pycache__", "pretrained")
-                )
-                yield from (Path(folder, name) for name in sorted(names))

@@ -6,13 +6,14 @@ Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from vehest.data.car import CarValues
 from vehest.data.errors import DataError
 from vehest.data.recording_summary import RecordingSummary, stored_summary
 from vehest.data.split_files import Reader, dataset_names, split_from_config
@@ -22,22 +23,24 @@ from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
-from vehest.run.config import Config, compose_config, missing_keys
+from vehest.run.config import Config, compose_config, missing_keys, quoted
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
+from vehest.run.estimate import finding_in_words
 from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
-from vehest.run.ingest import parts_of, plan_ingest, write_ingest
+from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
+from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
 from vehest.run.train import DIVERGED, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.weights import PublishedWeights, publish_weights
-from vehest.sources.base import car_of, kind_of, open_source
+from vehest.sources.base import SIMULATED, car_of, kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.health import SLOW_KERNEL
 from vehest.trust.record import read_trust
@@ -103,7 +106,7 @@ class Runner:
 
     def dataset_config(self, name: str, config: Config) -> Config:
         """The configuration of a data set's ingest, with the root and output of another command's."""
-        root = [] if config.get("root") is None else [f"root={_quoted(config['root'])}"]
+        root = [] if config.get("root") is None else [f"root={quoted(config['root'])}"]
         return self._once(
             "dataset",
             name,
@@ -154,6 +157,32 @@ class Runner:
             for name in dataset_names(config["split"])
         }
 
+    def warn_of_references(self, split: Split, config: Config) -> None:
+        """Warn once of each recording of a split whose reference has another sign or unit, is stuck or impossible.
+
+        The stored recordings are checked, so that a warning does not depend on which run has ingested them. References of a simulation
+        are right.
+        """
+        spans = [*split.train, *split.validation, *chain.from_iterable(split.tests.values())]
+        for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
+            if self.dataset_config(dataset, config)["dataset"]["source"] != SIMULATED:
+                self._once(
+                    "references",
+                    (dataset, recording),
+                    partial(self._warn_of_reference, dataset, recording, config),
+                )
+
+    def _warn_of_reference(self, dataset: str, recording: str, config: Config) -> None:
+        ingested = self._ingested(dataset, config)
+        file = recording_file(recording)
+        if file not in ingested.outputs:
+            return  # which the plan of a training or an evaluation says
+        for finding in reference_findings(read_recording(ingested.folder / file)):
+            self.messages.warn(
+                f"data set '{dataset}', recording '{recording}': {finding_in_words(finding)}; "
+                "every score against this reference is wrong if that is so"
+            )
+
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
         """Every data set of a split at a rate."""
         return {
@@ -161,9 +190,13 @@ class Runner:
             for name in split.datasets
         }
 
+    def cars(self, config: Config, datasets: Iterable[str]) -> dict[str, CarValues]:
+        """Values of the cars of data sets."""
+        return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
         """How estimates are scored, with the lowest speed of sideslip on each data set, by its car."""
-        cars = {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+        cars = self.cars(config, datasets)
         return protocol_from_config(config["evaluation"]).with_wheelbases(
             {name: car.wheelbase for name, car in cars.items()}
         )
@@ -182,7 +215,16 @@ class Runner:
         kinds = {
             name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets
         }
-        return Evaluation(split, data, references, kinds, protocol, self.output, faults)
+        return Evaluation(
+            split,
+            data,
+            references,
+            kinds,
+            protocol,
+            self.output,
+            faults,
+            self.cars(config, split.datasets),
+        )
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         """Make an artefact unless it is there."""
@@ -390,11 +432,3 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         "done",
         f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}",
     )
-
-
-def _quoted(text: Any) -> str:
-    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
-    escaped = re.sub(
-        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
-    )
-    return f"'{escaped}'"

@@ -38,6 +38,7 @@ from vehest.run.config import (
 from vehest.run.config_files import choices, find_pipeline, pipeline_names
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
+from vehest.run.next_commands import command_line, location_overrides
 from vehest.run.train import TrainJob, new_estimator
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, short_names, shown_value
@@ -99,6 +100,7 @@ class Study(PipelineFile):
 
     file: Path = Path()
     command: str = ""  # that makes it, without where data come from and results go
+    words: tuple[str, ...] = ()  # of the command that runs it here, all of them
     searches: dict[str, tuple[str, ...]] = field(
         default_factory=dict
     )  # part of the file with a search -> its trials, each a part here
@@ -143,7 +145,7 @@ Jobs = Mapping[
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
     """Read a pipeline by path or name; ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`."""
-    file, content = _content_of(name)
+    file, content = _content_of(name, location_overrides(overrides))
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     shown = [*read.datasets, *read.optional_datasets]
     forms = {"split": read.split or read.sweeps, "parts": read.parts, "datasets": shown}
@@ -205,7 +207,13 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
         },
     }
     command = " ".join([f"vehest run pipelines/{file.name}", *content_overrides(overrides)])
-    return Study(**{**vars(read), **changed}, file=file, command=command, searches=searches)
+    return Study(
+        **{**vars(read), **changed},
+        file=file,
+        command=command,
+        words=(name, *overrides),
+        searches=searches,
+    )
 
 
 def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
@@ -239,14 +247,20 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
     }
 
 
-def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, Any]]:
-    """A pipeline's file and its content, on top of that of the one it is based on."""
+def _content_of(
+    name: str, location: Sequence[str] = (), *, as_base: bool = False
+) -> tuple[Path, dict[str, Any]]:
+    """A pipeline's file and its content, on top of that of the one it is based on.
+
+    ``location``: overrides of the command that a command in an error's text needs too.
+    """
     file = find_pipeline(name)
     if file is None:
         close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
         hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
         if name in choices("dataset"):
-            hint = f", only a data set: 'vehest data usable {name}' says what its recordings suffice for"
+            usable = command_line("data usable", [name, *location])
+            hint = f", only a data set: '{usable}' says what its recordings suffice for"
         raise MissingError(
             f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})"
         )
@@ -443,7 +457,15 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
     of_jobs = {repr(seed): seed for seed in seeds or [usable[0]["seed"]]}.values()
     jobs = [replace(job, config={**job.config, "seed": seed}) for job in found for seed in of_jobs]
     command = " ".join(["vehest sweep", *words])
-    return Study(study, "sweep", study, parts={"": Part(split)}, command=command), {"": jobs}
+    own = Study(
+        study,
+        "sweep",
+        study,
+        parts={"": Part(split)},
+        command=command,
+        words=(*overrides, *(["--name", study] if name else [])),
+    )
+    return own, {"": jobs}
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:

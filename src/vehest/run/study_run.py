@@ -6,7 +6,7 @@ jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> re
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,20 +19,21 @@ from vehest.data.errors import (
     MissingError,
     VehestError,
 )
+from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
 from vehest.run.calibrate import calibration_of, plan_calibrate
 from vehest.run.comparison import Comparison, lower_rate, named_failures, print_notes, slowest
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import fault_figures, test_figures
+from vehest.run.evaluate import Evaluation, fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
+from vehest.run.next_commands import command_line, overrides_of_config
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import (
     PUBLISHED_WEIGHTS,
@@ -44,7 +45,7 @@ from vehest.run.publishing import (
 )
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
-from vehest.run.run_cache import Ran, RunCache, stamp_of
+from vehest.run.run_cache import Ran, RunCache
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
@@ -133,13 +134,13 @@ def run_study(
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
         if options.publish_weights:
             runner.publishes_to = _weights_to_add_to(study, overrides)
-        runner.train_first = f"vehest run {study.file}" if only_report else ""
+        runner.train_first = command_line("run", study.words) if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
         used = [config["dataset"] for config in shown]
         for part in study.parts:
             used += runner.datasets_of(_first(jobs[part]))
         raw = {
-            path: stamp_of(path)
+            path: stamp_of(Path(path).expanduser())
             for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)
         }
         datasets: list[StoredDataset | AbsentDataset] = []
@@ -281,7 +282,7 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
         return AbsentDataset(own["name"], title, licence, citation)
-    if runner.train_first and find(planned) is None:
+    if runner.train_first and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
@@ -320,11 +321,12 @@ def _error_of(
             f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}"
         )
     if unfinished and not runner.dry_run:
+        going_on = command_line("run" if study.file.name else "sweep", study.words)
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished)}; '{study.command}' goes on with them",
+            f"{', '.join(unfinished)}; '{going_on}' goes on with them",
         )
     return error
 
@@ -359,6 +361,7 @@ def evaluate_one(
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)
         if model is not None:
+            runner.warn_of_references(split, config)
             config, notes = lower_rate(config, "evaluation", slowest(runner.contents(config)))
             print_notes(notes, runner)
             trained = model_artefact(find_model(model, runner.output, note))
@@ -371,14 +374,15 @@ def evaluate_one(
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (found := find(plan)) is None:
+            if (found := find(plan, runner.messages.warn)) is None:
+                training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
-                    f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first"
+                    f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
                 )
             assert group.evaluation is not None
             trained = found
             how = group.evaluation
-        calibration = _calibration(trained, split, how.data, runner)
+        calibration = _calibration(trained, how, runner)
         artefact = runner.ensure(*how.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
     return {
@@ -389,16 +393,14 @@ def evaluate_one(
     }
 
 
-def _calibration(
-    model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner
-) -> Artefact | None:
+def _calibration(model: Artefact, how: Evaluation, runner: Runner) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
     learnt = learnt_spans(model)
     found = None
     if model.status == "complete" and (
-        not learnt or set(learnt) == {*split.train, *split.validation}
+        not learnt or set(learnt) == {*how.split.train, *how.split.validation}
     ):
-        job = plan_calibrate(model, split, data, runner.output)
+        job = plan_calibrate(model, how.split, how.data, runner.output, how.cars)
         if job is not None:
             found = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests

@@ -195,7 +195,7 @@ class Tracker:
 
     @property
     def _address(self) -> str:
-        return str(self.config.get("uri") or f"sqlite:///{(self.output / STORE).resolve()}")
+        return str(self.config.get("uri") or f"sqlite:///{(self.output / STORE).absolute()}")
 
 
 def _require_sqlite_path(store: Path) -> None:

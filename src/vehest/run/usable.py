@@ -24,6 +24,7 @@ from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
+from vehest.sources.base import car_of
 
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
@@ -65,7 +66,7 @@ class Usability:
     patterns: tuple[
         str, ...
     ] = ()  # overrides that its fit needs, since it asks for recordings by other names
-    to_give: str = ""  # setting that only the user knows, in words; empty if none
+    to_give: str = ""  # setting that only the user knows, or why it cannot be used at all, in words; empty if none
     car: tuple[
         str, ...
     ] = ()  # keys of the car's parameters, which are those of another car unless given
@@ -103,17 +104,38 @@ def all_usabilities(
 ) -> list[Usability]:
     """A row for each estimator of conf/estimator, then of other packages that have no file there, with the car of a data set, if any.
 
-    There is at least one recording.
+    There is at least one recording. A file or a package that cannot be used is a row with the reason.
     """
-    configs: dict[str, Config] = {
-        name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")
-    }
+    rows = [_choice_usability(name, recordings, dataset) for name in choices("estimator")]
+    listed = {row.estimator for row in rows}
     for name in estimator_names():
-        configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
-    return [
-        usability(name, with_car_values(config, [dataset] if dataset else []), recordings)
-        for name, config in configs.items()
-    ]
+        if name not in listed:
+            config: Config = {"estimator": {"name": name}, "training": {}}
+            rows.append(_usability_with_car(name, config, recordings, dataset))
+    return rows
+
+
+def _choice_usability(
+    name: str, recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None
+) -> Usability:
+    """The row of a file of conf/estimator; one that is no configuration is unusable for the reason that its error names."""
+    try:
+        config = compose_config("train", [f"estimator={name}"])
+        return _usability_with_car(name, config, recordings, dataset)
+    except ConfigurationError as error:
+        return Usability(name, None, None, Missing([], [], {}), to_give=str(error))
+
+
+def _usability_with_car(
+    name: str,
+    config: Config,
+    recordings: Sequence[RecordingSummary],
+    dataset: Mapping[str, Any] | None,
+) -> Usability:
+    """A row with the car of a data set, if any."""
+    return usability(
+        name, with_car_values(config, [car_of(dataset)] if dataset else []), recordings
+    )
 
 
 def usability(

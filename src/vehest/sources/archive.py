@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import lzma
 import os
 import shutil
 import stat
@@ -24,11 +23,15 @@ MOST_BYTES = 8 * 10**9
 SMALL = 64 * 2**20
 MOST_EXPANSION = 250  # bytes; times its packed size that a larger archive may unpack to
 MOST_FILES = 10_000
+METHODS = (
+    zipfile.ZIP_STORED,
+    zipfile.ZIP_DEFLATED,
+    zipfile.ZIP_BZIP2,
+)  # LZMA takes as much memory as an entry asks for, up to 4 GiB
 
 _UNSOUND = (
     zipfile.BadZipFile,
     zlib.error,
-    lzma.LZMAError,
     EOFError,
     RuntimeError,
     ValueError,
@@ -50,6 +53,11 @@ class _Archive(io.FileIO):
         return super().read(size)
 
 
+def unpacked_limit(packed: int, most_bytes: int = MOST_BYTES) -> int:
+    """What ``packed`` bytes may unpack to on disk [bytes]."""
+    return min(most_bytes, max(SMALL, MOST_EXPANSION * packed))
+
+
 @contextmanager
 def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
     """Yield a temporary folder with the contents of a zip archive; it is removed afterwards; raises `DataError` or `MissingError`.
@@ -62,12 +70,17 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
                 size = sum(entry.file_size for entry in entries)
-                most = min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size))
+                most = unpacked_limit(file.stat().st_size, most_bytes)
                 if len(entries) > MOST_FILES or size > most:
                     limits = f"more than the limit of {MOST_FILES} entries and {most / 1e9:.3g} GB; unpack it by hand"
                     raise DataError(
                         f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, {limits}"
                     )
+                for entry in entries:
+                    if entry.compress_type not in METHODS:
+                        raise DataError(
+                            f"'{file}' is packed by another method than deflate; unpack it by hand"
+                        )
                 targets = {
                     entry: folder / _checked_path(file, entry)
                     for entry in entries

@@ -7,13 +7,12 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
-from pydantic import Field
-
 import vehest.sources as package
+from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import regular_file
@@ -27,7 +26,6 @@ NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
 SIMULATED = "simulated"  # name of the source whose recordings are never real
-PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
@@ -41,44 +39,6 @@ class Point:
 
     x: float = 0.0
     y: float = 0.0
-
-
-@dataclass(frozen=True)
-class CarValues:
-    """Values of the car that a data set was recorded with; None where one is not known.
-
-    Attributes
-    ----------
-    wheelbase : float or None
-        Distance between the axles [m].
-    mass : float or None
-        Mass as it was driven [kg].
-    cg_to_rear_axle : float or None
-        Distance of the centre of gravity from the rear axle [m].
-    steering_ratio : float or None
-        Overall steering ratio: handwheel angle over road-wheel angle.
-    """
-
-    wheelbase: (
-        Annotated[float, Field(ge=0.05, le=20.0), "a number of metres, 0.05 to 20"] | None
-    ) = None
-    mass: PositiveNumber | None = None
-    cg_to_rear_axle: PositiveNumber | None = None
-    steering_ratio: PositiveNumber | None = None
-
-    def __post_init__(self) -> None:
-        """Raises `ValueError`: a centre of gravity outside of the wheelbase."""
-        rear = self.cg_to_rear_axle
-        if rear is not None and self.wheelbase is not None and rear >= self.wheelbase:
-            raise ValueError(
-                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {rear:g}"
-            )
-
-    def scaled(self, factor: float) -> CarValues:
-        """The same car with its lengths multiplied; its mass then is that of no car."""
-        wheelbase = None if self.wheelbase is None else factor * self.wheelbase
-        rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
-        return replace(self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None)
 
 
 @dataclass(frozen=True)
@@ -160,12 +120,7 @@ def car_of(dataset: Mapping[str, Any]) -> CarValues:
     ConfigurationError
         A value is not positive, or the data set makes no sense.
     """
-    source = open_source(dataset)
-    car = source.car
-    for transform in source.transforms:
-        if isinstance(transform, ScaleToWheelbase):
-            car = car.scaled(transform.to / transform.wheelbase)
-    return car
+    return open_source(dataset).car_in_recordings
 
 
 class Source(ABC):
@@ -223,6 +178,15 @@ class Source(ABC):
         """Values of the car as it was recorded, before any transform."""
         return self.declared_car or CarValues()
 
+    @cached_property
+    def car_in_recordings(self) -> CarValues:
+        """Values of the car that recordings show, after the transforms; see `car_of`."""
+        car = self.car
+        for transform in self.transforms:
+            if isinstance(transform, ScaleToWheelbase):
+                car = car.scaled(transform.to / transform.wheelbase)
+        return car
+
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
         """Inputs of the recordings: name -> file, or a version where there is no file.
@@ -254,13 +218,17 @@ class Source(ABC):
         yield self.read_file(file)
 
     def _prepared(self, recording: Recording) -> Recording:
-        """A recording after the data set's transforms and with its reference at the centre of gravity, unless it has been through them."""
+        """A recording with the data set's car, after its transforms and with its reference at the centre of gravity.
+
+        One that has been through the transforms is not transformed again.
+        """
         if len(recording) > 1:
             require_clock(
                 recording.time,
                 f"{self.where}, recording '{recording.id}'",
                 "correct time or rate_hz",
             )
+        recording = replace(recording, car=self.car_in_recordings)
         if DERIVED in recording.provenance:
             return recording
         for transform in self.transforms:

@@ -8,6 +8,7 @@ import pyarrow as pa
 from vehest.constants import FloatArray
 
 DAY = 86_400.0  # s
+HOUR = 3600.0  # s
 WRITTEN = (
     r"^\s*(?:(?P<date>\d{4}-\d{2}-\d{2}|\d{1,2}\.\d{1,2}\.\d{4})[T ]+)?"
     r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,]\d+)?)\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
@@ -46,8 +47,12 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
 
 
 def past_midnight(times: FloatArray) -> FloatArray:
-    """Times since midnight that go on past the next [s], (N,), of times of day."""
+    """Times since midnight that go on past the next [s], (N,), of times of day.
+
+    Midnight is a step from the last hour of a day to the first of the next. Any other step back, such as that after a stray 23:59:59,
+    stays a step back.
+    """
+    is_midnight = (times[:-1] > DAY - HOUR) & (times[1:] < HOUR)
     return np.asarray(
-        times + DAY * np.concatenate([[0.0], np.cumsum(np.diff(times) < -0.5 * DAY)]),
-        dtype=np.float64,
+        times + DAY * np.concatenate([[0.0], np.cumsum(is_midnight)]), dtype=np.float64
     )

@@ -23,7 +23,7 @@ from vehest.data.files import remove_leftovers, sha256_of, writing_error, writte
 from vehest.data.schema import validated
 from vehest.data.text_files import first_line, read_text
 from vehest.sources.base import Source, existing_folder
-from vehest.sources.resuming import Progress, ResumingDownloader
+from vehest.sources.resuming import REMEDY, Progress, ResumingDownloader
 
 CHECKSUMS = "checksums.txt"
 UNDER_WAY = ".download"
@@ -122,14 +122,13 @@ class Download:
         except OSError as error:
             if error.errno is not None:
                 raise writing_error(path, error) from error
-            part = (
-                "; the same command goes on after what has arrived"
+            again = (
+                "; when the server answers again, the same command goes on after what has arrived"
                 if downloader.part.exists()
                 else ""
             )
-            raise MissingError(
-                f"cannot fetch {address}: {str(error)[-200:]}{part}"
-            ) from None  # the cause comes last
+            cause = str(error)[-200:]  # which comes last
+            raise MissingError(f"cannot fetch {address}: {cause}; {REMEDY}{again}") from None
         except ValueError as error:  # of pooch, which has removed the file
             raise DataError(
                 f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})"

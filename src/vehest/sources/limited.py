@@ -44,23 +44,18 @@ class Reading(NamedTuple):
     summary: dict[str, Any]  # everything else, as JSON holds it
 
 
-def read_limited(reader: str, file: Path, **request: Any) -> Reading:
+def read_limited(reader: str, file: Path, *, packed: Path | None = None, **request: Any) -> Reading:
     """Call ``reader(file, **request)`` in a process that may not exceed its memory and time or write a file.
 
-    Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory`` and ten times its size. Where the system
-    has no such limits (Windows), eight times that time is all that ends it. ``reader`` is ``module:function``, which returns arrays and a
-    summary; ``request`` what JSON holds.
+    Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory`` and ten times its size; where it was
+    unpacked, that of ``packed``, the file or folder that the user has. Where the system has no such limits (Windows), eight times that time
+    is all that ends it. ``reader`` is ``module:function``, which returns arrays and a summary; ``request`` what JSON holds.
 
     Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise, as the file is damaged, or asks for
     more.
     """
-    size = sum(
-        part.stat().st_size
-        for part in (file.rglob("*") if file.is_dir() else [file])
-        if part.is_file()
-    )
-    seconds = SECONDS + SECONDS_PER_BYTE * size
-    memory = current_limits().memory + MEMORY_PER_BYTE * size
+    seconds = SECONDS + SECONDS_PER_BYTE * _size(file)
+    memory = current_limits().memory + MEMORY_PER_BYTE * _size(packed or file)
     order = {
         "reader": reader,
         "file": str(file),
@@ -105,6 +100,12 @@ def require_package(module: str, extra: str, what: str) -> None:
         raise MissingError(
             f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'"
         )
+
+
+def _size(file: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    parts = file.rglob("*") if file.is_dir() else [file]
+    return sum(part.stat().st_size for part in parts if part.is_file())
 
 
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:

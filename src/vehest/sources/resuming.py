@@ -12,6 +12,7 @@ from vehest.data.errors import MissingError
 from vehest.version import __version__
 
 CHUNK = 1 << 15  # bytes
+REMEDY = "correct download.url or put the file into the data set's folder by hand"
 TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
 ATTEMPTS = 5  # in a row that bring nothing new
 PAUSE = 1.0  # s, before the second of them; then twice as long each
@@ -102,16 +103,14 @@ class ResumingDownloader:
                 raise requests.ConnectionError(f"the server answers {status} {response.reason}")
             if status not in (200, 206):
                 raise MissingError(
-                    f"cannot fetch {url}: the server answers {status} {response.reason}; is the address right?"
+                    f"cannot fetch {url}: the server answers {status} {response.reason}; {REMEDY}"
                 )
             if "html" in about.get("Content-Type", ""):
-                raise MissingError(
-                    f"{url} is a web page, not a file; put the file into the data set's folder by hand"
-                )
+                raise MissingError(f"{url} is a web page, not a file; {REMEDY}")
             length = about.get("Content-Length", "")
             if not length.isdecimal() and not response.raw.chunked:
                 raise MissingError(
-                    f"cannot fetch {url}: the server does not state its length, so that a break would not show"
+                    f"cannot fetch {url}: the server does not state its length, so that a break would not show; {REMEDY}"
                 )
             self.resumed_at = have = have if resumed else 0
             self.version.write_text(

@@ -13,13 +13,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.splits import check_name
 from vehest.simulation.plant.planar_car import PLANAR, planar_car_from_configuration
 from vehest.simulation.plant.wear import Stint
-from vehest.sources.base import CarValues, Source
+from vehest.sources.base import Source
 
 Whole = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
 SurfaceFile = Annotated[

@@ -214,6 +214,9 @@ class StudyArtefacts:
         StoredDataset
     ] = ()  # of a study of recordings alone, in the order of the pipeline file
     absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
+    report_command: str = ""  # that draws this report again, with all of its overrides
+    # overrides, as text for a shell, that say where raw files come from and results go; in no published file
+    location: str = ""
 
     @property
     def first(self) -> PartArtefacts:

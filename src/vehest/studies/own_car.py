@@ -35,7 +35,7 @@ SHOWS_FAILED = True
 HARD = 4.0  # m/s², from which on driving says something of the tyres
 PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
-VERSION = "7"
+VERSION = "8"
 leaderboard = drive.leaderboard
 Verdict = tuple[
     list[str], EvaluatedModel | None
@@ -57,7 +57,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         n for n, block in enumerate(compared.blocks) if isinstance(block, str)
     )  # bars, and traces where there are any
     blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
-    commands = "\n".join(_commands(part, verdicts, artefacts.study))
+    commands = "\n".join(_commands(artefacts, verdicts))
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     absent = not_compared(part)
@@ -89,7 +89,7 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
     lines = [
         " ".join(sentences).replace("**", "").replace("`", "") for sentences, _ in verdicts.values()
     ]
-    commands = _commands(part, verdicts, artefacts.study)
+    commands = _commands(artefacts, verdicts)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 
 
@@ -226,8 +226,10 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     return f"{words}."
 
 
-def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) -> list[str]:
+def _commands(artefacts: StudyArtefacts, verdicts: Mapping[str, Verdict]) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
+    part = artefacts.first
+    location = f" {artefacts.location}" if artefacts.location else ""
     models = [
         (model, part.split.tests[name][0].dataset)
         for name, (_, model) in verdicts.items()
@@ -238,9 +240,9 @@ def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) 
     name = models[0][0].model_folder.name
     dataset = models[0][1]
     return [
-        f"vehest estimate {name} YOUR_LOG dataset={dataset} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
-        f"vehest export {name} -o on_the_car    # the same in C99",
-        f"vehest report {study}                 # this report again",
+        f"vehest estimate {name} YOUR_LOG dataset={dataset}{location} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
+        f"vehest export {name}{location} -o on_the_car    # the same in C99",
+        f"{artefacts.report_command}                 # this report again",
     ]
 
 

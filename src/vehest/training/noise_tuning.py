@@ -70,7 +70,9 @@ class IdentificationSettings(NoiseTuningSettings):
 
     group = "identification"
     method: Literal["data", "nelder_mead", "optuna"] = setting(
-        "optuna", "as above; data takes process noise as the paper has it"
+        "optuna",
+        "data: nothing is searched, process noise is the paper's; nelder_mead, optuna (extra tuning): levels with the smallest error of "
+        "sideslip on the training recordings",
     )
     trials: int = setting(60, "evaluations of Optuna in all stages together", least=1)
     stages: int = setting(

@@ -57,7 +57,8 @@ class ThroughFilterSettings(Group):
         "random", "fixed: the same sequences every epoch, as in the paper; random: starts are drawn"
     )
     curriculum: tuple[int, ...] = setting(
-        (), "lengths of shorter sequences to begin with, each for curriculum_epochs"
+        (),
+        "lengths of shorter sequences to begin with, such as [100, 250], each for curriculum_epochs",
     )
     curriculum_epochs: int = setting(100, "see curriculum", least=1)
     truncate_steps: int = setting(

@@ -28,6 +28,7 @@ import scipy
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
@@ -109,6 +110,7 @@ class Bands:
     largest: dict[str, float]  # term -> the 99.9th percentile of its size in training
     vy: Quantity  # the band of v
     sideslip: Quantity  # the band of β
+    cars: tuple[CarValues, ...] = ()  # values of the vehicles, as far as their data sets have any
 
     def __post_init__(self) -> None:
         check_channels("bands.channels", self.channels)
@@ -117,15 +119,25 @@ class Bands:
         check_number("bands.seconds", self.seconds, 0.0)
         check_number("bands.horizon_steps", self.horizon_steps, 0)
 
-    def are_of(self, vehicle: str) -> bool:
-        """Whether they apply to a vehicle as they are.
+    def are_of(self, vehicle: str, car: CarValues = UNKNOWN_CAR) -> bool:
+        """Whether they apply to a vehicle, by its name and values, as they are.
 
-        They do if they were calibrated on it, or are for any car. Where a side has no name, they apply
-        to the one car that they were calibrated on, and not to one beside several.
+        They do if they are for any car. They do not where `difference_to` finds one. Otherwise names
+        decide. Where a side has no name, they apply to the one car that they were calibrated on, and
+        not to one beside several.
         """
-        if not self.vehicles or vehicle in self.vehicles:
+        if not self.vehicles:
+            return True
+        if self.difference_to(car):
+            return False
+        if vehicle in self.vehicles:
             return True
         return len(self.vehicles) == 1 and UNNAMED_VEHICLE in (vehicle, *self.vehicles)
+
+    def difference_to(self, car: CarValues) -> str:
+        """Why a car is none of those that they were calibrated on, by its values; else empty."""
+        differences = [car.difference_to(calibrated_car) for calibrated_car in self.cars]
+        return differences[0] if differences and all(differences) else ""
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""

@@ -300,7 +300,8 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
 class GuardedStepper(Stepper):
     """Any fitted, causal estimator online, under the contract; ``trust`` and ``elsewhere`` are as of `GuardedRun`.
 
-    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal anti-aliasing filter first.
+    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal anti-aliasing filter first. ``clock`` judges other
+    stamps than those of `step`, such as the frames' that samples are formed from, and whoever passes it takes them.
 
     Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
 
@@ -316,6 +317,7 @@ class GuardedStepper(Stepper):
         bus_rate_hz: float | None = None,
         *,
         elsewhere: bool = False,
+        clock: SampleClock | None = None,
     ) -> None:
         self.estimator = estimator
         self._channels = tuple(estimator.channels)
@@ -344,7 +346,8 @@ class GuardedStepper(Stepper):
         self._places = [
             estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
         ]
-        self._clock = SampleClock(self._rate)
+        self._clock = SampleClock(self._rate) if clock is None else clock
+        self._judges_samples = clock is None
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
@@ -367,7 +370,8 @@ class GuardedStepper(Stepper):
             ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
         if not isinstance(time, Real):
-            self._clock.unstamped()
+            if self._judges_samples:
+                self._clock.unstamped()
             return self._received(sample)
         try:
             missing = self._clock.missing_before(float(time))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import DataError
 from vehest.data.recording import UNNAMED_VEHICLE
 from vehest.data.schema import check_format, validated
@@ -83,7 +84,12 @@ class Trust:
         return replace(self, bands=bands, health=health)
 
 
-def is_other_vehicle(trust: Trust | None, vehicle: str, same_vehicle: bool | None = None) -> bool:
+def is_other_vehicle(
+    trust: Trust | None,
+    vehicle: str,
+    same_vehicle: bool | None = None,
+    car: CarValues = UNKNOWN_CAR,
+) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on.
 
     Parameters
@@ -94,15 +100,22 @@ def is_other_vehicle(trust: Trust | None, vehicle: str, same_vehicle: bool | Non
         Name of the recording's car; the rule is that of `Bands.are_of`.
     same_vehicle : bool, optional
         Answer of the user, which comes first.
+    car : CarValues
+        Values of the recording's car.
     """
     if trust is None or trust.bands is None:
         return False
     if same_vehicle is not None:
         return not same_vehicle
-    return not trust.bands.are_of(vehicle)
+    return not trust.bands.are_of(vehicle, car)
 
 
-def describe_band(trust: Trust | None, vehicle: str, same_vehicle: bool | None = None) -> str:
+def describe_band(
+    trust: Trust | None,
+    vehicle: str,
+    same_vehicle: bool | None = None,
+    car: CarValues = UNKNOWN_CAR,
+) -> str:
     """What calibrated the band of an estimate, and by which rule of `is_other_vehicle` it applies; empty without a band."""
     if trust is None or trust.bands is None:
         return ""
@@ -116,14 +129,18 @@ def describe_band(trust: Trust | None, vehicle: str, same_vehicle: bool | None =
     if same_vehicle is not None:
         which = "the same car" if same_vehicle else "another car: band doubled"
         return f"{basis}; this one is of {which}, as same_vehicle says"
+    if difference := bands.difference_to(car):
+        remedy = "if it is the same, correct car of the data set, or give same_vehicle=true"
+        return f"{basis}; this one is of another car ({difference}): band doubled; {remedy}"
     if is_other_vehicle(trust, vehicle):
         remedy = "if it is the same, give same_vehicle=true, or its name as vehicle of the data set"
-        car = "assumed to be of" if vehicle == UNNAMED_VEHICLE else f"of '{vehicle}',"
-        return f"{basis}; this one is {car} another car: band doubled; {remedy}"
+        which = "assumed to be of" if vehicle == UNNAMED_VEHICLE else f"of '{vehicle}',"
+        return f"{basis}; this one is {which} another car: band doubled; {remedy}"
     if names and vehicle in bands.vehicles:
         return f"{basis}; this one is of the same car, by its name"
     remedy = "if it is another, give same_vehicle=false, which doubles the band"
-    return f"{basis}; this one is assumed to be of the same car, as no names differ; {remedy}"
+    by = "neither names nor values of car" if bands.cars and car != UNKNOWN_CAR else "no names"
+    return f"{basis}; this one is assumed to be of the same car, as {by} differ; {remedy}"
 
 
 def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
@@ -134,6 +151,8 @@ def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
     """
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     del content["about"]["model"]
+    if content["bands"] and not content["bands"]["cars"]:
+        del content["bands"]["cars"]
     content["about"] |= {"model": model} if model else {}
     (folder / TRUST).write_text(
         yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8"

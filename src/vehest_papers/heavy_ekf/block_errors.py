@@ -19,14 +19,14 @@ from vehest_papers.heavy_ekf.claims import titles_of
 from vehest_papers.heavy_ekf.factorial import SEEDS, Factorial
 from vehest_papers.heavy_ekf.twin import RATE, SECONDS
 from vehest_papers.kit.block_rows import (
-    BASELINES,
+    BASELINE_NAMES,
     BlockRow,
     TrainingRow,
     block_rows,
     names_of_blocks,
 )
 
-NAMES = (*paper.ORDER, *BASELINES)  # candidates that claims name, as the report calls them
+NAMES = (*paper.ORDER, *BASELINE_NAMES)  # candidates that claims name, as the report calls them
 REGIMES = ("straight", "turning")
 CORRECTED = "corrected wheel speeds"
 MEASURED = "measured wheel speeds"
@@ -124,7 +124,7 @@ def training_rows() -> list[TrainingRow]:
     """No candidate learns in epochs."""
     filters = "levels of noise by a direct search; nothing is learnt in epochs"
     reasons = dict.fromkeys(paper.ORDER, filters) | dict.fromkeys(
-        (*BASELINES, MEASURED, CORRECTED), "nothing is learnt in epochs"
+        (*BASELINE_NAMES, MEASURED, CORRECTED), "nothing is learnt in epochs"
     )
     return [
         TrainingRow(_named(name), "", "", "not applicable", reason)
@@ -140,7 +140,7 @@ def models_of(part: PartArtefacts) -> dict[str, EvaluatedModel]:
 
 
 def _named(title: str) -> str:
-    return BASELINES.get(title, title)
+    return BASELINE_NAMES.get(title, title)
 
 
 def _positions(own: Segments, among: Segments) -> Sequence[int]:

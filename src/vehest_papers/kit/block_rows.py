@@ -14,7 +14,7 @@ from vehest.constants import FloatArray
 
 BLOCKS = "blocks"
 TRAINING = "training"
-BASELINES: Mapping[str, str] = {
+BASELINE_NAMES: Mapping[str, str] = {
     "zero": "zero",
     "static map": "static_map",
 }  # name in a report -> name in blocks.csv
@@ -69,10 +69,14 @@ def block_rows(
     return [BlockRow(*head, *of_block) for of_block in of_blocks]
 
 
+def columns_of(row_type: type[Any]) -> tuple[str, ...]:
+    """Columns of a table of rows, in order."""
+    return tuple(field.name for field in fields(row_type))
+
+
 def frame(rows: Sequence[BlockRow] | Sequence[TrainingRow], row_type: type[Any]) -> pd.DataFrame:
     """Rows as a table with the columns of their type."""
-    names = [field.name for field in fields(row_type)]
-    return pd.DataFrame([astuple(row) for row in rows], columns=names)
+    return pd.DataFrame([astuple(row) for row in rows], columns=columns_of(row_type))
 
 
 def checked_training(

@@ -17,7 +17,7 @@ from vehest.evaluation.metrics import WEIGHTS, Scored, pieces_of, weighted_error
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest_papers.kit.block_rows import (
-    BASELINES,
+    BASELINE_NAMES,
     BlockRow,
     TrainingRow,
     block_rows,
@@ -47,7 +47,7 @@ def candidate_name(part: str, candidate: str) -> str:
     """Candidate of a part as blocks.csv has it: with the length of its training sequences where parts differ in it."""
     length = LENGTH.fullmatch(part)
     if length is None:
-        return BASELINES.get(candidate, candidate)
+        return BASELINE_NAMES.get(candidate, candidate)
     steps, by_samples = length.groups()
     if int(steps) == LONGEST:
         return f"{candidate}, {steps} steps"
@@ -181,7 +181,7 @@ def training_rows(parts: Mapping[str, PartArtefacts], main: str) -> list[Trainin
                 named, epochs_of(models[0]), paper.epochs(candidate), errors[candidate], twice
             )
     for baseline in paper.BASELINES:
-        named = BASELINES.get(baseline, baseline)
+        named = BASELINE_NAMES.get(baseline, baseline)
         rows[named] = TrainingRow(named, "", "", "not applicable", "nothing is learnt in epochs")
     return list(rows.values())
 

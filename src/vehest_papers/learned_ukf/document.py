@@ -35,7 +35,7 @@ from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences
 from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
-MAIN = ("real", "simulated")
+MAIN = "real"
 LIKELIHOOD = "likelihood"
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
@@ -47,7 +47,7 @@ NOTE = (
 
 @dataclass
 class Outcome:
-    """What one main part gives to the report."""
+    """What the main part gives to the report."""
 
     claims: list[Claim] = field(default_factory=list)
     picture: list[Block] = field(default_factory=list)
@@ -62,46 +62,37 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
-        DataError: neither ``real`` nor ``simulated`` is there, their test sets are not ``tyre_a`` and ``tyre_d``, or metrics are missing.
+        DataError: ``real`` is not there, its test sets are not ``tyre_a`` and ``tyre_d``, or metrics are missing.
         ConfigurationError: the protocol cuts no sequences.
     """
-    main = {name: artefacts.parts[name] for name in MAIN if name in artefacts.parts}
-    if not main:
-        raise DataError(f"study '{artefacts.study}' needs one of the parts: {', '.join(MAIN)}")
-    for name, part in main.items():
-        if set(part.split.tests) != set(SETS):
-            raise DataError(
-                f"study '{artefacts.study}': the test sets of part '{name}' must be called {' and '.join(SETS)}"
-            )
+    part = artefacts.parts.get(MAIN)
+    if part is None:
+        raise DataError(f"study '{artefacts.study}' needs the part '{MAIN}'")
+    if set(part.split.tests) != set(SETS):
+        raise DataError(
+            f"study '{artefacts.study}': the test sets of part '{MAIN}' must be called {' and '.join(SETS)}"
+        )
     data: dict[str, pd.DataFrame] = {}
-    found = {name: _outcome(name, part, artefacts, data) for name, part in main.items()}
-    every = [claim for own in found.values() for claim in own.claims] + claims.not_testable(
-        timed=any(own.timed for own in found.values())
-    )
-    blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE)]
-    for own in found.values():
-        blocks += own.added
-    blocks.append(f"{_budgets_in_words(main)} {_left_out(artefacts)}".strip())
-    for own in found.values():
-        blocks += [*own.picture, *own.front]
-    for own in found.values():
-        blocks += own.appendix
-    blocks += how_it_was_made(artefacts, main, data)
-    rows = [
-        *block_errors.error_rows(artefacts.parts),
-        *(row for own in found.values() for row in own.rows),
+    outcome = _outcome(MAIN, part, artefacts, data)
+    blocks: list[Block] = [
+        *_asked(artefacts, part),
+        claims_table([*outcome.claims, *claims.not_testable(timed=outcome.timed)], NOTE),
+        *outcome.added,
+        f"{_budgets_in_words(part)} {_left_out(artefacts)}".strip(),
+        *outcome.picture,
+        *outcome.front,
+        *outcome.appendix,
+        *how_it_was_made(artefacts, {MAIN: part}, data),
     ]
-    trained = block_errors.training_rows(artefacts.parts, next(iter(main)))
+    rows = [*block_errors.error_rows(artefacts.parts), *outcome.rows]
+    trained = block_errors.training_rows(artefacts.parts, MAIN)
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def _asked(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> list[Block]:
-    words = f"{kinds_of_parts(artefacts, main)}. The paper's are real.{absent_parts(artefacts)}"
-    learnt = "; ".join(
-        f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})"
-        for part in main.values()
-    )
+def _asked(artefacts: StudyArtefacts, part: PartArtefacts) -> list[Block]:
+    words = f"{kinds_of_parts(artefacts, [MAIN])}. The paper's are real.{absent_parts(artefacts)}"
+    learnt = f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})"
     words += f" Learnt on: {learnt}; in the paper about {fixed(paper.MINUTES_LEARNT, 1)} min of the same tyre."
     return [words, artefacts.about]
 
@@ -122,36 +113,34 @@ def _left_out(artefacts: StudyArtefacts) -> str:
     return f"Not run here, for their budget: {listed(absent)}." if absent else ""
 
 
-def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
+def _budgets_in_words(part: PartArtefacts) -> str:
     """Epochs of the methods that are compared first, beside the paper's."""
-    sentences = []
-    for part in main.values():
-        groups = models_by_candidate(part)
-        words = []
-        if paper.NNTF_UH in groups and groups[paper.NNTF_UH][0].training:
-            training = groups[paper.NNTF_UH][0].training
-            one_step, through = (training[phase]["max_epochs"] for phase in ("one_step", "through"))
-            words.append(
-                f"{paper.NNTF_UH} has {one_step} epochs one-step and {through} through the filter (paper: 1000 and 1000)"
-            )
-        words += [
-            f"{name} {groups[name][0].training['phase']['max_epochs']}"
-            for name in (paper.GRU, paper.LSTM)
-            if name in groups and groups[name][0].training
-        ]
-        if paper.NN in groups and groups[paper.NN][0].training:
-            words.append(
-                f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step"
-            )
-        if words:
-            sentences.append(f"Epochs ({words_of_kinds(part)}): {', '.join(words)}.")
-    return " ".join(sentences)
+    groups = models_by_candidate(part)
+    words = []
+    if paper.NNTF_UH in groups and groups[paper.NNTF_UH][0].training:
+        training = groups[paper.NNTF_UH][0].training
+        one_step, through = (training[phase]["max_epochs"] for phase in ("one_step", "through"))
+        words.append(
+            f"{paper.NNTF_UH} has {one_step} epochs one-step and {through} through the filter (paper: 1000 and 1000)"
+        )
+    words += [
+        f"{name} {groups[name][0].training['phase']['max_epochs']}"
+        for name in (paper.GRU, paper.LSTM)
+        if name in groups and groups[name][0].training
+    ]
+    if paper.NN in groups and groups[paper.NN][0].training:
+        words.append(
+            f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step"
+        )
+    if not words:
+        return ""
+    return f"Epochs ({words_of_kinds(part)}): {', '.join(words)}."
 
 
 def _outcome(
     name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: dict[str, pd.DataFrame]
 ) -> Outcome:
-    """Everything of a main part; parts beside it belong to the real one, or to whichever there is."""
+    """Everything of the main part and of those beside it on data of the same kind."""
     runs = runs_of(part)
     kind = words_of_kinds(part)
     where = f"{kind.upper()}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
@@ -161,7 +150,7 @@ def _outcome(
     for test in SETS:
         own.claims += claims.pair_claims(errors[test], test, kind)
     own.claims += [*claims.factor_claims(errors, kind), *claims.percentile_claims(errors, kind)]
-    _accuracy(own, name, errors, kind, summary=name == MAIN[0] or MAIN[0] not in artefacts.parts)
+    _accuracy(own, name, errors, kind)
     _friction(own, name, part, where, kind)
     _instability(own, name, part, kind)
     beside = {
@@ -198,15 +187,12 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Lo
         own.add(paper.ORACLE, error)
 
 
-def _accuracy(
-    own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool
-) -> None:
+def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str) -> None:
     own.front.append(
         "## Tables I and II\n\n"
         + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items())
     )
-    if summary:
-        own.front.append(tables.overview(errors, kind))
+    own.front.append(tables.overview(errors, kind))
     own.appendix.append(f"## Appendix: Tables I and II, {kind}")
     for test, tyre in SETS.items():
         learnt = (

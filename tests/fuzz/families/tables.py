@@ -8,6 +8,7 @@ from conftest import planar_drive
 from fuzz.case import Command, generator
 from fuzz.honest import lap
 from fuzz.mutations import spoil_bytes, spoil_json
+from parquet_bomb import bomb
 from vehest.data.store import write_recording
 
 CELLS = (
@@ -29,8 +30,13 @@ def _reads(case, file):
 @generator(weight=8)
 def csv(case):
     file = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False))
-    how = case.idea(2)
-    if how == 0:
+    how = case.idea(3)
+    if how == 2:
+        rows = [line.split(",") for line in file.read_text().splitlines()]
+        row = case.rng.choice([*rows[1:], rows[-1]])
+        row[0] = repr(float(row[0]) + case.rng.choice([1e7, 1e9, 1e10, 1e18]))
+        case.write("lap.csv", "\n".join(map(",".join, rows)) + "\n")
+    elif how == 0:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         for row in case.rng.sample(rows, case.rng.choice([1, 1, 3, 50])):
             row[case.rng.randrange(len(row))] = case.rng.choice(CELLS)
@@ -42,9 +48,12 @@ def csv(case):
 
 @generator(weight=8)
 def parquet(case):
-    """Bytes, most of all of the footer, which says how to read the rest; zeros that pack to next to nothing."""
+    """Bytes, most of all of the footer, which says how to read the rest; zeros that pack to next to nothing; pages larger than said."""
     file = case.place / "lap.parquet"
-    if case.idea(4) == 0:
+    idea = case.idea(4)
+    if idea == 1:
+        bomb(file, case.rng.choice([10**6, 10**8, 2**31 - 1024]), ("time", "vx", "yaw_rate", "ay"))
+    elif idea == 0:
         block = pa.table(
             {name: np.zeros(100_000) for name in ("time", "vx", "yaw_rate", "ay", "ax")}
         )

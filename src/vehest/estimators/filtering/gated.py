@@ -14,7 +14,7 @@ class GatedFilter(Estimator):
 
     gate: float | None = setting(
         None,
-        "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken",
+        "standard deviations of an innovation beyond which a measurement is refused in use, such as 5; null: all are taken, as in the papers",
         positive=True,
     )
 

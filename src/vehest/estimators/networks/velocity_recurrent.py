@@ -72,7 +72,7 @@ class SequenceSettings(Group):
     )
     mirrored: float = setting(
         0.0,
-        "share of training sequences that are seen in a mirror, left for right",
+        "share of training sequences that are seen in a mirror, left for right; papers: none",
         least=0.0,
         most=1.0,
     )

@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from vehest.data.errors import MissingError
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
 from vehest.run.locks import Waiting
@@ -166,7 +167,10 @@ class _Worker:
         except (EOFError, ConnectionError):
             self._process.join()
             self.is_alive = False
-            return Done(self.position, Failure(_describe_exit(self._process.exitcode)))
+            failure = Failure(
+                _describe_exit(self._process.exitcode), exit_code=MissingError.exit_code
+            )
+            return Done(self.position, failure)
         if kind == READY:
             assert self._task is not None
             self.begin(self.position, self._task)

@@ -26,7 +26,7 @@ from vehest.estimators.registry import (
     estimator_classes,
     estimator_names,
 )
-from vehest.run.config import compose_config
+from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
 from vehest.run.own_car.inspect import Examined, paths_of
@@ -108,10 +108,13 @@ def registered(word: str) -> str:
             f"{what}; its pyproject.toml needs, under {declared}; then install it with pip"
         )
     if name not in choices("estimator"):
-        raise ConfigurationError(
-            f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting"
-        )
+        raise ConfigurationError(_without_settings_file(name))
     return name
+
+
+def _without_settings_file(name: str) -> str:
+    """What an estimator of another package lacks that has no file in conf/estimator."""
+    return f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting"
 
 
 def write(
@@ -409,6 +412,9 @@ def _lack(
     samples: int,
     seconds: float,
 ) -> str:
+    if name not in choices("estimator"):
+        config: Config = {"estimator": {"name": name}, "training": {}}
+        return usability(name, config, contents).to_give or _without_settings_file(name)
     first = [
         word if "[" in word else word.split(",")[0]
         for word in words

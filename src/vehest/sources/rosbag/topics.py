@@ -12,7 +12,7 @@ from typing import Any
 from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.files import regular_file, writing_error
 from vehest.data.text_files import first_line, read_text
-from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked
+from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked, unpacked_limit
 from vehest.sources.limited import Reading, read_limited, require_package
 
 METADATA = "metadata.yaml"
@@ -32,7 +32,8 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
     bag_files(path)
     with _unpacked_bag(path, most_bytes) as bag:
         try:
-            return read_limited(f"vehest.sources.readers.bags:{function}", bag, **request)
+            reader = f"vehest.sources.readers.bags:{function}"
+            return read_limited(reader, bag, packed=path, **request)
         except VehestError as error:
             raise type(error)(str(error).replace(str(bag), str(path))) from None
 
@@ -92,15 +93,19 @@ def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: in
         from compression import zstd
     else:
         from backports import zstd
-    left = most_bytes
+    most = unpacked_limit(sum(file.stat().st_size for file in packed), most_bytes)
+    n_bytes = 0
     for file in packed:
         try:
             with zstd.open(file) as stream, open(folder / file.name, "xb") as plain:
                 while block := stream.read(1 << 20):
-                    left -= len(block)
-                    if left < 0:
+                    n_bytes += len(block)
+                    if n_bytes > most:
+                        remedy = (
+                            "raise unpacked_limit" if most == most_bytes else "unpack it by hand"
+                        )
                         raise DataError(
-                            f"'{path}' would unpack to more than the limit of {most_bytes / 1e9:.3g} GB; raise unpacked_limit"
+                            f"'{path}' would unpack to more than the limit of {most / 1e9:.3g} GB; {remedy}"
                         )
                     plain.write(block)
         except (zstd.ZstdError, EOFError) as error:

@@ -1,0 +1,71 @@
+"""Values of the car that recordings were made with, and when two cars cannot be the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+from pydantic import Field
+
+PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
+
+SAME_CAR_RANGES = {"wheelbase": (1.05, "m"), "mass": (1.25, "kg")}
+"""Value -> factor by which it may differ for one car, and its unit.
+
+Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % of a small car's mass.
+"""
+
+
+@dataclass(frozen=True)
+class CarValues:
+    """Values of the car that a data set was recorded with; None where one is not known.
+
+    Attributes
+    ----------
+    wheelbase : float or None
+        Distance between the axles [m].
+    mass : float or None
+        Mass as it was driven [kg].
+    cg_to_rear_axle : float or None
+        Distance of the centre of gravity from the rear axle [m].
+    steering_ratio : float or None
+        Overall steering ratio: handwheel angle over road-wheel angle.
+    """
+
+    wheelbase: (
+        Annotated[float, Field(ge=0.05, le=20.0), "a number of metres, 0.05 to 20"] | None
+    ) = None
+    mass: PositiveNumber | None = None
+    cg_to_rear_axle: PositiveNumber | None = None
+    steering_ratio: PositiveNumber | None = None
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError`: a centre of gravity outside of the wheelbase."""
+        rear = self.cg_to_rear_axle
+        if rear is not None and self.wheelbase is not None and rear >= self.wheelbase:
+            raise ValueError(
+                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {rear:g}"
+            )
+
+    def scaled(self, factor: float) -> CarValues:
+        """The same car with its lengths multiplied; its mass then is that of no car."""
+        wheelbase = None if self.wheelbase is None else factor * self.wheelbase
+        rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
+        return replace(self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None)
+
+    def difference_to(self, other: CarValues) -> str:
+        """Why this and another car cannot be the same: ``wheelbase 0.33 m, not 2.7 m``; else empty.
+
+        They cannot where a value that both have differs by more than `SAME_CAR_RANGES`.
+        """
+        for name, (factor, unit) in SAME_CAR_RANGES.items():
+            value = getattr(self, name)
+            expected = getattr(other, name)
+            if value is None or expected is None:
+                continue
+            if max(value, expected) > factor * min(value, expected):
+                return f"{name} {value:g} {unit}, not {expected:g} {unit}"
+        return ""
+
+
+UNKNOWN_CAR = CarValues()

@@ -1,0 +1,520 @@
+"""The four papers on one page: what each claims and tabulates, beside ours (`make scorecard`).
+
+Made of claims.yaml, results/STUDY/tables/blocks.csv and training.csv alone: no model and no recording is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import math
+import sys
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vehest.data.errors import DataError, VehestError
+from vehest.data.text_files import read_rows
+from vehest.report.style import MISSING, significant
+from vehest_papers.kit.block_errors import (
+    TRAINING_STATES,
+    BlockErrors,
+    Key,
+    Training,
+    read_blocks,
+    read_training,
+)
+from vehest_papers.kit.claim_files import Claim, Paper, Row, Table, read_paper
+from vehest_papers.kit.verdicts import (
+    NOT_PUBLISHED,
+    VERDICTS,
+    Figure,
+    Judgement,
+    judge_paper,
+    judge_row,
+    least_training,
+)
+
+PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
+TITLES = {
+    "ksnn": "KS-NN",
+    "learned_ukf": "Learned UKF",
+    "heavy_ekf": "Heavy-vehicle EKF",
+    "cnn_ukf": "CNN-UKF",
+}
+CLAIMS_FOLDER = Path(__file__).parent
+CSV_COLUMNS = (
+    "paper",
+    "row",
+    "id",
+    "text",
+    "source",
+    "data",
+    "part",
+    "test_set",
+    "metric",
+    "published",
+    "ours",
+    "published_ratio",
+    "size",
+    "size_low",
+    "size_high",
+    "order",
+    "order_low",
+    "order_high",
+    "p_value",
+    "blocks",
+    "seeds",
+    "diverged",
+    "power",
+    "blocks_needed",
+    "training",
+    "epochs",
+    "epochs_paper",
+    "verdict",
+    "reason",
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A paper with its judged claims and table rows."""
+
+    paper: Paper
+    training: Mapping[str, Training]
+    claims: Mapping[str, Judgement]  # id -> judgement
+    rows: Sequence[tuple[Table, Row, Judgement]]
+    is_published: bool  # whether there are errors by block
+
+    def counts(self) -> Counter[str]:
+        """Verdict -> number of the paper's claims, without comparisons that we added."""
+        return Counter(
+            self.claims[claim.id].verdict for claim in self.paper.claims if not claim.is_added
+        )
+
+    def counts_of_training(self) -> Counter[str]:
+        """Training -> number of the paper's claims that errors by block decide."""
+        return Counter(
+            state.state if state is not None else "not applicable"
+            for claim in self.paper.claims
+            if not claim.is_added and self.claims[claim.id].n_blocks
+            for _, state in [least_training(claim, self.training)]
+        )
+
+
+def read_study(name: str, results: Path, claims_folder: Path = CLAIMS_FOLDER) -> Study:
+    """Read a paper's claims and the errors by block of its study, and judge them."""
+    paper = read_paper(claims_folder / name / "claims.yaml")
+    tables = results / paper.study / "tables"
+    blocks: dict[Key, BlockErrors] | None = None
+    if (tables / "blocks.csv").exists():
+        blocks = read_blocks(tables / "blocks.csv")
+    training: dict[str, Training] = {}
+    if (tables / "training.csv").exists():
+        training = read_training(tables / "training.csv")
+    rows = [
+        (table, row, judge_row(row, table, blocks, training))
+        for table in paper.tables
+        for row in table.rows
+    ]
+    return Study(paper, training, judge_paper(paper, blocks, training), rows, blocks is not None)
+
+
+def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[str, str]:
+    """Content of scorecard.md, scorecard.csv and scorecard/changed_verdicts.csv, as they belong into ``results``."""
+    studies = [read_study(name, results, claims_folder) for name in PAPERS]
+    before = claims_folder / "claims_before.csv"
+    return {
+        "scorecard.md": _page(studies, results),
+        "scorecard.csv": _csv(CSV_COLUMNS, [row for study in studies for row in _csv_rows(study)]),
+        "scorecard/changed_verdicts.csv": _csv(*_changes(studies, before)),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the scorecard; with ``--check`` exit with 1 where it is not what the committed inputs give."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--results", type=Path, default=Path("results"))
+    parser.add_argument("--check", action="store_true", help="write nothing, compare")
+    options = parser.parse_args(arguments)
+    try:
+        files = scorecard_files(options.results)
+    except VehestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    if options.check:
+        _check(files, options.results)
+        return
+    for name, text in files.items():
+        (options.results / name).parent.mkdir(parents=True, exist_ok=True)
+        (options.results / name).write_text(text, encoding="utf-8")
+
+
+def _check(files: Mapping[str, str], results: Path) -> None:
+    for name, text in files.items():
+        path = results / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            print(f"error: '{path}' is not what its inputs give; run make scorecard")
+            sys.exit(DataError.exit_code)
+
+
+def _page(studies: Sequence[Study], results: Path) -> str:
+    lines = [
+        "# Scorecard: published and ours",
+        "",
+        "Four papers on the estimation of lateral velocity and sideslip angle, re-created with vehest. One engine judges",
+        "every claim from the errors by block and seed; a verdict in *italics* rests on a network whose training has not",
+        "been shown to be sufficient. [What the verdicts mean and how often they are right](../docs/scorecard.md).",
+        "",
+        "## Should I use this method?",
+        "",
+        *_table(
+            ("paper", "answer"),
+            [(_linked(study), _line(study.paper.recommendation)) for study in studies],
+        ),
+        "",
+        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
+        "earlier code and shorter trainings.",
+        "",
+        "## Verdicts on the papers' claims",
+        "",
+        *_table_of_counts(studies, "verdict", VERDICTS, [study.counts() for study in studies]),
+        "",
+        f"*Not assessed*: {NOT_PUBLISHED}, or not of this candidate.",
+        "",
+        "Training of the least trained candidate of each claim that was assessed:",
+        "",
+        *_table_of_counts(
+            studies,
+            "training",
+            TRAINING_STATES[::-1],
+            [study.counts_of_training() for study in studies],
+        ),
+        "",
+    ]
+    for study in studies:
+        lines += _section(study, results)
+    return "\n".join([*lines, *_section_of_planted_truth(results)])
+
+
+def _table_of_counts(
+    studies: Sequence[Study], heading: str, words: Sequence[str], counts: Sequence[Counter[str]]
+) -> list[str]:
+    """Number of claims of each paper, a row a word, with their sum."""
+    rows = [(word, *(str(number[word] or MISSING) for number in counts)) for word in words]
+    rows.append(("all", *(str(number.total()) for number in counts)))
+    return _table((heading, *(_linked(study) for study in studies)), rows, n_text=1)
+
+
+def _section(study: Study, results: Path) -> list[str]:
+    paper = study.paper
+    report = results / paper.study / "report.md"
+    link = f" [Report of the study]({paper.study}/report.md)." if report.exists() else ""
+    lines = [
+        f"## {TITLES[paper.paper]}",
+        "",
+        f"{_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
+        "",
+        f"**{_line(paper.recommendation)}**",
+        "",
+    ]
+    if not study.is_published:
+        lines += [f"Not assessed yet: {NOT_PUBLISHED}.", ""]
+    for table in paper.tables:
+        lines += _section_of_table(study, table)
+    lines += [f"### Claims of {TITLES[paper.paper]}", ""]
+    lines += _table_of_claims(study, [own for own in paper.claims if not own.is_added])
+    if added := [own for own in paper.claims if own.is_added]:
+        lines += [f"### Beside the paper: {TITLES[paper.paper]}", ""]
+        lines += ["Comparisons that the paper does not make; they are in no count above.", ""]
+        lines += _table_of_claims(study, added)
+    return lines
+
+
+def _section_of_table(study: Study, table: Table) -> list[str]:
+    origin = study.paper.parts[table.part]
+    cells = []
+    for of, row, judgement in study.rows:
+        if of is not table:
+            continue
+        state = study.training.get(row.candidate)
+        structure = f" ({row.structure})" if row.structure else ""
+        unit = "" if row.unit == "1" else f" {row.unit}"
+        cells.append(
+            (
+                _text(row.candidate + structure),
+                f"`{row.metric}`",
+                f"{significant(row.published)}{unit}",
+                _figures(judgement, unit),
+                _epochs(study, row.candidate, state),
+                _verdict(judgement, state),
+            )
+        )
+    about = _line(study.paper.test_sets[table.test_set])
+    note = f" {_line(table.note)}" if table.note else ""
+    return [
+        f"### {table.table}, {TITLES[study.paper.paper]}: {table.test_set} ({table.part})",
+        "",
+        f"Ours: {origin}. {_text(about)}.{note}",
+        "",
+        *_table(
+            (
+                "candidate",
+                "metric",
+                "published",
+                "ours, 95 % interval",
+                "epochs ours / paper",
+                "verdict",
+            ),
+            cells,
+        ),
+        "",
+    ]
+
+
+def _section_of_planted_truth(results: Path) -> list[str]:
+    """Rates of verdicts on simulated studies, as `vehest_papers.planted_truth` found them."""
+    path = results / "scorecard" / "planted_truth.csv"
+    headings = {
+        "design": "blocks",
+        "seeds": "seeds",
+        "truth": "truth",
+        "wrong": "wrong",
+        "reproduced": "reproduced",
+        "direction only": "direction only",
+        "contradicted": "contradicted",
+        "no significant difference": "no significant difference",
+        "size_covered": "size in interval",
+        "wrong_equality": "wrong of equality",
+    }
+    rows = read_rows(path, tuple(headings))
+    cells = [[_text(row[name]) for name in headings] for row in rows]
+    return [
+        "## How often these verdicts are right",
+        "",
+        f"Per cent of {rows[0]['studies']} simulated studies each, made of real errors",
+        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant difference where there",
+        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where it is true or",
+        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in their interval. The",
+        "rows with one seed show why a candidate that was trained once gets no verdict. *Reproduced* excludes that there",
+        "is no effect, not that the effect is half the paper's: the interval of the size shows what is excluded.",
+        "",
+        *_table(list(headings.values()), cells, n_text=3),
+        "",
+    ]
+
+
+def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
+    cells = []
+    for claim in claims:
+        judgement = study.claims[claim.id]
+        name, state = least_training(claim, study.training)
+        origin = study.paper.parts.get(claim.part, "") if claim.not_testable is None else ""
+        reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
+        cells.append(
+            (
+                f"{_text(_line(claim.claim))} ({_text(claim.source)})",
+                _published(claim),
+                _figures(judgement, _unit(claim)),
+                f"{origin}, {claim.test_set}" if origin else MISSING,
+                _epochs(study, name, state),
+                _verdict(judgement, state),
+                reason or MISSING,
+            )
+        )
+    headings = (
+        "claim",
+        "published",
+        "ours, 95 % interval",
+        "data",
+        "epochs ours / paper",
+        "verdict",
+        "why",
+    )
+    return [*_table(headings, cells), ""]
+
+
+def _verdict(judgement: Judgement, training: Training | None) -> str:
+    """The verdict, in italics where it rests on networks whose training was not shown to suffice."""
+    is_assessed = judgement.n_blocks > 0
+    is_sufficient = training is None or training.state in ("sufficient", "not applicable")
+    return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
+
+
+def _epochs(study: Study, candidate: str, training: Training | None) -> str:
+    """Epochs of the least trained candidate, the paper's, and what is known of the training."""
+    declared = study.paper.candidates.get(candidate)
+    of_paper = declared.epochs_paper if declared is not None else None
+    if training is None or training.state == "not applicable":
+        return MISSING if of_paper is None else f"{MISSING} / {of_paper}"
+    ours = training.epochs or MISSING
+    paper = training.epochs_paper or (MISSING if of_paper is None else str(of_paper))
+    return f"{ours} / {paper}, {training.state}"
+
+
+def _unit(claim: Claim) -> str:
+    return f" {claim.unit}" if claim.unit not in (None, "1") else ""
+
+
+def _figures(judgement: Judgement, unit: str) -> str:
+    """Errors and both ratios with their intervals."""
+    words = []
+    for name, figure in judgement.values.items():
+        label = f"{_text(name)} " if len(judgement.values) > 1 else ""
+        words.append(f"{label}{_figure(figure)}{unit}")
+    if judgement.size is not None:
+        words.append(f"ratio {_figure(judgement.size)}")
+    if judgement.order is not None:
+        words.append(f"mean of blocks' ratios {_figure(judgement.order)}")
+    return "; ".join(words) or MISSING
+
+
+def _figure(figure: Figure) -> str:
+    if not math.isfinite(figure.low):
+        return significant(figure.value)
+    return f"{significant(figure.value)} [{significant(figure.low)}, {significant(figure.high)}]"
+
+
+def _published(claim: Claim) -> str:
+    words = [
+        f"{_text(name)} {significant(value) if isinstance(value, float) else _text(value)}"
+        for name, value in claim.published.items()
+    ]
+    ratio = claim.published_ratio
+    if ratio is not None:
+        words.append(f"ratio {significant(ratio)}")
+    return "; ".join(words) or MISSING
+
+
+def _csv_rows(study: Study) -> list[dict[str, str]]:
+    rows = []
+    for table, row, judgement in study.rows:
+        claim = Claim(
+            "",
+            f"{row.candidate} {row.structure}".strip(),
+            table.table,
+            candidate=row.candidate,
+            part=table.part,
+            test_set=table.test_set,
+            metric=row.metric,
+            published={row.candidate: row.published},
+        )
+        rows.append(_csv_row(study, claim, judgement, "table"))
+    for claim in study.paper.claims:
+        kind = "added comparison" if claim.is_added else "claim"
+        rows.append(_csv_row(study, claim, study.claims[claim.id], kind))
+    return rows
+
+
+def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dict[str, str]:
+    name, state = least_training(claim, study.training)
+    declared = study.paper.candidates.get(name)
+    of_paper = "" if declared is None or declared.epochs_paper is None else declared.epochs_paper
+    return {
+        "paper": study.paper.paper,
+        "row": kind,
+        "id": claim.id,
+        "text": _line(claim.claim),
+        "source": claim.source,
+        "data": study.paper.parts.get(claim.part, ""),
+        "part": claim.part,
+        "test_set": claim.test_set,
+        "metric": claim.metric,
+        "published": "; ".join(f"{name} {value}" for name, value in claim.published.items()),
+        "ours": "; ".join(f"{name} {_figure(figure)}" for name, figure in judgement.values.items()),
+        "published_ratio": _number(claim.published_ratio),
+        **_ends("size", judgement.size),
+        **_ends("order", judgement.order),
+        "p_value": _number(judgement.p_value),
+        "blocks": str(judgement.n_blocks or ""),
+        "seeds": " ".join(str(number) for number in (judgement.n_seeds or {}).values()),
+        "diverged": " ".join(str(number) for number in (judgement.diverged or {}).values()),
+        "power": _number(judgement.power),
+        "blocks_needed": str(judgement.blocks_needed or ""),
+        "training": state.state if state is not None else "not applicable",
+        "epochs": state.epochs if state is not None else "",
+        "epochs_paper": str(of_paper),
+        "verdict": judgement.verdict,
+        "reason": judgement.reason,
+    }
+
+
+def _ends(name: str, figure: Figure | None) -> dict[str, str]:
+    values = (None, None, None) if figure is None else (figure.value, figure.low, figure.high)
+    keys = (name, f"{name}_low", f"{name}_high")
+    return {key: _number(value) for key, value in zip(keys, values, strict=True)}
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None or not math.isfinite(value) else f"{value:.4g}"
+
+
+def _changes(studies: Sequence[Study], before: Path) -> tuple[Sequence[str], list[dict[str, str]]]:
+    """Claims as they were judged before this engine, with their verdicts now."""
+    columns = ("paper", "old_claim", "data", "old_verdict", "id", "verdict", "reason", "mapping")
+    judged = {
+        (study.paper.paper, name): judgement
+        for study in studies
+        for name, judgement in study.claims.items()
+    }
+    rows = []
+    for row in read_rows(before, ("paper", "old_claim", "data", "verdict", "id", "reason")):
+        ids = [] if row["id"] == "removed" else row["id"].split()
+        absent = [name for name in ids if (row["paper"], name) not in judged]
+        if absent:
+            raise DataError(
+                f"'{before}': {row['paper']} has no claim {absent[0]!r}; write an id of claims.yaml"
+            )
+        now = [judged[row["paper"], name] for name in ids]
+        rows.append(
+            {
+                "paper": row["paper"],
+                "old_claim": row["old_claim"],
+                "data": row["data"],
+                "old_verdict": row["verdict"],
+                "id": row["id"],
+                "verdict": "; ".join(judgement.verdict for judgement in now) or "removed",
+                "reason": "; ".join(dict.fromkeys(judgement.reason for judgement in now)),
+                "mapping": row["reason"],
+            }
+        )
+    return columns, rows
+
+
+def _csv(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> str:
+    stream = io.StringIO(newline="")
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def _table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], n_text: int | None = None
+) -> list[str]:
+    """A Markdown table; columns from ``n_text`` on are numbers, aligned to the right."""
+    n_text = len(headings) if n_text is None else n_text
+    rule = [":--"] * n_text + ["--:"] * (len(headings) - n_text)
+    return [f"| {' | '.join(cells)} |" for cells in (headings, rule, *rows)]
+
+
+def _linked(study: Study) -> str:
+    title = TITLES[study.paper.paper]
+    return f"[{title}](#{title.lower().replace(' ', '-')})"
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _text(text: str) -> str:
+    """Text of a cell: characters that Markdown would take for markup are escaped."""
+    for character in "\\|*_<[":
+        text = text.replace(character, f"\\{character}")
+    return text
+
+
+if __name__ == "__main__":
+    main()
