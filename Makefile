@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots example_log clean ferrari_drive ksnn learned_ukf heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -68,7 +68,7 @@ test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium c
 	$(BIN)/python -m pytest -m "page and not slow" -rs
 
 TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
-TESTS_docs := tests/test_docs.py tests/test_examples.py
+TESTS_docs := tests/test_docs.py tests/test_shown_commands.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py
@@ -121,6 +121,11 @@ docs-site: $(INSTALLED) ## a site of all pages in build/site, every warning an e
 screenshots: $(INSTALLED) docs-site ## pictures of the quickstart's page and of the site, in docs/images; needs Chromium
 	$(BIN)/vehest run quickstart tracking=none
 	PYTHONPATH=tests $(BIN)/python tests/screenshots.py "$$(ls -td "$${VEHEST_OUTPUT:-outputs}"/report/quickstart-*/ | head -1)report.html" build/site docs/images
+
+example_log: $(INSTALLED) ## docs/examples/lap.csv, the log of the how-to guides: four minutes of a simulated Ferrari 250 LM
+	$(BIN)/vehest downsample sim_quickstart rate_hz=20 vehicle@dataset.vehicle=ferrari_250_lm \
+	  'dataset.drives=[{id: lap, seed: 7, manoeuvre: {name: laps, course: palm_beach_like, duration: 240, severity: [0.92, 1.0]}}]'
+	$(BIN)/python docs/make_example_log.py "$$(ls -t "$${VEHEST_OUTPUT:-outputs}"/downsample/sim_quickstart-20hz-*/lap.parquet | head -1)"
 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml

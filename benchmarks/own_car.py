@@ -56,10 +56,16 @@ def write_log(data: Path, file: Path) -> None:
 
 
 def timed(folder: Path, *words: str) -> tuple[float, str]:
-    """Seconds and standard output of a command; its standard error goes on to ours."""
+    """Seconds and standard output of a command without VEHEST_DATA; its standard error goes on to ours."""
+    environment = os.environ | {"VEHEST_OUTPUT": str(folder / "outputs")}
+    del environment["VEHEST_DATA"]
     start = time.monotonic()
     done = subprocess.run(
-        [sys.executable, "-m", "vehest", *words], cwd=folder, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "vehest", *words],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     if done.returncode != 0:
         sys.exit(f"vehest {' '.join(words)} ended with {done.returncode}")
@@ -75,8 +81,6 @@ def main() -> None:
         sys.exit("set VEHEST_DATA to the folder with the recordings")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        os.environ["VEHEST_OUTPUT"] = str(folder / "outputs")
-        os.environ.pop("VEHEST_DATA")
         write_log(Path(data), folder / "lap.csv")
         rows = []
         output = ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import inspect
+import json
 import math
 import re
 from collections import Counter
@@ -26,6 +27,41 @@ PART = re.compile(
     r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL
 )
 
+HEADINGS = {
+    "v = 0": "zero",
+    "map with reference": "static map, fitted to the drive",
+    "shipped": "shipped network",
+    "band holds": "coverage",
+    "choices": "role",
+    "worse than v = 0": "worse than zero",
+    "paper": "published",
+    "real_drive": "550 to 700 s",
+    "real_whole": "whole drive",
+    "rmse_sideslip_offline_deg": "RMSE(β) offline [deg]",
+    "rmse_sideslip_online_deg": "online [deg]",
+    "ratio_sideslip": "ratio",
+    "title": "estimator",
+    "rmse_sideslip": "RMSE(β) [deg]",
+    "interval": "95 % interval",
+    "n_seeds": "seeds",
+    "beats_zero": "better than zero",
+    "beats_static_map": "better than static_map",
+    "share": "share of faults that are flagged",
+    "per_hour": "alarms an hour",
+    "low": "from (95 %)",
+    "high": "to",
+    "of_a_sensor": "alarms that accuse a sensor",
+    "than 1.1 times shipped": "worse than 1.1 times the shipped network",
+}
+"""Headings of reports' tables -> those of pages."""
+CELLS = {
+    "not told apart": "no significant difference",
+    "Zero (v = 0)": "Zero",
+    "made on it": "development",
+    "not": "test",
+}
+"""Cells of reports' tables -> those of pages."""
+
 BASELINES = ("zero", "static_map")
 OVERVIEWS = {
     "rational_ekf": (
@@ -43,7 +79,7 @@ OVERVIEWS = {
         "cnn_ukf",
         "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
         {
-            "part": "learnt on",
+            "part": "trained on",
             "candidate": "method",
             "ours_mse": "MSE",
             "ours_mse_nonlinear": "MSE_nl",
@@ -52,7 +88,7 @@ OVERVIEWS = {
     ),
     "learned_ukf": (
         "learned_ukf",
-        "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
+        "Weighted squared error of the states, **real** recordings, means over seeds; no training uses tyre D",
         {
             "candidate": "method",
             "ours_tyre_a": "tyre A",
@@ -62,6 +98,9 @@ OVERVIEWS = {
     ),
 }
 """Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
+
+VERDICTS = {"lowest": "best", "not told apart": "not significant", "": "–"}
+"""Verdict in a published leaderboard -> how the page says it."""
 
 COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
@@ -312,7 +351,7 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
 
 
 def figures(shown: str, *estimators: str) -> Iterable[str]:
-    """What published studies say of families, and a figure, named as STUDY/FIGURE, with its caption."""
+    """What published studies report of families, and a figure, named as STUDY/FIGURE, with its caption."""
     yield from _on_the_same_drive(estimators)
     for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
         rows = [
@@ -340,13 +379,47 @@ def _on_the_same_drive(estimators: Sequence[str]) -> Iterable[str]:
     wanted = [*estimators, *(name for name in BASELINES if name not in estimators)]
     shown = [row for name in wanted for row in rows if row["estimator"] == name]
     if any(row["estimator"] in estimators for row in shown):
-        yield "RMSE(β) [deg] with its 95 % interval, learnt on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
+        yield "RMSE(β) [deg] with its 95 % interval, trained on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
         cells = ("Ferrari 250 LM (real), 550 to 700 s", *(_with_interval(row) for row in shown))
         yield _table(("test", *(row["title"] for row in shown)), [cells], right=len(shown))
 
 
 def _with_interval(row: dict[str, str]) -> str:
     return f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
+
+
+# Excerpts
+
+
+def excerpt(source: str, columns: str, rows: str = "") -> Iterable[str]:
+    """Columns, numbered from 1, of a CSV file or of a Markdown table of a report.
+
+    ``source`` is a file below results/, of a report with ``#2`` behind it for its second table. ``rows`` is a
+    pattern that the cells of a row, joined by commas, begin with; ``_`` stands for a blank.
+    """
+    name, _, number = source.partition("#")
+    path = RESULTS / name
+    if not path.is_file():
+        return
+    lines = _csv_lines(path) if path.suffix == ".csv" else _table_lines(path, int(number or 1))
+    indices = [int(column) - 1 for column in columns.split(",")]
+    pattern = re.compile(rows.replace("_", " "))
+    header = [HEADINGS.get(lines[0][index], lines[0][index]) for index in indices]
+    matches = [line for line in lines[1:] if pattern.match(",".join(line))]
+    cells = [[CELLS.get(line[index], line[index]) for index in indices] for line in matches]
+    yield _table(header, cells, right=len(indices) - 1)
+
+
+def _csv_lines(path: Path) -> list[list[str]]:
+    with open(path, newline="", encoding="utf-8") as stream:
+        return [[_rounded(cell) or "–" for cell in line] for line in csv.reader(stream)]
+
+
+def _table_lines(path: Path, number: int) -> list[list[str]]:
+    """Cells of a report's table, without the rule below its header."""
+    tables = re.findall(r"^\|.*(?:\n\|.*)+", path.read_text(encoding="utf-8"), re.MULTILINE)
+    header, _, *lines = tables[number - 1].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in (header, *lines)]
 
 
 # Published results
@@ -360,9 +433,10 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
             f"{float(row['n_parameters']):.0f}",
             f"{float(row['rmse_sideslip']):.3f}",
             row["interval"],
-            row["against_best"],
-            row["beats_zero"] or "–",
-            row["beats_static_map"] or "–",
+            *(
+                VERDICTS.get(row[column], row[column])
+                for column in ("against_best", "beats_zero", "beats_static_map")
+            ),
             f"{float(row['fvu']):.3f}",
         )
         for row in _rows(RESULTS / source)
@@ -371,13 +445,143 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         "parameters",
         "RMSE(β) [deg]",
         "95 % interval [deg]",
-        "to the lowest [deg]",
-        "beats v = 0",
+        "difference to best [deg]",
+        "beats zero",
         "beats static map",
         "FVU",
     )
     if lines:
         yield _table(("estimator", *columns), lines, right=len(columns))
+
+
+def wheelbase_of_small_cars() -> Iterable[str]:
+    """RMSE(β) of the self-calibrating filter on small cars with and without their wheelbase."""
+    tables = _tables_of_markdown(RESULTS / "unseen_car" / "report.md")
+    zero = {
+        row["car"]: row["v = 0"]
+        for table in tables
+        for row in table
+        if {"car", "v = 0"} <= row.keys()
+    }
+    lines = [
+        (row["car"].removesuffix(" (real)"), zero[row["car"]], row["cold"], row["car not given"])
+        for table in tables
+        for row in table
+        if "car not given" in row and ", 1:" in row["car"]
+    ]
+    columns = ("`zero` [deg]", "with wheelbase [deg]", "without [deg]")
+    if lines:
+        yield _table(("car", *columns), lines, right=len(columns))
+
+
+def _tables_of_markdown(path: Path) -> list[list[dict[str, str]]]:
+    """Every table of a report, a dictionary a row."""
+    if not path.is_file():
+        return []
+    tables = []
+    for block in re.findall(r"(?:^\|.*\|$\n?)+", path.read_text(encoding="utf-8"), re.MULTILINE):
+        header, _, *rows = (
+            [cell.strip() for cell in line.strip("| ").split(" | ")] for line in block.splitlines()
+        )
+        tables.append([dict(zip(header, row, strict=True)) for row in rows])
+    return tables
+
+
+# Benchmarks
+
+
+def benchmarks(*names: str) -> Iterable[str]:
+    """Time and memory of the plain way and of vehest, a row a case of the benchmarks named."""
+    lines = [
+        (
+            case["case"],
+            _seconds(case["baseline_seconds"]),
+            _seconds(case["ours_seconds"]),
+            _two_digits(case["baseline_seconds"] / case["ours_seconds"]),
+            name,
+        )
+        for name in names
+        for case in _json(f"benchmarks/{name}.json").get("cases", [])
+        if {"baseline_seconds", "ours_seconds"} <= case.keys()
+    ]
+    if lines:
+        yield _table(("case", "plain", "vehest", "ratio", "file"), lines, right=4)
+
+
+def workflow() -> Iterable[str]:
+    """Time and memory of whole commands."""
+    titles = {
+        "help": "`vehest --help`",
+        "run_finished": "`vehest run` of a finished study",
+        "estimate_minute": "`vehest estimate`, one minute",
+        "estimate_15_h": "`vehest estimate`, 15 hours at 100 Hz",
+    }
+    measured = _json("benchmarks/workflow.json").get("now", {})
+    lines = [
+        (titles[name], f"{value['seconds']:.2f} s", f"{value['peak_mb']:.0f} MB")
+        for name, value in measured.items()
+    ]
+    if lines:
+        yield _table(("command", "time", "memory"), lines, right=2)
+
+
+def launchers() -> Iterable[str]:
+    """Time that the launchers add to a task, and what one parent process sustains."""
+    measured = _json("benchmarks/launchers.json")
+    if not measured:
+        return
+    local, ray = measured["launchers"]["local"], measured["launchers"]["ray"]
+    yield _table(
+        ("two cores", "local", "Ray"),
+        [
+            ("until the first group begins", _seconds(local["start_s"]), _seconds(ray["start_s"])),
+            ("added to a task", _seconds(local["added_s"]), _seconds(ray["added_s"])),
+        ],
+        right=2,
+    )
+    untracked, tracked = measured["sweep"]["none"], measured["sweep"]["mlflow"]
+    yield _table(
+        ("part of one parent process", "measured"),
+        [
+            (
+                "Ray's scheduler",
+                f"{measured['scheduler']['empty_tasks_a_second']:.0f} empty tasks a second",
+            ),
+            (
+                "work for a training, without tracking",
+                _seconds(untracked["parent_cpu_s_a_training"]),
+            ),
+            (
+                "work for a training in MLflow's local store",
+                _seconds(tracked["mlflow_s_a_training"]),
+            ),
+            (
+                "planning of a combination of a sweep",
+                _seconds(measured["planning"]["seconds_a_combination"]),
+            ),
+            (
+                "artefacts of a training",
+                f"{untracked['bytes_a_training'] / 1e3:.0f} kB, {untracked['files_a_training']:.0f} files",
+            ),
+            ("memory over 2,000 trainings", f"{untracked['parent_mb']:.0f} MB"),
+        ],
+        right=1,
+    )
+
+
+def _json(source: str) -> dict[str, Any]:
+    path = RESULTS / source
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+def _two_digits(ratio: float) -> str:
+    return f"{float(f'{ratio:.2g}'):g}"
+
+
+def _seconds(value: float) -> str:
+    """Three digits, in s, ms or µs."""
+    factor, unit = (1.0, "s") if value >= 1.0 else (1e3, "ms") if value >= 1e-3 else (1e6, "µs")
+    return f"{value * factor:.3g} {unit}" if value < 1000.0 else f"{value:.0f} s"
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -406,7 +610,22 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-_PARTS = (commands, files, channels, units, manoeuvres, courses, settings, figures, leaderboard)
+_PARTS = (
+    commands,
+    files,
+    channels,
+    units,
+    manoeuvres,
+    courses,
+    settings,
+    figures,
+    excerpt,
+    leaderboard,
+    wheelbase_of_small_cars,
+    benchmarks,
+    workflow,
+    launchers,
+)
 PARTS: dict[str, Callable[..., Iterable[str]]] = {part.__name__: part for part in _PARTS}
 
 if __name__ == "__main__":

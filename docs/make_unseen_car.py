@@ -9,7 +9,7 @@ import argparse
 import csv
 import os
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.io
+import yaml
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError
@@ -112,6 +113,8 @@ CARS = (
     ),
     Car("AutoRally, 1:5, smoothed signals", "real", False, 0.57, None, "autorally", slowest=1.0),
 )
+FILES = {"stanford_tts": "stanford_tts/*.mat", "autorally": "autorally/mppi_*.mat"}
+"""Raw files of cars that no data set in conf/dataset reads."""
 SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
 LARGEST_RATIO = 1.1
 METHODS = (
@@ -172,6 +175,19 @@ class Errors(NamedTuple):
     time: FloatArray
     title: str
     speed: float  # median [m/s]
+
+
+def raw_files_of(cars: Iterable[Car]) -> list[str]:
+    """Names of the keys of everything that is read of cars (`vehest.run.table_records`)."""
+    names = set()
+    for car in cars:
+        name = car.dataset
+        names.add(f"files {FILES[name]}" if name in FILES else f"data {name}")
+        if car.unlabelled == ROBUSTNESS:
+            names.add("files roboracer/robustness/*.csv")
+        elif car.unlabelled:
+            names.add("data ferrari_250lm_unlabelled")
+    return sorted(names)
 
 
 def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
@@ -415,6 +431,14 @@ def git(*words: str) -> str:
     ).stdout.strip()
 
 
+def chosen_since(before: str, now: str) -> list[str]:
+    """Settings of the filter that have other values in one commit than in an earlier one."""
+    earlier, later = (
+        yaml.safe_load(git("show", f"{commit}:{CHOICES}"))["estimator"] for commit in (before, now)
+    )
+    return sorted(name for name, value in later.items() if (name, value) not in earlier.items())
+
+
 def open_cars(cars: Sequence[str], note: str) -> None:
     """Append what is scored to openings.csv, with a note; raises SystemExit where the choices are not committed."""
     if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators", "src/vehest/run"):
@@ -424,12 +448,7 @@ def open_cars(cars: Sequence[str], note: str) -> None:
     file = TARGET / "openings.csv"
     commit = git("rev-parse", "HEAD")
     rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
-    changed = (
-        git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
-    )
-    names = sorted(
-        {line[1:].split(":")[0].strip() for line in changed if line[:1] == "+" and line[1:2] == " "}
-    )
+    names = chosen_since(rows[-1]["commit"], commit) if rows else []
     rows.append(
         {
             "commit": commit,
@@ -617,7 +636,7 @@ def main() -> None:
             [
                 "script docs/make_unseen_car.py",
                 "evaluate self_calibrating",
-                *(f"data {name}" for name in sorted({car.dataset for car in found})),
+                *raw_files_of(found),
             ],
         )
 

@@ -26,6 +26,7 @@ from make_unseen_car import (
     filter_of,
     identified_on,
     ingested,
+    raw_files_of,
     table,
 )
 
@@ -717,7 +718,7 @@ def main() -> None:
         [
             "script docs/unseen_car_record.py",
             "evaluate self_calibrating",
-            *(f"data {name}" for name in sorted({car.dataset for car in CARS if car.development})),
+            *raw_files_of(car for car in CARS if car.development),
         ],
     )
 

@@ -210,7 +210,7 @@ class Place:
         found, _, err = self(*arguments)
         assert found != 0
         lines = [
-            line for line in err.splitlines() if not line.startswith(("done", "skipped", "once"))
+            line for line in err.splitlines() if not line.startswith(("done", "reused", "once"))
         ]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")

@@ -11,19 +11,28 @@ from PIL import Image
 from chromium import browser, opened
 
 LOOKS = {1280: 1.0, 390: 2.0}  # width [px] -> pixels of the picture for one of the page
+MARGIN = 16  # px above the first element
 HEIGHTS = {1280: 1150, 390: 1500}
 SCHEMES = ("light", "dark")
 SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"}
 
 
 def picture(driver, top, width, path):
-    """A part of the page that is open, from ``top`` down, in few colours."""
-    clip = {"x": 0, "y": top, "width": width, "height": HEIGHTS[width], "scale": LOOKS[width]}
+    """A part of the page that is open, from ``top`` down, in 256 colours."""
+    clip = {
+        "x": 0,
+        "y": max(top - MARGIN, 0),
+        "width": width,
+        "height": HEIGHTS[width],
+        "scale": LOOKS[width],
+    }
     shot = driver.execute_cdp_cmd(
         "Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip}
     )["data"]
     with Image.open(io.BytesIO(base64.b64decode(shot))) as image:
-        image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+        image.convert("RGB").quantize(
+            256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        ).save(path, optimize=True)
 
 
 def main(report, site, out):

@@ -50,7 +50,7 @@ def test_each_example_is_a_module_and_a_configuration_of_few_lines_on_the_page()
     lines = {
         file.name: len(file.read_text(encoding="utf-8").splitlines())
         for file in EXAMPLES.iterdir()
-        if file.is_file()
+        if file.suffix in (".py", ".yaml", ".j2")
     }
     assert set(lines) == {f"{name}.{end}" for name in NAMES for end in ("py", "yaml")} | {
         "sliding_mode.c.j2"
@@ -164,7 +164,7 @@ def block_with(words):
 def test_smallest_estimator_on_the_page_integrates_and_runs_online():
     namespace = {"__name__": "smallest"}
     exec(compile(block_with("class Leaky"), "smallest", "exec", dont_inherit=True), namespace)
-    model = namespace["Leaky"].from_config({"rate_hz": 20.0, "kept": 0.9})
+    model = namespace["Leaky"].from_config({"rate_hz": 20.0, "decay": 0.9})
     drive = planar_drive(5.0)
     expected = 0.0
     stepper = model.online()

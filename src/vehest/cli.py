@@ -79,7 +79,7 @@ PIPELINES = _offer(pipeline_names)
 
 DryRun = Annotated[
     bool,
-    typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing."),
+    typer.Option("--dry-run", help="List the stages that would run or be reused; run nothing."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
 DatasetOrFile = Annotated[
@@ -189,14 +189,15 @@ def new_car(
     mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
     steering_ratio: Annotated[
         float | None,
-        typer.Option("--steering-ratio", help="Steering wheel's angle to the road wheels'."),
+        typer.Option("--steering-ratio", help="Overall steering ratio."),
     ] = None,
     own: Annotated[
         list[str] | None,
         typer.Option(
             "--with",
-            metavar="PACKAGE.MODULE:CLASS",
-            help="Compare also an installed estimator of your own; repeatable.",
+            metavar="NAME|PACKAGE.MODULE:CLASS",
+            help="Compare also this estimator: a built-in family "
+            f"({', '.join(choices('estimator'))}) or an installed class of your own; repeatable.",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -418,18 +419,21 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid. An .mf4
+    The table contains v [m/s], β [rad and deg], half widths of their calibrated 90 % bands, and the health of each sample: 0 valid,
+    1 degraded, 2 invalid. An .mf4
     is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
-    For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` takes the self-calibrating
+    For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` uses the self-calibrating
     filter, with a note; estimator.smoothed=true makes it the whole drive's at once.
 
     Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     from vehest.run.estimate import estimate_file
+    from vehest.run.estimate_summary import summary_lines
 
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    emit(as_json, estimate_file(words, out, strict=strict, car=car))
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    emit(as_json, outcome, summary_lines(outcome))
 
 
 @app.command()
@@ -647,7 +651,7 @@ def compare(
         list[str] | None,
         typer.Argument(
             metavar="[ESTIMATE]... [OVERRIDES]...",
-            help="Tables with time and v [m/s] or β [rad], made by any tool, or by `vehest estimate`; then key=value …",
+            help="Tables with time and v [m/s] or β [rad or deg], made by any tool, or by `vehest estimate`; then key=value …",
             show_default=False,
         ),
     ] = None,
@@ -660,16 +664,35 @@ def compare(
             autocompletion=MODELS,
         ),
     ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--column",
+            metavar="QUANTITY=COLUMN",
+            help="Column of time, vy or sideslip in a table of another tool, such as sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
+            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    shift: Annotated[
+        str,
+        typer.Option(
+            "--shift",
+            metavar="SECONDS|auto",
+            help="Added to the times of other tools' tables; auto: by correlation with the reference.",
+        ),
+    ] = "0",
     as_json: AsJson = False,
 ) -> None:
     """Score estimates of any tool on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
 
-    v = 0 and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all estimates have, with 95 %
-    intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
+    The zero-sideslip baseline and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all
+    estimates have, with 95 % intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
+    A model that was trained on the recording is listed and left out of the verdict.
     """
     from vehest.run.compare_files import compare_files
 
-    emit(as_json, *compare_files(recording, words or [], models or []))
+    emit(as_json, *compare_files(recording, words or [], models or [], columns or [], shift))
 
 
 @app.command()
@@ -705,7 +728,7 @@ def run(
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
-    Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
+    Existing artefacts are reused, and so are published weights of trainings with the same key. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
     options = RunOptions(
@@ -797,7 +820,7 @@ def sweep(
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
 
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
-    on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
+    on the validation range. Existing artefacts are reused, a failed job stops no other, the same command finishes what is missing.
     """
     options = RunOptions(
         force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ()

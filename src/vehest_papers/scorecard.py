@@ -26,7 +26,22 @@ from vehest_papers.kit.block_errors import (
     read_blocks,
     read_training,
 )
-from vehest_papers.kit.claim_files import Claim, Paper, Row, Table, read_paper
+from vehest_papers.kit.claim_files import (
+    CLAIMS_FOLDER,
+    Claim,
+    Paper,
+    Row,
+    Table,
+    read_paper,
+)
+from vehest_papers.kit.verdict_table import (
+    epochs_in_words,
+    figure_in_words,
+    figures_in_words,
+    one_line,
+    published_in_words,
+    unit_of,
+)
 from vehest_papers.kit.verdicts import (
     NOT_PUBLISHED,
     VERDICTS,
@@ -44,7 +59,6 @@ TITLES = {
     "heavy_ekf": "Heavy-vehicle EKF",
     "cnn_ukf": "CNN-UKF",
 }
-CLAIMS_FOLDER = Path(__file__).parent
 CSV_COLUMNS = (
     "paper",
     "row",
@@ -76,6 +90,38 @@ CSV_COLUMNS = (
     "verdict",
     "reason",
 )
+LEGEND = (
+    (
+        "NNTF_UH, RATTE, …",
+        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` describes each",
+    ),
+    ("published", "value of the paper"),
+    (
+        "ours",
+        "the same error of our run with its 95 % interval; the data are marked as real or simulated",
+    ),
+    (
+        "metric",
+        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], `rmse_sideslip` [deg] and the "
+        "others: [metrics](../docs/evaluation.md#metrics)",
+    ),
+    (
+        "ratio",
+        "error of the first candidate of a claim over that of the second, all samples together; below 1 the first "
+        "one is better",
+    ),
+    (
+        "mean of blocks' ratios",
+        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same weight for each",
+    ),
+    ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
+    (
+        "verdict",
+        "from the errors by block and seed ([definitions, and how often they are right](../docs/scorecard.md)); in "
+        "*italics* where the training has not been shown to be sufficient",
+    ),
+)
+"""Columns of the page's tables and what they hold."""
 
 
 @dataclass(frozen=True)
@@ -164,19 +210,23 @@ def _page(studies: Sequence[Study], results: Path) -> str:
     lines = [
         "# Scorecard: published and ours",
         "",
-        "Four papers on the estimation of lateral velocity and sideslip angle, re-created with vehest. One engine judges",
-        "every claim from the errors by block and seed; a verdict in *italics* rests on a network whose training has not",
-        "been shown to be sufficient. [What the verdicts mean and how often they are right](../docs/scorecard.md).",
+        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs of their methods in vehest:",
+        "first whether to use each method, then how many claims of its paper were reproduced, then every table row and",
+        "claim with the published value and ours.",
         "",
         "## Should I use this method?",
         "",
         *_table(
             ("paper", "answer"),
-            [(_linked(study), _line(study.paper.recommendation)) for study in studies],
+            [(_linked(study), one_line(study.paper.recommendation)) for study in studies],
         ),
         "",
         "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
         "earlier code and shorter trainings.",
+        "",
+        "## How to read the tables",
+        "",
+        *_table(("column or name", "meaning"), LEGEND, n_text=2),
         "",
         "## Verdicts on the papers' claims",
         "",
@@ -215,9 +265,9 @@ def _section(study: Study, results: Path) -> list[str]:
     lines = [
         f"## {TITLES[paper.paper]}",
         "",
-        f"{_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
+        f"{one_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
         "",
-        f"**{_line(paper.recommendation)}**",
+        f"**{one_line(paper.recommendation)}**",
         "",
     ]
     if not study.is_published:
@@ -247,13 +297,13 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 _text(row.candidate + structure),
                 f"`{row.metric}`",
                 f"{significant(row.published)}{unit}",
-                _figures(judgement, unit),
-                _epochs(study, row.candidate, state),
+                figures_in_words(judgement, unit, _text),
+                epochs_in_words(study.paper, row.candidate, state),
                 _verdict(judgement, state),
             )
         )
-    about = _line(study.paper.test_sets[table.test_set])
-    note = f" {_line(table.note)}" if table.note else ""
+    about = one_line(study.paper.test_sets[table.test_set])
+    note = f" {one_line(table.note)}" if table.note else ""
     return [
         f"### {table.table}, {TITLES[study.paper.paper]}: {table.test_set} ({table.part})",
         "",
@@ -315,11 +365,11 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
         reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
         cells.append(
             (
-                f"{_text(_line(claim.claim))} ({_text(claim.source)})",
-                _published(claim),
-                _figures(judgement, _unit(claim)),
+                f"{_text(one_line(claim.claim))} ({_text(claim.source)})",
+                published_in_words(claim, _text),
+                figures_in_words(judgement, unit_of(claim), _text),
                 f"{origin}, {claim.test_set}" if origin else MISSING,
-                _epochs(study, name, state),
+                epochs_in_words(study.paper, name, state),
                 _verdict(judgement, state),
                 reason or MISSING,
             )
@@ -341,51 +391,6 @@ def _verdict(judgement: Judgement, training: Training | None) -> str:
     is_assessed = judgement.n_blocks > 0
     is_sufficient = training is None or training.state in ("sufficient", "not applicable")
     return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
-
-
-def _epochs(study: Study, candidate: str, training: Training | None) -> str:
-    """Epochs of the least trained candidate, the paper's, and what is known of the training."""
-    declared = study.paper.candidates.get(candidate)
-    of_paper = declared.epochs_paper if declared is not None else None
-    if training is None or training.state == "not applicable":
-        return MISSING if of_paper is None else f"{MISSING} / {of_paper}"
-    ours = training.epochs or MISSING
-    paper = training.epochs_paper or (MISSING if of_paper is None else str(of_paper))
-    return f"{ours} / {paper}, {training.state}"
-
-
-def _unit(claim: Claim) -> str:
-    return f" {claim.unit}" if claim.unit not in (None, "1") else ""
-
-
-def _figures(judgement: Judgement, unit: str) -> str:
-    """Errors and both ratios with their intervals."""
-    words = []
-    for name, figure in judgement.values.items():
-        label = f"{_text(name)} " if len(judgement.values) > 1 else ""
-        words.append(f"{label}{_figure(figure)}{unit}")
-    if judgement.size is not None:
-        words.append(f"ratio {_figure(judgement.size)}")
-    if judgement.order is not None:
-        words.append(f"mean of blocks' ratios {_figure(judgement.order)}")
-    return "; ".join(words) or MISSING
-
-
-def _figure(figure: Figure) -> str:
-    if not math.isfinite(figure.low):
-        return significant(figure.value)
-    return f"{significant(figure.value)} [{significant(figure.low)}, {significant(figure.high)}]"
-
-
-def _published(claim: Claim) -> str:
-    words = [
-        f"{_text(name)} {significant(value) if isinstance(value, float) else _text(value)}"
-        for name, value in claim.published.items()
-    ]
-    ratio = claim.published_ratio
-    if ratio is not None:
-        words.append(f"ratio {significant(ratio)}")
-    return "; ".join(words) or MISSING
 
 
 def _csv_rows(study: Study) -> list[dict[str, str]]:
@@ -416,14 +421,16 @@ def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dic
         "paper": study.paper.paper,
         "row": kind,
         "id": claim.id,
-        "text": _line(claim.claim),
+        "text": one_line(claim.claim),
         "source": claim.source,
         "data": study.paper.parts.get(claim.part, ""),
         "part": claim.part,
         "test_set": claim.test_set,
         "metric": claim.metric,
         "published": "; ".join(f"{name} {value}" for name, value in claim.published.items()),
-        "ours": "; ".join(f"{name} {_figure(figure)}" for name, figure in judgement.values.items()),
+        "ours": "; ".join(
+            f"{name} {figure_in_words(figure)}" for name, figure in judgement.values.items()
+        ),
         "published_ratio": _number(claim.published_ratio),
         **_ends("size", judgement.size),
         **_ends("order", judgement.order),
@@ -503,10 +510,6 @@ def _table(
 def _linked(study: Study) -> str:
     title = TITLES[study.paper.paper]
     return f"[{title}](#{title.lower().replace(' ', '-')})"
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _text(text: str) -> str:

@@ -272,3 +272,33 @@ def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measure
 )
 def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length, speed, noted):
     assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted
+
+
+@pytest.mark.parametrize(
+    ("length", "value", "is_found"),
+    [(1, 7.3, True), (20, 7.3, True), (300, 7.3, False), (1, 0.05, False)],
+    ids=["one sample", "a fifth of a second", "a manoeuvre of 3 s", "within the usual range"],
+)
+def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_found):
+    """419° at a steering wheel is possible, but not for one sample."""
+    drive = clean_drive()
+    handwheel = 15.0 * drive["steer"]
+    handwheel[3000 : 3000 + length] = value
+    drive = replace(drive, channels={**drive.channels, "handwheel": handwheel})
+    found = [one for one in checks_of_recording(drive) if one.check == "spike"]
+    assert [one.channel for one in found] == ["handwheel"] * is_found
+    assert all("jumps once" in one.message and "7.3 rad at 40 s" in one.message for one in found)
+
+
+def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
+    drive = clean_drive()
+    shaking = 5.0 * (-1.0) ** np.arange(len(drive))
+    shaking[3000] = 22.0  # by 27 m/s², two of its ranges, but not three of its steps of 10 m/s²
+    standing = {name: samples.copy() for name, samples in drive.channels.items()}
+    for samples in standing.values():
+        samples[3000:3400] = 0.0
+    standing["sideslip_ref"] = 0.02 * np.sin(0.01 * np.arange(len(drive)))
+    standing["sideslip_ref"][3200] = 3.0
+    for channels in ({**drive.channels, "ax": shaking}, standing):
+        found = checks_of_recording(replace(drive, channels=channels))
+        assert "spike" not in [one.check for one in found]

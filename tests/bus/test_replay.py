@@ -70,8 +70,8 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
     assert figures["samples_lost"] == 0
     assert figures["estimates"] == len(table) == len(expected)
     np.testing.assert_allclose(
-        table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9
-    )
+        table[["vy", "sideslip", "health"]], np.array(expected), rtol=5e-6, atol=1e-9
+    )  # half a unit of the six digits that a CSV file has
     replayed(write_log(drive(), tmp_path), out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
     ahead = stepper.horizon_steps / 20.0 - stepper.delay

@@ -69,7 +69,7 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ({"names": "a"}, "it.names must be a list of names, not 'a'"),
         (
             {"inner": [{"gain": 1, "gian": 1}]},
-            "it.inner.0.gian is not an option of it.inner.0; options: gain, steps",
+            "it.inner.0.gian is not an option of it.inner.0; did you mean 'it.inner.0.gain'? options: gain, steps",
         ),
         ({"lists": [3]}, "it.lists.0 must be a list, not 3"),
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),

@@ -17,11 +17,9 @@ from vehest.evaluation.significance import (
     root_interval,
     root_intervals,
 )
-from vehest_papers.kit.paired import paired_difference, sequence_labels
 
 N_SEQUENCES = 16
 LENGTH = 100
-LABELS = sequence_labels([LENGTH] * N_SEQUENCES)
 
 
 def losses(generator, n_seeds, seed_level=0.0, own_noise=False):
@@ -31,10 +29,11 @@ def losses(generator, n_seeds, seed_level=0.0, own_noise=False):
     return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
 
 
-def compared(first, second, block_seconds=None, n_resamples=400):
-    return paired_difference(
-        first, second, LABELS, rate_hz=100.0, block_seconds=block_seconds, n_resamples=n_resamples
-    )
+def compared(first, second, lengths=(LENGTH,) * N_SEQUENCES, n_resamples=400):
+    """Difference of the mean losses over blocks of these lengths."""
+    starts = np.cumsum([0, *lengths[:-1]])
+    sums = [np.add.reduceat(losses, starts, axis=1) for losses in (first, second)]
+    return difference_of_blocks(*sums, np.array(lengths, dtype=float), n_resamples=n_resamples)
 
 
 @pytest.mark.parametrize(("n_seeds", "seed_level"), [((1, 1), 0.0), ((3, 3), 0.5), ((3, 5), 1.5)])
@@ -69,9 +68,7 @@ def test_one_seed_and_white_noise_are_a_paired_t_test():
     generator = np.random.default_rng(3)
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
-    result = paired_difference(
-        first, second, sequence_labels([60]), rate_hz=1.0, block_seconds=1.0, n_resamples=40_000
-    )
+    result = compared(first, second, [1] * 60, n_resamples=40_000)
     known = stats.ttest_rel(first[0], second[0])
     low, high = known.confidence_interval()
     assert result.root.dof == pytest.approx(59.0)
@@ -83,27 +80,13 @@ def test_one_seed_and_white_noise_are_a_paired_t_test():
     assert result.mean.p_value == pytest.approx(known.pvalue, rel=0.1)
 
 
-def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ():
+def test_equal_losses_do_not_differ_and_one_block_is_refused():
     same = np.arange(10.0)[None]
-    result = paired_difference(same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2)
-    assert result.mean.dof == 2 + 4 - 1
+    result = compared(same, same, [2, 1, 2, 2, 2, 1])
+    assert result.mean.dof == 6 - 1
     assert (result.mean.value, result.mean.p_value) == (0.0, 1.0)
-    assert result == paired_difference(
-        same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2
-    )
-
-
-@pytest.mark.parametrize(
-    ("first", "labels", "message"),
-    [
-        (np.zeros((2, 5)), [3, 3], r"first estimator must be of shape \(seeds, 6\), not \(2, 5\)"),
-        (np.full((1, 6), np.nan), [3, 3], "hold 6 values that are not finite"),
-        (np.zeros((1, 6)), [6], "1 blocks to resample"),
-    ],
-)
-def test_losses_that_cannot_be_compared_are_refused(first, labels, message):
-    with pytest.raises(DataError, match=message):
-        paired_difference(first, np.zeros((1, 6)), sequence_labels(labels), rate_hz=10.0)
+    with pytest.raises(DataError, match="1 blocks to resample"):
+        compared(same, same, [10])
 
 
 def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch):

@@ -70,18 +70,6 @@ def test_every_claim_before_is_mapped_exactly_once():
     assert len(rows) == sum(CLAIMS_BEFORE.values())
 
 
-@pytest.mark.parametrize("study", CLAIMS_BEFORE)
-def test_mapping_has_every_row_of_the_published_tables_of_claims(study: str):
-    known = {(row["old_claim"], row["data"]) for row in read_mapping() if row["paper"] == study}
-    tables = list((RESULTS / study / "tables").glob("claims*.csv"))
-    rows = [
-        row
-        for table in tables
-        for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines())
-    ]
-    assert {(row["claim"], row["data"]) for row in rows} <= known
-
-
 def test_mapping_names_claims_that_exist_and_says_why_others_were_removed():
     ids = {paper: {claim["id"] for claim in read_claims(paper)["claims"]} for paper in PAPERS}
     for row in read_mapping():

@@ -1,11 +1,13 @@
 """Errors by block of the heavy vehicle's study: they add up to the figures that the report shows."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from study_parts import part_of, stored
 from test_studies_heavy_ekf import RATE, short_drive
+from test_studies_heavy_ekf import estimated as scaled
 
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -16,6 +18,9 @@ from vehest.evaluation.metrics import Protocol, accuracy, score_all
 from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.heavy_ekf import block_errors, factorial, vehicle
 from vehest_papers.heavy_ekf.twin import Conditions
+from vehest_papers.kit.block_errors import blocks_of, training_of
+from vehest_papers.kit.claim_files import claims_of
+from vehest_papers.kit.verdicts import judge_paper
 
 PROTOCOL = Protocol(rate_hz=RATE, skip_seconds=1.5)
 SPAN = Span("car", "short")
@@ -138,6 +143,27 @@ def test_wheel_speeds_of_a_drive_in_bends_come_together(tmp_path):
     )
     assert measured["short 0.00 s, block 1"] == (pytest.approx(spread[:200].sum()), 200.0)
     assert all(corrected[block][0] < 0.1 * measured[block][0] for block in measured)
+
+
+def test_measured_values_stand_under_the_ids_of_the_papers_claims():
+    drive = short_drive(120.0)
+    drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
+    drives = {"nominal_laps": drive, "worn_laps": drive}
+    estimates = {
+        test: {name: scaled(drive, 0.8) for name in ("LINT", "RATT", "RATTE", "zero")}
+        for test in drives
+    }
+    rows = block_errors.measured_rows("truck", drives, estimates, 2.0)
+    measured = {own.id: own for own in claims_of("heavy_ekf").claims if own.kind == "measured"}
+    assert {row.metric for row in rows} == set(measured)
+    for own in measured.values():
+        named = {(row.part, row.test_set, row.candidate) for row in rows if row.metric == own.id}
+        assert (own.part, own.test_set, own.candidate) in named
+    verdicts = judge_paper(
+        claims_of("heavy_ekf"), blocks_of(rows), training_of(block_errors.training_rows())
+    )
+    assert verdicts["lint_underestimates_nominal_laps"].verdict == "reproduced"
+    assert verdicts["ratte_until_0_4_s_before_stop"].verdict == "inconclusive"
 
 
 def test_filters_learn_nothing_in_epochs():

@@ -16,7 +16,8 @@ from vehest.estimators.registry import estimator_class
 from vehest.evaluation.blocks import segments_of, write_segments
 from vehest.evaluation.metrics import Protocol
 from vehest.studies.artefacts import EvaluatedModel
-from vehest_papers.ksnn import behaviour, claims_of_models, paper
+from vehest_papers.ksnn import behaviour, measures, paper
+from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.schemes import Scheme
 
 OFFSET = 0.2
@@ -75,23 +76,26 @@ def scheme(folder, *, bias=False):
 
 def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(tmp_path):
     own = scheme(tmp_path)
-    errors, biases = behaviour.without_biases(own, [paper.LINEAR], "f2")
+    biases = behaviour.mean_biases(own)
+    corrected = behaviour.without_biases(own, paper.LINEAR, biases, "f2")
+    measured = [model.segments("f2") for model in own.models(paper.LINEAR)]
+    errors = SegmentErrors({"corrected": corrected, "as measured": measured})
     assert biases["own"] == pytest.approx(0.0, abs=2e-3)
     assert biases["other"] == pytest.approx(OFFSET, abs=2e-3)
     network = ksnn_with_weights(n_local=2)
     clean = planar_drive(SECONDS, seed=6)
     error = (network.estimate([clean.without_references()])[0]["vy"] - clean["vy_ref"])[30:]
-    assert errors.value(f"{paper.LINEAR}, corrected", "rmse_vy") == pytest.approx(
+    assert errors.value("corrected", "rmse_vy") == pytest.approx(
         math.sqrt(np.mean(error**2)), rel=2e-4
     )
-    assert errors.value(f"{paper.LINEAR}, as measured", "rmse_vy") != pytest.approx(
+    assert errors.value("as measured", "rmse_vy") != pytest.approx(
         math.sqrt(np.mean(error**2)), rel=2e-4
     )
 
 
 def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimate(tmp_path):
     own = scheme(tmp_path)
-    errors = behaviour.after_start(own, paper.LINEAR, "c2")
+    errors = SegmentErrors(behaviour.after_start(own, paper.LINEAR, "c2"))
     drive = planar_drive(SECONDS, seed=1)
     estimate = ksnn_with_weights(n_local=2).estimate([drive.without_references()])[0]["vy"]
     ends = np.arange(max(behaviour.WINDOWS), len(drive), behaviour.STRIDE)
@@ -102,7 +106,8 @@ def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimat
 
 def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp_path):
     own = scheme(tmp_path)
-    errors, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
+    segments, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
+    errors = SegmentErrors(segments)
     drive = planar_drive(SECONDS, seed=1)
     scored = np.arange(len(drive)) >= 30
     low = scored & (np.abs(drive["yaw_rate"]) < 0.1)
@@ -122,8 +127,9 @@ def test_band_levels_are_the_density_of_the_error(tmp_path):
     estimate = estimator_class("zero").from_config({"rate_hz": 20.0}).estimate([drive])[0]
     noisy = replace(estimate, channels={**estimate.channels, "vy": drive["vy_ref"] + noise})
     write_estimate(noisy, model.evaluation_folder / "c2" / "0.parquet")
-    levels = claims_of_models.band_levels(own, {paper.ZERO: model}, "c2")
-    densities = [levels[paper.ZERO, hz].value for hz in claims_of_models.BANDS_HZ[3:]]
+    names, powers = measures.band_powers(own, model, "c2")
+    assert names[:2] == ["c2 1.50 s", "c2 27.10 s"]
+    densities = powers[:, 3:].mean(axis=0)
     assert np.mean(densities) == pytest.approx(0.1**2 / 10.0, rel=0.1), (
         "white noise of 0.1 m/s over 0 to 10 Hz"
     )

@@ -10,9 +10,9 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, TrackNoise
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest_papers.heavy_ekf import accuracy, draws, tables, tyres, vehicle, watching
+from vehest_papers.heavy_ekf import accuracy, tables, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.document import WHEELS
-from vehest_papers.heavy_ekf.subjects import Filter
+from vehest_papers.heavy_ekf.subjects import Filter, corners
 
 RATE = 20.0
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
@@ -119,19 +119,38 @@ def estimated(drive, gain, noise=0.0):
     )
 
 
-def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim():
+def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8():
     drive = short_drive(120.0)
     drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
-    estimates = {
-        "nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}
-    }
-    gains = accuracy.gains_of({"nominal_laps": drive}, estimates, ["LINT", "RATT"])
-    assert gains["nominal_laps", "LINT"][0] == pytest.approx(0.8, abs=0.01)
-    gains |= {("worn_laps", name): gains["nominal_laps", name] for name in ("LINT", "RATT")}
-    assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == [
-        "reproduced",
-        "undecided",
-    ] * 2
+    values = accuracy.gains_of(drive, estimated(drive, 0.8, 1e-5))
+    assert len(values) == 12
+    assert values.mean() == pytest.approx(0.8, abs=0.01)
+    turning = corners(drive)
+    true = drive["sideslip_ref"][turning]
+    scaled = estimated(drive, 0.8, 1e-3)["sideslip"][turning]
+    slope = np.polyfit(true, scaled, 1)[0]
+    assert accuracy.gains_of(drive, estimated(drive, 0.8, 1e-3)).mean() == pytest.approx(slope)
+
+
+def test_errors_that_double_on_the_last_lap_have_a_log_change_of_their_squares():
+    drive = short_drive(90.0)
+    last = accuracy.laps_of(drive)[-1]
+    wrong = 0.01 * np.where(last, 2.0, 1.0) * np.where(drive.time < 1.5, 100.0, 1.0)
+    sideslip = drive["sideslip_ref"] + wrong
+    estimate = Estimate(drive.id, "doubled", RATE, 0.0, {"vy": sideslip, "sideslip": sideslip})
+    changes = accuracy.log_change_of_last_lap(drive, estimate, 2.0)
+    assert len(changes) == 2, "30 s, less the start that is not scored, in stretches of 10 s"
+    assert changes == pytest.approx(np.full(2, math.log(4.0)))
+
+
+def test_error_before_the_stop_leaves_the_last_moments_out():
+    drive = short_drive(60.0)
+    speed = np.where(drive.time < 40.0, 10.0, 0.0)
+    stops = replace(drive, channels={**drive.channels, "vx_ref": speed})
+    wrong = np.radians(np.where(drive.time > 39.58, 50.0, np.where(drive.time > 34.98, 0.3, 7.0)))
+    sideslip = drive["sideslip_ref"] + wrong
+    estimate = Estimate(drive.id, "late", RATE, 0.0, {"vy": sideslip, "sideslip": sideslip})
+    assert accuracy.error_before_stop(stops, estimate) == pytest.approx(0.3)
 
 
 def test_laps_are_thirds_of_the_way_and_the_stop_is_when_the_truck_last_moved():
@@ -145,22 +164,3 @@ def test_laps_are_thirds_of_the_way_and_the_stop_is_when_the_truck_last_moved():
         "stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated"
     )
     assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
-
-
-def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is_not():
-    samples = np.full(5, 1000.0)
-    level = np.array([1.0, 1.1, 0.9, 1.05, 0.95]) * 0.04 * 1000.0
-    jumps = np.array([1.5, 0.6, 1.4, 0.5, 1.0])
-    sums = {
-        "worn_fast": {
-            "LINT": (level, samples),
-            "RATT": (1.5 * level, samples),
-            "RATTE": (jumps * level, samples),
-        }
-    }
-    found = draws.compared(sums)
-    own, told_apart = found["worn_fast", ("RATT", "LINT")]
-    assert told_apart
-    assert 0.0 < own.low < own.value < own.high
-    assert own.value == pytest.approx(0.2 * (math.sqrt(1.5) - 1.0), rel=1e-6)
-    assert not found["worn_fast", ("RATTE", "LINT")][1]

@@ -345,7 +345,7 @@ def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
 
     made = place.files()
     code, again, err = place("run", "ground", "--jobs", "1")
-    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert {status for status, _ in _statuses(err)} == {"reused"}
     assert (again, place.files()) == (out, made)
     assert place("report", "ground")[0] == 0
 
@@ -375,7 +375,7 @@ def test_overrides_reach_the_data_sets_that_have_their_key(survey_place):
     assert ("would", "ingest") in _statuses(err)
     assert ("would", "report") in _statuses(err)
     assert place.files() == set()
-    assert "suits no data set" in place.refused("run", "ground", "training.patience=1")[1]
+    assert "matches no data set" in place.refused("run", "ground", "training.patience=1")[1]
     assert "belongs to the study" in place.refused("run", "ground", "dataset=mine")[1]
     assert "run 'vehest run" in place.refused("report", "ground")[1]
 

@@ -286,3 +286,18 @@ def test_blocks_that_do_not_match_are_refused():
     blocks = studied(a=LEVELS, b=errors_of(LEVELS, np.full(N, 50.0)))
     with pytest.raises(DataError, match="different sizes"):
         judged(claim_of(), blocks)
+
+
+def test_measured_weights_have_an_interval_over_their_trainings():
+    """A value a seed and one block: Student's t over seeds; with two seeds there is no interval."""
+    values = np.array([0.80, 0.84, 0.79, 0.83, 0.81])
+    claim = claim_of(
+        "measured", id="leak", metric="", direction="lower", limit=1.0, measure="weights:leak"
+    )
+    blocks = {Key("real", "a", "test", "leak"): errors_of(values[:, None], [1.0])}
+    found = judged(claim, blocks)
+    low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert found.verdict == "reproduced"
+    assert (found.values["a"].low, found.values["a"].high) == pytest.approx((low, high))
+    few = {Key("real", "a", "test", "leak"): errors_of(values[:2, None], [1.0])}
+    assert judged(claim, few).verdict == "inconclusive"

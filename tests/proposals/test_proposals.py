@@ -289,7 +289,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         (
             "lap.csv",
             b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20,
-            "of 1 (t); not read: column 2, one of 2 columns called 'v'",
+            "of 3 (t, v #2, v #3); not read: column 't' as the time: it goes backwards",
         ),
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
         ("lap.mat", b"MATLAB 5.0 MAT-file", "writetable"),
@@ -529,11 +529,20 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     assert any("makes 2 recordings" in note for note in made.notes)
 
 
-@pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
+def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path):
+    table = usual(drive())
+    table.loc[1000:1025, "Steer"] = np.nan
+    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert made.dataset["channels"]["handwheel"]["max_gap"] == pytest.approx(0.54)
+    steer = read_back(made)["handwheel"][1000:1026]
+    np.testing.assert_allclose(np.diff(steer, 2), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".vbo", ".csv"])
 def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(
     tmp_path, suffix
 ):
-    """Half a second in a VBOX's log and in a measurement, two in a table without times."""
+    """Half a second in a VBOX's log, two in a table without times."""
     table = usual(drive())
     table.loc[1000 : 1100 if suffix == ".csv" else 1025, "Steer"] = np.nan
     table = table.drop(columns="Time [s]") if suffix == ".csv" else table
@@ -595,11 +604,6 @@ POSE = {
             "sideslip_ref",
         ),
         (
-            lambda: pd.concat([usual(drive()), usual(drive())[["Steer"]]], axis=1),
-            "column 8, one of 2 columns called 'Steer'",
-            "handwheel",
-        ),
-        (
             lambda: usual(drive()).assign(**ROLL),
             r"'roll \(rad\)' is named as roll.*left out",
             "roll",
@@ -611,7 +615,7 @@ POSE = {
         ),
         (standing, "stands all the time", ""),
     ],
-    ids=["no clock", "no name", "twice", "impossible angle", "unrelated pose", "standing"],
+    ids=["no clock", "no name", "impossible angle", "unrelated pose", "standing"],
 )
 def test_what_is_left_out_is_noted(tmp_path, table, said, absent):
     proposals = proposals_of(tmp_path, table())
@@ -1068,3 +1072,190 @@ def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
     assert not proposed(tmp_path, table)["handwheel"].asked
     table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
     assert proposed(tmp_path, table)["handwheel"].asked
+
+
+TILTED = {"roll": "Roll [rad]", "pitch": "Pitch [rad]"}
+
+
+@pytest.mark.parametrize(
+    ("of_ay", "of_yaw_rate", "of_pitch", "is_asked"),
+    [(1, 1, 1, False), (-1, -1, -1, False), (-1, 1, -1, True), (1, -1, 1, True)],
+    ids=["forward-left-up", "forward-right-down", "ay to the right", "yaw to the right"],
+)
+def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
+    tmp_path, of_ay, of_yaw_rate, of_pitch, is_asked
+):
+    """Gravity is 9.81·sin(roll) along y and -9.81·sin(pitch) along x, so signs show in ay and ax."""
+    d = drive(240.0)
+    heading = np.cumsum(d["r"]) / 50.0
+    table = usual(d).drop(columns=["Steer", "Beta"])
+    table["Latitude"] = 48.0 + np.cumsum(d["vx"] * np.sin(heading)) / 50.0 / 111_000.0
+    metres = 111_000.0 * np.cos(np.radians(48.0))
+    table["Longitude"] = 16.0 + np.cumsum(d["vx"] * np.cos(heading)) / 50.0 / metres
+    table["LatAcc"] *= of_ay
+    table["Gyro"] *= of_yaw_rate
+    table[TILTED["roll"]] = -0.01 * d["ay"]
+    table[TILTED["pitch"]] = -0.01 * of_pitch * d["ax"]
+    found = proposed(tmp_path, table)
+    assert (found["yaw_rate"].sign, found["ay"].sign) == (of_yaw_rate, of_ay)
+    assert (found["roll"].sign, found["pitch"].sign) == (1, of_pitch)
+    assert {bool(found[name].asked) for name in TILTED} == {is_asked}
+    mirrored = proposals_of(tmp_path, table).mirrored().by_channel
+    assert (mirrored["roll"].sign, mirrored["pitch"].sign) == (1, -of_pitch)
+
+
+WRAPPED = {
+    "16 bit of ms": lambda ms: (60_000 + ms) % 65_536,
+    "signed 16 bit of ms": lambda ms: (90_000 + ms + 32_768) % 65_536 - 32_768,
+    "32 bit of us": lambda ms: (2**32 - 30_000_000 + 1000 * ms) % 2**32,
+    "seconds of the week": lambda ms: (604_750.0 + 1e-3 * ms) % 604_800.0,
+}
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_a_counter_of_time_that_wraps_goes_on(tmp_path, name):
+    unit = "us" if "us" in name else "s" if "seconds" in name else "ms"
+    table = usual(drive()).rename(columns={"Time [s]": f"tick_{unit}"})
+    table.iloc[:, 0] = WRAPPED[name](20 * np.arange(6000))
+    made = drafted(tmp_path, table)
+    assert [round(seconds, 2) for seconds in made.durations.values()] == [120.0]
+    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+
+
+def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path):
+    table = usual(drive())
+    rows = np.arange(6000)
+    rows[500:503] = [502, 500, 501]
+    rows[3000:5000:100], rows[3001:5001:100] = (
+        rows[3001:5001:100].copy(),
+        rows[3000:5000:100].copy(),
+    )
+    made = drafted(tmp_path, table.iloc[rows])
+    assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
+    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    table.loc[2000:, "Time [s]"] -= 40.0
+    made = drafted(tmp_path, table)
+    assert [round(seconds) for seconds in made.durations.values()] == [40, 80]
+    (note,) = [note for note in made.notes if "go back" in note]
+    assert "makes 2 recordings; a command on one recording takes the longest, 80 of 120 s" in note
+
+
+@pytest.mark.parametrize("excess", [1.0, 1.08])
+def test_a_speed_is_compared_with_ay_less_the_change_of_the_lateral_velocity(tmp_path, excess):
+    """ay over vx·yaw_rate is 0.94 here, by d(vy)/dt, where the speed is right."""
+    d = drive(240.0)
+    t = d["t"]
+    turning = 3.0 * np.sin(2 * np.pi * 0.2 * t) + 2.0 * np.sin(2 * np.pi * 0.07 * t)
+    vy = np.cumsum(-0.06 * turning) / 50.0 + 0.1 * np.sin(2 * np.pi * 0.31 * t)
+    ay = turning + np.gradient(vy, t)
+    d |= {"r": turning / d["vx"], "vy": vy, "ay": ay}
+    table = pd.DataFrame(
+        {"t": t, "vx": excess * d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "vy_ref": d["vy"]}
+    )
+    notes = proposals_of(tmp_path, table).notes
+    assert any("'vx' reads" in note for note in notes) == (excess > 1.0)
+
+
+def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp_path):
+    d = drive()
+    stand = np.zeros(1500)
+    vx, rate = (np.concatenate([stand, d[name], stand]) for name in ("vx", "r"))
+    noise = np.random.default_rng(1).standard_normal((2, 9000))
+    heading = np.cumsum(rate) / 50.0
+    table = pd.DataFrame({"t": np.arange(9000) / 50.0, "Speed [m/s]": vx, "Gyro [rad/s]": -rate})
+    table["LatAcc [m/s2]"] = -vx * rate + 0.05 * noise[0]
+    metres = 111_000.0 * np.cos(np.radians(48.0))
+    table["Latitude"] = 48.0 + np.cumsum(vx * np.sin(heading)) / 50.0 / 111_000.0
+    table["Longitude"] = 11.0 + np.cumsum(vx * np.cos(heading)) / 50.0 / metres
+    table[["Latitude", "Longitude"]] += 1e-7 * noise.T
+    table.to_csv(tmp_path / "course.csv", index=False)
+    found = inspect("my_car", [tmp_path / "course.csv"]).proposals
+    assert "course over latitude and longitude" in found.left_right
+    assert (found.by_channel["yaw_rate"].sign, found.by_channel["ay"].sign) == (-1, -1)
+
+
+def left_out(tmp_path, table):
+    """Channels with their columns, and keys of open questions, where every question stays open."""
+    examined, questions = ask(
+        inspect("my_car", [write(tmp_path / "lap.csv", table)]), interactive=False
+    )
+    by_channel = {name: one.column for name, one in examined.proposals.by_channel.items()}
+    return by_channel, {one.key: one for one in questions}
+
+
+def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "Ux": d["vx"],
+            "Uy": d["vy"],
+            "r [rad/s]": d["r"],
+            "e": 0.3 * np.sin(0.2 * d["t"]),
+            "dpsi [rad]": d["sideslip"] + 0.01 * np.sin(0.3 * d["t"]),
+            "roll": -0.01 * d["ay"],
+            "heading_error": d["r"] / 3.0,
+        }
+    )
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"yaw_rate": "r [rad/s]", "vy_ref": "Uy"}
+    assert (open_questions["Ux"].proposed, open_questions["Ux"].candidates[0]) == ("-", "vx m/s")
+    assert '--answer "Ux=vx m/s"' in open_questions["Ux"].text
+
+
+def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answer(tmp_path):
+    d = drive()
+    columns = {"a": d["t"], "b": d["vx"], "c": d["r"], "d": d["ay"]}
+    with pytest.raises(VehestError, match='--answer "b=vx m/s"'):
+        left_out(tmp_path, pd.DataFrame(columns))
+    named = {"a": d["t"], "speed": d["vx"], "c [rad/s]": d["r"], "d": d["ay"]}
+    assert left_out(tmp_path, pd.DataFrame(named))[0] == {"vx": "speed", "yaw_rate": "c [rad/s]"}
+    found = left_out(tmp_path, pd.DataFrame({**columns, "e": d["ax"]}))[0]
+    assert found == {"vx": "b", "yaw_rate": "c", "ay": "d", "ax": "e"}
+
+
+def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
+    d = drive()
+    noise = 0.02 * np.random.default_rng(2).standard_normal((3, len(d["t"])))
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "AccelerationX": d["ay"],
+            "AccelerationY": noise[0],
+            "AccelerationZ": d["ax"],
+            "VelocityX": d["vy"],
+            "VelocityY": noise[1],
+            "VelocityZ": d["vx"],
+            "AngularVelocityX": noise[2],
+            "AngularVelocityY": d["r"],
+            "AngularVelocityZ": noise[1] + noise[2],
+        }
+    )
+    found = {name: one.column for name, one in proposed(tmp_path, table).items()}
+    assert found == {
+        "vx": "VelocityZ",
+        "yaw_rate": "AngularVelocityY",
+        "ay": "AccelerationX",
+        "ax": "AccelerationZ",
+        "vy_ref": "VelocityX",
+    }
+
+
+def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
+    d = drive()
+    heading = 3.0 * np.cumsum(d["r"]) / 50.0
+    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    table = pd.DataFrame({"t": d["t"], "Velocity east [m/s]": east, "vel_n [m/s]": north})
+    table["Velocity forward [m/s]"] = d["vx"]
+    table = table.assign(**{"Gyro [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
+    found = proposed(tmp_path, table)
+    assert (found["vx"].column, found["vx"].asked) == ("Velocity forward [m/s]", "")
+    assert {"vx_ref", "vy_ref"}.isdisjoint(found)
+    heading = np.cumsum(d["r"]) / 50.0  # always nearly along x
+    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    table = pd.DataFrame({"t": d["t"], "twist.linear.x": east, "twist.linear.y": north})
+    table = table.assign(x=np.cumsum(east) / 50.0, y=np.cumsum(north) / 50.0)
+    table = table.assign(**{"gyro_z [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"yaw_rate": "gyro_z [rad/s]", "ay": "LatAcc [m/s2]"}
+    assert "an axis of the world" in open_questions["twist.linear.x"].text

@@ -1,4 +1,4 @@
-"""The verdict on a car of one's own: a winner only where there is one, and what more recordings would bring."""
+"""The verdict on a user's car: what is recommended, with which error, and what more recordings would bring."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from test_report import drive, study
 
 from vehest.data.store import read_recording, write_recording
 from vehest.run.comparison import NO_TIME
+from vehest.studies import drive as drive_study
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.own_car import documents, not_compared, verdict, verdict_of
 
@@ -31,17 +32,15 @@ def test_the_one_below_all_others_is_recommended_with_its_interval_what_it_beats
 ):
     found = verdict_of(without(part, "luenberger", "gru"), "test")
     words = " ".join(found[0])
-    assert "**Use KS-NN linear + bias, P = 2.** Expected RMSE(β) " in words
-    assert (
-        "It beats v = 0 and the static map." in words
-        or "It beats the static map and v = 0." in words
-    )
-    low, high = (float(text) for text in words.split("(", 2)[2].split(")")[0].split(" to "))
+    assert words.startswith("**Best: KS-NN linear + bias, P = 2, ")
+    assert "**Recommended: KS-NN linear + bias, P = 2**, expected RMSE(β) " in words
+    assert "it is significantly better than every other estimator" in words
+    low, high = (float(text) for text in words.split("[", 2)[2].split("]")[0].split(", "))
     assert 0.0 < low < high
     assert (found[1].estimator, found[1].seed) == ("ksnn", 1)
 
 
-def test_two_that_are_alike_are_not_told_apart(part):
+def test_of_two_that_are_alike_neither_is_significantly_worse(part):
     twins = [
         replace(model, variant="twin", title="Its twin")
         for model in part.models
@@ -56,18 +55,11 @@ def test_two_that_are_alike_are_not_told_apart(part):
             metrics=pd.concat([part.metrics, rows], ignore_index=True),
         )
     )
-    assert words.startswith("**Take ")
-    assert all(
-        text in words
-        for text in (
-            "**No estimator can be called best:** ",
-            " has the lowest error and is not told apart from ",
-        )
-    )
-    assert "**Use" not in words
-    assert "**Use" not in said(without(part, "zero", "static_map", "luenberger", "gru")), (
-        "without the baselines"
-    )
+    assert words.startswith("**Best: ")
+    assert " is not significantly worse. **Recommended: " in words
+    assert "every other estimator" not in words
+    bare = said(without(part, "zero", "static_map", "luenberger", "gru"))
+    assert "**No estimator is recommended**: none was compared with" in bare
 
 
 def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_commands_take(part):
@@ -89,8 +81,9 @@ def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_comm
     found = verdict_of(replace(own, models=[*own.models, *alike]), "test")
     assert found[1] is not None
     assert found[1].estimator == "gru"
-    assert found[0][0].startswith("**Take GRU")
-    assert "Luenberger has the lowest error and is not told apart from GRU" in found[0][0]
+    assert found[0][0].startswith("**Best: Luenberger, ")
+    assert "GRU | 5 &lt;states> is not significantly worse." in found[0][0]
+    assert found[0][1].startswith("**Recommended: GRU")
 
 
 def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, tmp_path):
@@ -112,17 +105,62 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
         )
     )
     assert (
-        "The score counts 94 % of the test, without the first 1.5 s of its 1 range, **which hide the largest sideslip** ("
+        "94 % of the test is scored, without the first 1.5 s of its 1 range, **which contain the largest sideslip** ("
         in words
     )
     assert "; in 2.1 % of that the car is slower than 1 m/s, and only v is scored." in words
-    assert "hide" not in said(part)
+    assert "largest sideslip" not in said(part)
 
 
 def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
-    words = said(without(part, "luenberger", "gru", "ksnn"))
-    assert words.startswith("**Nothing beats Static map here**")
-    assert ": none that learns was compared." in words
+    found = verdict_of(without(part, "luenberger", "gru", "ksnn"), "test")
+    assert found[0][0].startswith("**Best: Static map, ")
+    assert found[0][1].startswith(
+        "**No estimator is recommended**: none of these is significantly better than"
+    )
+    assert found[1] is None
+
+
+def test_an_estimator_that_only_equals_a_baseline_is_not_recommended(part):
+    """A static map that is as good as KS-NN: the best and its equals all lack a significant difference to it."""
+    ksnn = next(model for model in part.models if model.estimator == "ksnn" and model.seed == 1)
+    tied = [
+        replace(model, evaluation_folder=ksnn.evaluation_folder)
+        if model.estimator == "static_map"
+        else model
+        for model in part.models
+    ]
+    found = verdict_of(replace(part, models=tied), "test")
+    assert found[0][0].startswith("**Best: ")
+    assert "not significantly worse" in found[0][0]
+    assert found[0][1].startswith("**No estimator is recommended**")
+    assert found[1] is None
+    report = documents(
+        StudyArtefacts(
+            "toy", "A toy study", "", "vehest run toy", {"": ""}, {"": replace(part, models=tied)}
+        )
+    )["report"]
+    assert "**Recommended" not in "\n".join(
+        block for block in report.blocks if isinstance(block, str)
+    )
+    assert "vehest export" not in "\n".join(
+        block for block in report.blocks if isinstance(block, str)
+    )
+
+
+def test_the_comparison_of_a_drive_recommends_by_the_same_rule(part):
+    """The page of any comparison and its printed verdict, with the static map as good as the best."""
+    artefacts = StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part})
+    (printed,) = drive_study.verdict(artefacts)
+    opening = str(drive_study.comparison(part).blocks[0])
+    assert "Recommended: KS-NN" in printed
+    assert printed in opening.replace("**", "").replace("`", "")
+    assert (
+        "Recommended"
+        not in drive_study.verdict(
+            replace(artefacts, parts={"": without(part, "luenberger", "gru", "ksnn")})
+        )[0]
+    )
 
 
 def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
@@ -147,7 +185,9 @@ def test_a_bound_that_an_estimator_goes_below_does_not_make_a_drive_silent(part)
     )
     assert "cannot rank" not in said(replace(part, metrics=bounded))
     own = bounded.assign(value=bounded["value"].where(bounded["metric"] != "rmse_sideslip", 95.0))
-    assert "tells sideslip to no better than 90° (Cramér-Rao)" in said(replace(part, metrics=own))
+    assert "the Cramér-Rao bound of the measured channels is 90°" in said(
+        replace(part, metrics=own)
+    )
 
 
 def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
@@ -156,7 +196,7 @@ def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
     for start, stop in ((2.0, 40.0), (42.0, 58.0), (60.0, 85.0)):
         minutes += float((np.abs(recording.cut(start, stop)["ay"]) > 4.0).sum()) / 20.0 / 60.0
     assert (
-        f"Your recordings hold {minutes:.1f} min beyond 4 m/s²: {3 * minutes:.0f} more would halve the interval."
+        f"Your recordings contain {minutes:.1f} min with |ay| above 4 m/s²: {3 * minutes:.0f} min more would halve the interval."
         in said(part)
     )
 

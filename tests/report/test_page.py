@@ -64,6 +64,12 @@ def views(driver):
     )
 
 
+def open_appendices(driver):
+    driver.execute_script(
+        "document.querySelectorAll('details').forEach((section) => (section.open = true))"
+    )
+
+
 def press(driver, text):
     (button,) = [
         own
@@ -123,9 +129,9 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
     opened(chromium, hour)
     assert len(views(chromium)) == 3 + 1 + 3  # v, β and its error; health; three channels
     for text, view in {
-        "": (0.0, 3599.95),
-        "busiest 20 s": (100.0, 120.0),
+        "": (100.0, 120.0),
         "whole range": (0.0, 3599.95),
+        "busiest 20 s": (100.0, 120.0),
     }.items():
         if text:
             press(chromium, text)
@@ -136,6 +142,7 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
     from selenium.webdriver import ActionChains
 
     opened(chromium, hour)
+    press(chromium, "whole range")
     over = chromium.find_elements("css selector", ".u-over")[1]
     quarter = over.size["width"] // 4
     ActionChains(chromium).move_to_element_with_offset(
@@ -146,7 +153,7 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
         assert stop == pytest.approx(1800.0, abs=30.0)
 
 
-def test_errors_can_be_taken_over_the_stretch_in_view(chromium, hour):
+def test_errors_can_be_taken_over_the_segment_in_view(chromium, hour):
     opened(chromium, hour)
     press(chromium, "busiest 20 s")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
@@ -158,6 +165,7 @@ def test_errors_can_be_taken_over_the_stretch_in_view(chromium, hour):
 def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
+    open_appendices(chromium)
     header = chromium.find_element(
         "xpath", "//figure[@id='table-leaderboard_test']//th/button[contains(., 'interval')]"
     )
@@ -186,7 +194,7 @@ def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium, to
     assert paper() == grounds[scheme]
     chromium.find_element("id", "theme").click()
     assert paper() == grounds[other]
-    image = chromium.find_element("css selector", "#figure-errors_test img")
+    image = chromium.find_element("css selector", "#figure-forest_test img")
     assert (
         image.value_of_css_property("color-scheme") == other
     )  # by which an SVG image picks its colours
@@ -200,6 +208,7 @@ def test_page_is_accessible_fits_its_width_and_complains_of_nothing(
 ):
     for path in (hour, toy[0]):
         opened(chromium, path, width=width, scheme=scheme)
+        open_appendices(chromium)
         assert axe_violations(chromium) == []
         assert chromium.execute_script("return document.documentElement.scrollWidth") <= width
         assert complaints(chromium) == []
@@ -210,7 +219,9 @@ CUT = """return [...document.querySelectorAll("main *")].filter(
 ).map((own) => own.ariaLabel ?? own.tagName)"""
 
 
-def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(chromium, tmp_path):
+def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folded(
+    chromium, tmp_path
+):
     """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
     part = study(tmp_path / "study", tests)
@@ -227,7 +238,8 @@ def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(c
     opened(chromium, tmp_path / "report.html", width=1280)
     shown = chromium.execute_script("return document.querySelector('main').innerText")
     assert all(
-        words in shown for words in ("Verdict", "Use KS-NN", "95 % interval", "vehest export")
+        words in shown
+        for words in ("Verdict", "Recommended: KS-NN", "95 % interval", "vehest export")
     )
     assert "FVU" not in shown
     assert len(shown.split()) <= 1500
@@ -235,12 +247,50 @@ def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(c
     gaps = "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) => line.includes(null))"
     assert all(chromium.execute_script(gaps))
     first = "return document.querySelector('figure.live').explorer.detail.label"
-    assert f"Use {chromium.execute_script(first)}." in shown
-    chromium.execute_script(
-        "document.querySelectorAll('details').forEach((section) => (section.open = true))"
-    )
+    assert f"Recommended: {chromium.execute_script(first)}, expected" in shown
+    open_appendices(chromium)
     assert "FVU" in chromium.execute_script("return document.querySelector('main').innerText")
     assert chromium.execute_script(CUT) == []
+
+
+LEGEND = "return [...document.querySelectorAll('.legend > span')].map((own) => own.textContent)"
+SERIES = (
+    "return document.querySelector('figure.live').explorer.plots[1].series.map((own) => own.label)"
+)
+
+
+def test_legend_names_what_is_drawn_and_the_reference_lies_below_the_estimates(chromium, hour):
+    opened(chromium, hour)
+    drawn = [f"Estimator {i}" for i in range(1, 5)]
+    assert chromium.execute_script(LEGEND) == ["reference", *drawn, "90 % band of Estimator 1"]
+    labels = chromium.execute_script(SERIES)
+    order = [label for label in labels if label in {"reference", *drawn}]
+    assert order[0] == "reference"  # uPlot draws series in their order
+    assert set(order[1:]) == set(drawn)
+    chromium.find_element("css selector", 'input[aria-label="draw Estimator 2"]').click()
+    assert "Estimator 2" not in chromium.execute_script(LEGEND)
+
+
+def test_strip_of_sensor_health_has_a_legend(chromium, hour):
+    opened(chromium, hour)
+    heads = [own.text for own in chromium.find_elements("css selector", ".panel .head")]
+    (strip,) = [text for text in heads if text.startswith("sensor health")]
+    words = ("valid", "degraded", "invalid", *(f"Estimator {i}" for i in range(1, 5)))
+    assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
+
+
+def test_appendices_are_one_folded_list_at_the_end_and_the_contents_name_what_is_open(
+    chromium, toy
+):
+    opened(chromium, toy[0])
+    after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
+    found = chromium.execute_script(after)
+    assert len(found) >= 5
+    assert all(section == ["DETAILS", False] for section in found)
+    contents = [own.text for own in chromium.find_elements("css selector", "nav a")]
+    assert contents == ["Verdict", "Minutes of reference", "Appendices"]
+    last = "return document.querySelector('#appendices ~ details:last-of-type h2').textContent"
+    assert chromium.execute_script(last) == "Note"
 
 
 def test_page_shows_the_figure_where_scripts_may_not_run(chromium, toy):

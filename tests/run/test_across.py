@@ -91,7 +91,10 @@ def test_errors_of_all_folds_count_together(across):
         folds = [row[f"fold_{fold}"] for fold in (1, 2, 3)]
         assert min(folds) <= row["rmse_sideslip"] <= max(folds)
     report = (across.folder / "results" / "folds_of_mine" / "report.md").read_text(encoding="utf-8")
-    assert "all 3 folds (simulated data), each estimated by models that had not seen it" in report
+    assert (
+        "all 3 folds (simulated data), each estimated by models that were not trained on it"
+        in report
+    )
     metrics = pd.read_csv(across.folder / "results" / "folds_of_mine" / "metrics.csv")
     assert {name.split("/")[1] for name in metrics["trained_on"].unique()} == {
         "fold_1",

@@ -20,7 +20,7 @@ from conftest import planar_drive
 from place import DATASET, PIPELINE, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
-from vehest.data.store import read_recording
+from vehest.data.store import read_estimate, read_recording
 from vehest.run import ingest, inspect_data, runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.comparison import NO_TIME
@@ -33,7 +33,7 @@ def _statuses(err):
     return [
         tuple(line.split()[:2])
         for line in err.splitlines()
-        if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")
+        if line.split()[:1] and line.split()[0] in ("done", "reused", "would")
     ]
 
 
@@ -45,7 +45,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
 
     again, err = place.done("run", "small", "tracking=none")
     assert ({status for status, _ in _statuses(err)}, again, place.files()) == (
-        {"skipped"},
+        {"reused"},
         out,
         made,
     )
@@ -53,7 +53,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     (place.folder / "README.md").write_text("changed")
     place.change("conf/dataset/mine.yaml", citation="somebody else", licence="another")
     _, _, err = place("run", "small", "tracking=none", "--dry-run")
-    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert {status for status, _ in _statuses(err)} == {"reused"}
 
     _, _, err = place("run", "small", "tracking=none", "training.learning_rate=0.002")
     done = [line for line in err.splitlines() if line.startswith("done")]
@@ -174,9 +174,32 @@ def test_train_eval_estimate_report_one_by_one(place):
         "band_sideslip",
         "health",
         "health_reason",
+        "sideslip_deg",
+        "band_sideslip_deg",
     ]
-    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
-        assert np.allclose(frame[column], text[column], equal_nan=True), column
+    assert list(text.columns) == list(frame.columns)
+    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health", "sideslip_deg"):
+        # half a unit of the sixth digit
+        assert np.allclose(frame[column], text[column], rtol=5e-6, atol=0.0, equal_nan=True), column
+    assert np.allclose(frame["time"], text["time"], rtol=0.0, atol=5.1e-7)
+    for angle in ("sideslip", "band_sideslip"):
+        assert np.allclose(frame[f"{angle}_deg"], np.degrees(frame[angle]), equal_nan=True)
+    units = {
+        field.name: field.metadata[b"unit"].decode()
+        for field in pq.ParquetFile("out.parquet").schema_arrow
+    }
+    assert units == {
+        "time": "s",
+        "vy": "m/s",
+        "sideslip": "rad",
+        "band_vy": "m/s",
+        "band_sideslip": "rad",
+        "health": "1",
+        "health_reason": "1",
+        "sideslip_deg": "deg",
+        "band_sideslip_deg": "deg",
+    }
+    assert "sideslip_deg" not in read_estimate(Path("out.parquet")).channels
     assert [reason_in_words(code) for code in frame["health_reason"]] == text[
         "health_reason"
     ].fillna("").tolist()
@@ -382,7 +405,7 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     drive = planar_drive(10.0, 20.0).without_references()
     slow = pd.DataFrame({"time": drive.time, **drive.channels})
     for name, table in (
-        ("slow", slow),
+        ("slow", slow.iloc[::5]),
         ("less", slow.drop(columns="ax")),
         ("lap", slow.assign(time=slow["time"] / 5.0)),
     ):
@@ -397,6 +420,9 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     ):
         place.refused("estimate", "luenberger", name, "-o", out, says=says)
         assert not Path("out.parquet").exists()
+    slow.to_csv("twenty.csv", index=False)
+    _, said = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
+    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in said
     swapped = (
         "split.train=[{recording: three}]",
         "split.tests.test=[{recording: one, start: 5, stop: 20}]",

@@ -12,11 +12,12 @@ import pytest
 from refusals import refusal
 
 from conftest import planar_drive
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
-from vehest.run.compare_files import compare_estimates, compare_files, read_estimate_table
+from vehest.run.compare_files import compare_estimates, compare_files
+from vehest.run.estimate_tables import parse_columns, parse_shift, read_estimate_table
 from vehest.run.inspect_data import check
 
 
@@ -76,7 +77,7 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
     assert found["rows"][0]["estimate"] == "mine"
     assert found["rows"][0]["rmse_sideslip"] < 0.1
     assert found["share_below_min_speed"] == pytest.approx(10.0 / 120.0, abs=0.005)
-    assert "has the lowest sideslip error" in found["verdict"]
+    assert found["verdict"].startswith("Best: mine,")
     assert compare_estimates(own, {"mine": estimate}, 0.3)["min_sideslip_speed"] == pytest.approx(
         1 / 3
     )
@@ -207,9 +208,14 @@ def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp
     found = compare_estimates(drive, estimates)
     assert found["rows"][0]["estimate"] == "good"
     assert {row["estimate"] for row in found["rows"]} == {"good", "bad", "zero", "static_map"}
-    assert "On this recording good has the lowest sideslip error" in found["verdict"]
+    assert found["verdict"].startswith("Best: good, ")
+    assert (
+        "It is significantly better than the zero-sideslip baseline and the static map."
+        in (found["verdict"])
+    )
     alike = compare_estimates(drive, {"one": estimates["good"], "other": estimates["good"]})
-    assert "no estimator can be called best" in alike["verdict"]
+    assert alike["verdict"].startswith("Best: one, ")
+    assert "other is not significantly worse." in alike["verdict"]
 
 
 def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
@@ -244,6 +250,125 @@ def test_other_clocks_and_columns_are_refused_with_the_file_that_has_them(drive,
     assert "has no column vy [m/s]" in refusal(lambda: read_estimate_table(late, drive))
 
 
+def test_a_model_that_was_trained_here_is_listed_last_and_changes_no_verdict(drive, tmp_path):
+    estimates = {
+        name: read_estimate_table(written(tmp_path, name, drive, size), drive)
+        for name, size in (("good", 0.01), ("other", 0.3), ("trained", 0.001))
+    }
+    alone = compare_estimates(drive, {name: estimates[name] for name in ("good", "other")})
+    found = compare_estimates(drive, estimates, trained_here=["trained"])
+    assert [row["estimate"] for row in found["rows"]][-1] == "trained"
+    assert found["rows"][-1]["rmse_vy"] < found["rows"][0]["rmse_vy"]
+    excluded = "'trained' was trained on this recording and left out of the verdict. "
+    assert found["verdict"] == excluded + alone["verdict"]
+    assert found["rows"][:-1] == alone["rows"]
+
+
+def carmaker(folder, drive, shift=0.0):
+    """A table of another tool: semicolons, its own names, the angle in degrees and counted the other way."""
+    beta = -np.degrees(np.arctan2(drive["vy_ref"] + 0.05, drive["vx"]))
+    file = folder / "carmaker.csv"
+    pd.DataFrame({"Clock": drive.time - shift, "Beta_CarMaker": beta}).to_csv(
+        file, index=False, sep=";"
+    )
+    return file
+
+
+def test_columns_of_another_tool_are_read_by_their_stated_names_units_and_signs(drive, tmp_path):
+    file = carmaker(tmp_path, drive)
+    columns = parse_columns(["time=Clock", "sideslip=-Beta_CarMaker:deg"])
+    read = read_estimate_table(file, drive, columns)
+    assert read["vy"] == pytest.approx(drive["vy_ref"] + 0.05, abs=1e-9)
+    wrong = read_estimate_table(
+        file, drive, parse_columns(["time=Clock", "sideslip=-Beta_CarMaker"])
+    )
+    assert np.abs(wrong["vy"] - read["vy"]).max() > 1.0, "radians are the default"
+    suffixed = tmp_path / "suffixed.csv"
+    pd.DataFrame(
+        {
+            "time_ms": 1e3 * drive.time,
+            "beta_deg": np.degrees(np.arctan2(drive["vy_ref"], drive["vx"])),
+        }
+    ).to_csv(suffixed, index=False)
+    read = read_estimate_table(suffixed, drive)
+    assert read["vy"] == pytest.approx(drive["vy_ref"], abs=1e-9)
+    assert read.start_time == pytest.approx(drive.start_time)
+
+
+@pytest.mark.parametrize("shift", [12.345, -3.2, 1.7e9])
+def test_a_shift_by_correlation_is_the_one_that_was_put_in(drive, tmp_path, capsys, shift):
+    file = carmaker(tmp_path, drive, shift)
+    columns = parse_columns(["time=Clock", "sideslip=-Beta_CarMaker:deg"])
+    read = read_estimate_table(file, drive, columns, parse_shift("auto"))
+    assert read.start_time == pytest.approx(drive.start_time, abs=2e-3)
+    assert f"shifted by {shift:.1f}"[:-2] in capsys.readouterr().err
+    stated = read_estimate_table(file, drive, columns, parse_shift(str(shift)))
+    assert stated.start_time == pytest.approx(drive.start_time, abs=1e-5)
+
+
+def test_a_shift_between_laps_that_resemble_each_other_is_refused(drive, tmp_path):
+    lap = np.sin(2.0 * np.pi * drive.time / 12.0)
+    repeated = replace(drive, channels={**drive.channels, "vy_ref": lap})
+    file = tmp_path / "lap.csv"
+    part = (drive.time >= drive.time[0] + 30.0) & (drive.time < drive.time[0] + 60.0)
+    pd.DataFrame({"time": drive.time[part], "vy": lap[part]}).to_csv(file, index=False)
+    said = refusal(lambda: read_estimate_table(file, repeated, (), None))
+    assert "--shift auto is ambiguous: its correlation with the reference is 1.00 at" in said
+    noise = np.random.default_rng(0).standard_normal(len(drive))
+    pd.DataFrame({"time": drive.time, "vy": noise}).to_csv(file, index=False)
+    assert "is ambiguous" in refusal(lambda: read_estimate_table(file, drive, (), None))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["beta=Beta"], "'beta' is no quantity of an estimate; there are time, vy and sideslip"),
+        (["sideslip="], "names no column"),
+        (["sidesip=Beta"], "did you mean 'sideslip'?"),
+    ],
+)
+def test_a_wrong_column_option_is_refused(words, says):
+    assert says in refusal(lambda: parse_columns(words), ConfigurationError)
+
+
+@pytest.mark.parametrize("text", ["now", "inf", "nan", ""])
+def test_a_wrong_shift_is_refused(text):
+    says = f"--shift must be a number of seconds or auto, not '{text}'"
+    assert says in refusal(lambda: parse_shift(text), ConfigurationError)
+
+
+def test_what_is_missing_in_a_table_is_said_with_the_accepted_names(drive, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    table = pd.DataFrame({"time": drive.time, "Beta_CarMaker": drive["vy_ref"]})
+    table.to_csv("mine.csv", index=False)
+    said = refusal(lambda: read_estimate_table(Path("mine.csv"), drive))
+    assert "accepted names: vy, v, vlat" in said
+    assert "--column sideslip=NAME:deg" in said
+    said = refusal(
+        lambda: read_estimate_table(
+            Path("mine.csv"), drive, parse_columns(["sideslip=Beta_CarMaker:m/s"])
+        )
+    )
+    assert "is in 'm/s', which is no unit of sideslip" in said
+    names = ("vx", "yaw_rate", "ax", "ay", "vy_ref")
+    pd.DataFrame({"time": drive.time} | {name: drive[name] for name in names}).to_csv(
+        "lap.csv", index=False
+    )
+    said = refusal(
+        lambda: compare_files(Path("lap.csv"), ["mine.csv"], [], ["sideslip=BetaCarMaker"]),
+        ConfigurationError,
+    )
+    assert "no estimate has a column 'BetaCarMaker'; did you mean 'Beta_CarMaker'?" in said
+    table.assign(vy=drive["vy_ref"]).to_csv("mine.csv", index=False)
+    Path("other").mkdir()
+    table.assign(vy=drive["vy_ref"]).to_csv("other/mine.csv", index=False)
+    said = refusal(
+        lambda: compare_files(Path("lap.csv"), ["mine.csv", "other/mine.csv"], []),
+        ConfigurationError,
+    )
+    assert "2 estimates are called 'mine'" in said
+
+
 def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):
     table = pd.read_csv(place.folder / "raw" / "three.csv")
     pd.DataFrame({"time": table["Time"], "vy": table["Vy"] + 0.1}).to_csv(
@@ -270,7 +395,24 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
     assert "trained on this recording" not in err
     out, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
     assert "warning: 'luenberger' was trained on this recording: its row is no test" in err
-    assert "No estimator can be called best: 'luenberger' was trained on this recording." in out
+    assert "No verdict: 'luenberger' was trained on this recording." in out
+    out, _ = place.done(
+        "compare",
+        f"{raw}/one.csv",
+        "dataset=mine",
+        "-m",
+        "luenberger",
+        "-m",
+        "pretrained",
+        "--json",
+    )
+    found = json.loads(out)
+    assert found["verdict"].startswith(
+        "'luenberger' was trained on this recording and left out of the verdict. "
+    )
+    assert "luenberger" not in found["verdict"].partition("verdict. ")[2]
+    assert found["rows"][-1]["estimate"] == "luenberger"
+    assert found["rows"][-1]["against_best"] == "trained on it"
     trained_on = "'luenberger' was trained on this recording"
     for recording, is_named in (("one", True), ("three", False)):
         _, err = place.done(

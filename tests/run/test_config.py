@@ -74,6 +74,51 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
     )
 
 
+@pytest.mark.parametrize(
+    ("override", "meant"),
+    [
+        ("estimator.nlocal=3", "estimator.n_local"),
+        ("n_local=3", "estimator.n_local"),
+        ("training.max_epoch=3", "training.max_epochs"),
+        ("traning.max_epochs=3", "training.max_epochs"),
+        ("evaluation.rate=3", "evaluation.rate_hz"),
+        ("split.nam=x", "split.name"),
+        ("sed=3", "seed"),
+        ("limits.job=3", "limits.jobs"),
+        ("estimatr=ksnn", "estimator"),
+    ],
+)
+def test_a_misspelt_option_of_any_group_is_answered_with_what_was_meant(elsewhere, override, meant):
+    said = refusal(
+        lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", override]),
+        ConfigurationError,
+    )
+    assert f"did you mean '{meant}'?" in said
+
+
+def test_a_misspelt_option_of_a_data_set_a_nested_group_or_a_study_is_answered_too(elsewhere):
+    for command, words, meant in (
+        ("ingest", ["dataset=tabular", "dataset.clok=strict"], "dataset.clock"),
+        (
+            "train",
+            ["estimator=kalman", "split=ferrari_drive", "estimator.car.mas=3"],
+            "estimator.car.mass",
+        ),
+    ):
+        said = refusal(
+            lambda words=words, command=command: compose_config(command, words), ConfigurationError
+        )
+        assert f"did you mean '{meant}'?" in said
+    said = refusal(
+        lambda: jobs_of(read_study("quickstart"), ["estimator.nlocal=3"]), ConfigurationError
+    )
+    assert "did you mean 'estimator.n_local'?" in said
+    assert "did you mean" not in refusal(
+        lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", "zzz=1"]),
+        ConfigurationError,
+    )
+
+
 def test_sweeps_expand_to_every_combination_that_of_the_ferrari_to_35_jobs(elsewhere):
     jobs = expand(
         ["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"]
@@ -136,7 +181,7 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
     assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
     seeds = [job.config["seed"] for job in jobs_of(read_study("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
-    assert "suits no sweep" in refusal(
+    assert "matches no sweep" in refusal(
         lambda: jobs_of(read_study("quickstart"), ["training.momentum=0.9"]), ConfigurationError
     )
 

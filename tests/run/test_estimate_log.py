@@ -40,7 +40,8 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mf4")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
-    table = pd.read_csv("beta.csv")
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.parquet")[0] == 0
+    table = pd.read_parquet("beta.parquet")
     with asammdf.MDF("beta.mf4") as measurement:
         assert np.array_equal(measurement.get("Veh_ay").samples, drive["ay"])
         assert np.array_equal(measurement.get("T").samples, measurement.get("T").timestamps)
@@ -50,17 +51,18 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
         assert np.array_equal(vy.samples, table["vy"], equal_nan=True)
         assert (vy.unit, measurement.get("vehest_sideslip").unit) == ("m/s", "rad")
         assert np.array_equal(measurement.get("vehest_health", raw=True).samples, table["health"])
-        assert [text.decode().removeprefix("-") for text in words.samples] == table[
-            "health_reason"
-        ].fillna("").tolist()
+        assert [text.decode().removeprefix("-") for text in words.samples] == pd.read_csv(
+            "beta.csv"
+        )["health_reason"].fillna("").tolist()
 
 
 def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.parquet")[0] == 0
     found = loadmat("beta.mat", squeeze_me=True)
-    table = pd.read_csv("beta.csv")
+    table = pd.read_parquet("beta.parquet")
     assert np.allclose(found["ay"], drive["ay"])
     every = round(100.0 * (table["time"][1] - table["time"][0]))
     assert np.array_equal(found["vehest_vy"][::every][: len(table)], table["vy"], equal_nan=True)

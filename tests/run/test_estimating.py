@@ -57,6 +57,40 @@ def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved):
         assert "of the drive" in json.loads(out)["verdict"]
 
 
+def test_the_summary_for_people_names_point_band_share_rate_warnings_and_file(saved):
+    lap({})
+    figures = json.loads(saved.done("estimate", "own", "lap.csv", "-o", "out.csv", "--json")[0])
+    out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv")
+    rows = {line.split()[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
+    assert not {"{", "}"} & set(out)
+    assert rows["point"] == "v and β at the centre of gravity"
+    assert f"samples at {figures['rate_hz']:g} Hz" in rows["estimate"]
+    assert rows["valid"].startswith(f"{figures['valid_percent']:.3g} % of the estimated samples")
+    band = figures["band_sideslip_deg"]
+    assert f"90 % band ±{band['median']:.2f}° (median)" in rows["sideslip"]
+    assert rows["warnings"] == "none"
+    assert rows["file"].startswith("out.csv (vy [m/s]")
+    assert err == ""
+    lap({"vx": np.zeros(3000)})
+    out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv")
+    assert "warnings  1, printed above" in out
+    assert err.startswith("warning: vx: never changes")
+
+
+def test_the_point_of_the_self_calibrating_filter_depends_on_the_centre_of_gravity(saved):
+    lap({})
+    words = ("lap.csv", "estimator.wheelbase=2.4", "-o", "out.csv")
+    out, _ = saved.done("estimate", *words)
+    assert (
+        "30 % of the way from the accelerometer to a typical centre of gravity, which is assumed 1.15 m"
+        in out
+    )
+    out, _ = saved.done("estimate", *words, "estimator.cg_to_rear_axle=1.07")
+    assert "v and β at the centre of gravity, 1.07 m ahead of the rear axle" in out
+    [note] = [line for line in out.splitlines() if line.startswith("note")]
+    assert len(note) < 200
+
+
 def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refuses_it(saved):
     lap({"vx": np.zeros(3000)})
     said = "vx: never changes: 0 m/s throughout"

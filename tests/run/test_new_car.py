@@ -156,6 +156,7 @@ def test_json_says_all_of_it_to_a_script(log):
         "unit": "s",
         "evidence": "unit in the header, 50 Hz",
         "asked": False,
+        "repair": {},
     }
     assert ([question["key"] for question in said["open"]], said["has_reference"]) == (
         ["left_right"],
@@ -185,6 +186,7 @@ def test_run_takes_what_was_written(log):
     assert set(planned) >= {
         "static_map",
         "data_sheet",
+        "self_calibrating",
         "ksnn",
         "luenberger",
         "kalman",
@@ -193,6 +195,9 @@ def test_run_takes_what_was_written(log):
         "cnn_ukf",
     }
     assert log("data", "check", "my_car")[0] == 0
+    rows = json.loads(log("data", "usable", "my_car", "--json")[1])["estimators"]
+    usable = {row["estimator"] for row in rows if row["usable"] in ("yes", "with settings")}
+    assert usable == set(planned), "what is usable is written and run, and nothing else"
 
 
 def test_nothing_half_written_stays(log):
@@ -237,7 +242,10 @@ def test_without_a_speed_no_pipeline_is_written_that_could_not_run_and_a_yaw_rat
     )
     assert log("data", "check", "my_car")[0] == 0
     log.write("gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
-    out, err = log.new("gyro.csv", "--yes", "--force")
+    _, err = log.new("gyro.csv", "--yes", "--force", code=2)
+    assert err.endswith('add those that are right: --answer "Gyro=yaw_rate deg/s"\n')
+    answer = ("--answer", "Gyro=yaw_rate deg/s")
+    out, err = log.new("gyro.csv", "--yes", "--force", *answer)
     assert (err, "lacks vx, ay" in out) == ("", True)
 
 

@@ -29,7 +29,7 @@ QUICK = PIPELINE | {
 }
 RUN = ("run", "small", "tracking=none")
 CHECK = ("report", "--check")
-TIME_NAMES = ("seconds", "minutes", "[ms]", "## Times")
+TIME_NAMES = ("seconds", "[ms]", "## Times")
 
 
 @pytest.fixture(scope="module")

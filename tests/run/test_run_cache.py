@@ -52,9 +52,7 @@ def test_a_finished_study_prints_what_a_run_in_full_prints(study):
         forget(study)
         assert study(*words) == recognised, words
         assert recognised[0] == 0
-        assert words[0] == "report" or ("skipped report" in recognised[2]) == (
-            words[-1] != "--quiet"
-        )
+        assert words[0] == "report" or ("reused  " in recognised[2]) == (words[-1] != "--quiet")
         study.done("run", *WORDS)  # dry runs and reports leave no record
 
 
@@ -130,7 +128,7 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
 def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_overrides_are_another(
     study,
 ):
-    assert "skipped" not in study.done("run", *WORDS, "--force")[1]
+    assert "reused" not in study.done("run", *WORDS, "--force")[1]
     assert cached()
     raw = study.folder / "raw" / "three.csv"
     raw.write_text("\n".join(raw.read_text().splitlines()[:-5]) + "\n")

@@ -361,7 +361,7 @@ def test_tables_that_are_damaged_are_one_line(tmp_path):
     assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
 
 
-def test_a_checkpoint_or_a_published_study_that_is_damaged_counts_as_none(tmp_path):
+def test_a_damaged_checkpoint_counts_as_none_and_a_damaged_record_of_a_study_is_an_error(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)
@@ -370,9 +370,10 @@ def test_a_checkpoint_or_a_published_study_that_is_damaged_counts_as_none(tmp_pa
         Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}),
     )
     assert resume_epoch(tmp_path) == 3
+    assert published_in(tmp_path) is None
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
-        assert published_in(tmp_path) is None
+        assert str(tmp_path / PROVENANCE) in refusal(lambda: published_in(tmp_path))
     (tmp_path / PROVENANCE).write_text('{"kinds": {"a": "real"}, "parts": ["b"], "command": "x"}')
     assert published_in(tmp_path) == Published(kinds={"a": "real"}, parts=("b",))
 

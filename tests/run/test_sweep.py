@@ -233,7 +233,7 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     made = place.files()
     again, err = place.done("sweep", *GRID, "--json")
     assert (json.loads(again), place.files()) == ({**outcome, "skipped": True}, made)
-    assert {line.split()[0] for line in err.splitlines()} == {"skipped"}
+    assert [line.split()[0] for line in err.splitlines()] == ["reused"]
 
     out, err = place.done("sweep", *GRID[:-1], "seed=range(3)", "--name", "more")
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 4, (

@@ -1,13 +1,20 @@
 """Records of tables that commands outside pipelines write, and `vehest report --check` on them."""
 
 import json
+import os
+import re
+import runpy
+import subprocess
 from pathlib import Path
 
+import make_unseen_car
 import pytest
+from make_unseen_car import CARS, chosen_since, raw_files_of
 
-from vehest.run import table_records
+from vehest.data.errors import MissingError
+from vehest.run import artefacts, table_records
 from vehest.run.publishing import PROVENANCE, RESULTS
-from vehest.run.table_records import record_tables
+from vehest.run.table_records import record_tables, today_of
 from vehest.run.versions import VERSIONS, code_of
 
 CHECK = ("report", "--check", "tables")
@@ -81,6 +88,85 @@ def test_a_trial_outside_results_is_not_recorded(tmp_path):
     assert not (tmp_path / PROVENANCE).exists()
 
 
+def test_a_record_without_the_raw_files_is_refused_and_the_former_one_stays(place, table):
+    file = table.parent / PROVENANCE
+    former = file.read_text()
+    assert set(json.loads(former)["keys"]["a.csv: data mine"]) == {"code", "data"}
+    (place.folder / "raw").rename(place.folder / "elsewhere")
+    with pytest.raises(MissingError, match=r"cannot record 'a\.csv': raw files of data mine"):
+        record_tables([table], "make a", ["data mine"])
+    assert file.read_text() == former
+
+
+def test_raw_files_of_no_data_set_are_compared(place, table, outcome):
+    lap = place.folder / "raw" / "other" / "lap.mat"
+    lap.parent.mkdir()
+    lap.write_text("1")
+    record_tables([table], "make a", ["files other/*.mat"])
+    assert outcome() == (0, "tables: up to date\n")
+    lap.write_text("2")
+    assert outcome() == (3, "tables: stale: data (a.csv: files other/*.mat)\n")
+    lap.unlink()
+    note = "data not checked, raw files not here: other/*.mat"
+    assert outcome() == (0, f"tables: up to date: {note}\n")
+    with pytest.raises(MissingError, match="raw files of files other"):
+        record_tables([table], "make a", ["files other/*.mat"])
+
+
+def test_keys_of_the_unseen_cars_can_be_recorded(tmp_path):
+    names = raw_files_of(CARS)
+    assert {"data s90", "files stanford_tts/*.mat", "files autorally/mppi_*.mat"} <= set(names)
+    for name in (*names, "report own_car", "evaluate self_calibrating"):
+        assert today_of(f"report.md: {name}", tmp_path) is not None
+
+
+def test_commands_of_own_car_run_without_the_recordings_that_its_record_needs(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("VEHEST_DATA", "recordings")
+    environments = []
+
+    def run(command, env, **_):
+        environments.append(env)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    own_car = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "own_car.py"))
+    own_car["timed"](tmp_path, "--version")
+    assert "VEHEST_DATA" not in environments[0]
+    assert environments[0]["VEHEST_OUTPUT"] == str(tmp_path / "outputs")
+    assert os.environ["VEHEST_DATA"] == "recordings"
+
+
+def test_only_values_of_choices_count_as_chosen_since(monkeypatch):
+    texts = {
+        "a": "estimator: {grip: 14}  # m/s²\n",
+        "b": "estimator:\n  grip: 14.0\n  memory: 150\n",
+    }
+    monkeypatch.setattr(make_unseen_car, "git", lambda _, name: texts[name.partition(":")[0]])
+    assert chosen_since("a", "b") == ["memory"]
+
+
+def test_the_commit_of_a_record_has_no_changes_but_those_in_results(place, monkeypatch):
+    author = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    monkeypatch.setattr(artefacts, "CHECKOUT", place.folder)
+    monkeypatch.chdir(place.folder)
+    table = place.folder / "results" / "tables" / "a.csv"
+    script = place.folder / "script.py"
+    table.parent.mkdir(parents=True)
+    for file in (table, script):
+        file.write_text("1\n")
+    for words in (["init", "-q"], ["add", "-A"], [*author, "commit", "-qm", "a"]):
+        subprocess.run(["git", *words], check=True)
+    commit = artefacts.commit.__wrapped__
+    clean = commit()
+    assert len(clean) == 12
+    table.write_text("2\n")
+    assert commit() == clean
+    script.write_text("2\n")
+    assert commit() == f"{clean}-dirty"
+
+
 def test_every_folder_of_results_has_a_provenance():
     results = Path(__file__).parents[2] / RESULTS
     folders = {folder.name for folder in results.iterdir() if folder.is_dir()}
@@ -88,3 +174,16 @@ def test_every_folder_of_results_has_a_provenance():
     others = {"benchmarks", "scorecard"}
     recorded = {file.parent.name for file in results.glob(f"*/{PROVENANCE}")}
     assert folders - others == recorded
+
+
+def test_every_recorded_data_set_has_the_digest_of_its_raw_files():
+    """Without one a table is stale at once wherever the raw files are."""
+    records = (Path(__file__).parents[2] / RESULTS).glob(f"*/{PROVENANCE}")
+    keys = {
+        f"{file.parent.name}/{what}": key
+        for file in records
+        for what, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
+        if re.match(r"\S+\.\w+: (data|files) ", what)
+    }
+    assert keys
+    assert [what for what, key in keys.items() if "data" not in key] == []

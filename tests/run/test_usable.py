@@ -257,12 +257,14 @@ NAMES = (
 def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
     contents = [summary_of(log(FULL))]
     plain = usability(name, compose_config("train", [f"estimator={name}"]), contents)
-    assert (plain.usable, "estimator.wheelbase=" in plain.to_give) == ("no", name == "data_sheet")
+    expected = "no" if name == "data_sheet" else "with settings"
+    assert plain.usable == expected
+    assert ("estimator.wheelbase=" in plain.to_give) == (name == "data_sheet")
     given = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
-    assert (
-        usability(name, compose_config("train", [f"estimator={name}", *given]), contents).usable
-        == "yes"
-    )
+    after = usability(name, compose_config("train", [f"estimator={name}", *given]), contents)
+    assert after.missing.to_estimate == after.missing.to_train == []
+    assert after.patterns == ()
+    assert after.usable == ("with settings" if after.of_car else "yes")
 
 
 def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to_those_whom_they_concern():
@@ -271,7 +273,7 @@ def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to
         "not to train",
         ["vy_ref"],
     )
-    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), (
+    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "with settings"), (
         "they learn nothing of a reference"
     )
     drive = log(FULL)

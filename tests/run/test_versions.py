@@ -56,7 +56,7 @@ def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_
 
 def test_what_has_no_version_is_of_version_1():
     assert code_of("train", "zero").endswith(" training=1")
-    assert code_of("report", "folds").endswith(" folds=2")
+    assert code_of("report", "folds").endswith(" folds=3")
     assert "no study module 'nobody'" in refusal(
         lambda: code_of("report", "nobody"), ConfigurationError
     )

@@ -163,3 +163,86 @@ def test_a_damaged_log_is_one_line(tmp_path, suffix, change, said):
     written = write_log(drive(3.0), tmp_path, suffix)
     written.log.write_bytes(change(written.log.read_bytes()))
     assert re.search(said, refusal(lambda: read(tmp_path)))
+
+
+def ramp(first, missing, n=200):
+    """Frames of 100 Hz whose first two bytes count up, but for a missing code from sample 20."""
+    return [
+        (k / 100, 0, struct.pack("<H6x", missing[k - 20] if 20 <= k < 20 + len(missing) else k))
+        for k in range(first, first + n)
+    ]
+
+
+def choices(text):
+    return one('0|16@1+ (0.01,0) [0|300] "m/s" Car') + f"\nVAL_ 291 Speed {text} ;\n"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SNA", "Signal not available", "Speed_Invalid", "ERROR", "Init", "nicht verfuegbar", "n.a."],
+)
+def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, name):
+    log(tmp_path, choices(f'65535 "{name}"'), ramp(0, [65535] * 5))
+    got = read(tmp_path, channels={"vx": {**SPEED["vx"], "max_gap": 0.1}})
+    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 100.0, atol=1e-9)
+    said = refusal(lambda: read(tmp_path, channels=SPEED))
+    assert "'Speed' of message 'Speed', for channel 'vx', 5 samples of which are marked as" in said
+    assert "has a gap of 0.06 s after 0.19 s" in said
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
+def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding):
+    log(tmp_path, "", ramp(0, [65535] * 5))
+    content = choices('65535 "Ungültig"').replace("m/s", "km/h").encode(encoding)
+    (tmp_path / "car.dbc").write_bytes(content)
+    speed = {**SPEED["vx"], "unit": "km/h", "max_gap": 0.1}
+    got = read(tmp_path, channels={"vx": speed})
+    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 360.0, atol=1e-9)
+
+
+def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(tmp_path):
+    log(tmp_path, choices('65535 "SNA"'), ramp(0, [65535] * 50))
+    declared = {"files": "drive.*", "dbc": str(tmp_path / "car.dbc"), "rate_hz": 100}
+    declared |= {"channels": SPEED, "max_gap": 0.1, "path": str(tmp_path)}
+    parts = list(open_source({"name": "mine", "source": "can", **declared}).recordings())
+    assert [(len(part), float(part["vx"].max())) for part in parts] == [(20, 0.19), (130, 1.99)]
+
+
+@pytest.mark.parametrize(
+    "names",
+    ['0 "Init"', '30 "no error"', '30 "Errors occurred once"', '30 "valid"', '30 "N" 31 "Normal"'],
+)
+def test_values_with_other_names_and_the_zero_of_a_standing_car_are_measurements(tmp_path, names):
+    log(tmp_path, choices(names), ramp(0, []))
+    got = read(tmp_path, channels=SPEED)
+    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 100.0, atol=1e-9)
+
+
+J1939 = """VERSION ""
+
+BO_ 2566834174 Wheels: 8 Car
+ SG_ Speed : 0|16@1+ (0.00390625,0) [0|{maximum}] "km/h" Car
+{protocol}"""
+PROTOCOL = """BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";
+BA_DEF_DEF_ "VFrameFormat" "J1939PG";
+BA_ "VFrameFormat" BO_ 2566834174 3;
+"""
+
+
+@pytest.mark.parametrize(
+    ("maximum", "protocol", "n_missing"),
+    [("250.996", "", 3), ("0", PROTOCOL, 3), ("300", "", 0)],
+    ids=["beyond the declared maximum", "by the protocol", "within the declared range"],
+)
+def test_reserved_codes_of_j1939_are_missing_samples(tmp_path, maximum, protocol, n_missing):
+    (tmp_path / "car.dbc").write_text(J1939.format(maximum=maximum, protocol=protocol))
+    raw = np.full(100, 0xFAFF)  # the highest value that is a measurement
+    raw[[40, 50, 60]] = 0xFB00, 0xFE01, 0xFFFF
+    with can.Logger(tmp_path / "drive.asc") as writer:
+        for k, code in enumerate(raw.tolist()):
+            data = struct.pack("<H6x", code)
+            writer(can.Message(k / 100, 2566834174 & 0x1FFFFFFF, True, data=data, channel=0))
+    channels = {"vx": {"column": "Speed", "unit": "km/h"}}
+    got = read(tmp_path, channels=channels, gappy=["vx"])["vx"]
+    assert np.count_nonzero(np.isnan(got)) == n_missing
+    assert (3.6 * got[~np.isnan(got)] < 251.0).all() == (n_missing > 0)

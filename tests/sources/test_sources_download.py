@@ -324,16 +324,16 @@ def test_ingest_fetches_what_is_missing_then_ingests(server, tmp_path, monkeypat
     }
     (tmp_path / "conf" / "dataset").mkdir(parents=True)
     (tmp_path / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset))
-    for what in ("done", "skipped"):
+    for fetched, ingested in (("done", "done"), ("note", "reused")):
         code, _, err = run_vehest(
             capsys, "ingest", "mine", "--download", "root=data", "output=outputs"
         )
         assert code == 0, err
         lines = [tuple(line.split()[:3]) for line in err.splitlines()]
         assert lines == [
-            (what, "download", "one.csv"),
-            (what, "download", "two.csv"),
-            (what, "ingest", "mine"),
+            (fetched, "download", "one.csv"),
+            (fetched, "download", "two.csv"),
+            (ingested, "ingest", "mine"),
         ]
         assert [path for path, _, _ in server.asked] == ["/files/one.csv", "/files/two.csv"]
     (stored,) = (tmp_path / "outputs" / "ingest").glob("mine-*/two.parquet")

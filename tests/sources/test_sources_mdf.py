@@ -171,6 +171,22 @@ def test_physical_values_are_read(tmp_path, raw, conversion, physical):
     np.testing.assert_allclose(recording["vx"], physical, rtol=1e-12)
 
 
+def test_values_that_a_conversion_names_not_available_are_missing_samples(tmp_path):
+    from asammdf.blocks.conversion_utils import from_dict
+
+    raw = np.arange(2001, dtype="u2")
+    raw[100:103] = 65535
+    names = {"val_0": 65535, "text_0": b"SNA", "val_1": 0, "text_1": b"Error", "default": b""}
+    named = from_dict({**names, "default_addr": from_dict({"a": 0.01, "b": 0.0})})
+    file = one(tmp_path / "a.mf4", FAST, raw, conversion=named)
+    bridged = {"vx": {**ONE["vx"], "max_gap": 0.05}}
+    expected = 0.01 * np.arange(1, 2001)
+    np.testing.assert_allclose(read_mdf(file, channels=bridged)["vx"], expected, rtol=1e-12)
+    assert "a gap of 0.04 s after 0.99 s" in refused(file)
+    gear = from_dict({**names, "text_1": b"D", "default_addr": from_dict({"a": 0.01, "b": 0.0})})
+    assert "holds text" in refused(one(tmp_path / "a.mf4", FAST, raw, conversion=gear))
+
+
 def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp_path):
     gear = {"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"D", "default": b"?"}
     stamps = np.concatenate([FAST[:50], FAST[49:]])
@@ -258,7 +274,9 @@ def test_invalid_samples_are_missing_values(tmp_path):
     bits = (np.arange(2001) >= 500) & (np.arange(2001) < 520)
     values = np.where(bits, 1e6, 10.0 + FAST)  # what stands at an invalid sample must never be seen
     file = one(tmp_path / "a.mf4", FAST, values, invalidation_bits=bits)
-    assert "holds 20 samples between 5 s and 5.19 s that are marked invalid" in refused(file)
+    assert "20 samples of which are marked as not measured, has a gap of 0.21 s after 4.99 s" in (
+        refused(file)
+    )
     recording = read_mdf(file, gappy=["vx"])
     expected = np.where(bits, np.nan, 10.0 + FAST)
     np.testing.assert_allclose(recording["vx"], expected, rtol=1e-12)

@@ -292,6 +292,19 @@ def test_a_moving_average_removes_what_would_alias(tmp_path):
     )  # a line stays the line: no delay
 
 
+def test_nan_in_a_field_is_bridged_up_to_the_max_gap_of_its_topic(tmp_path):
+    topics = drive()
+    speed = topics["/motor"].fields["motor.rpm"]
+    speed[50:53] = np.nan
+    folder = write_bag(tmp_path, topics).parent
+    step = float(np.median(np.diff(topics["/motor"].times)))
+    recording = read(folder, topics=topic_options("motor", max_gap=4.1 * step))
+    np.testing.assert_allclose(recording["vx"], 1.0 + recording.time, rtol=0, atol=1e-8)
+    message = refused(folder, topics=topic_options("motor", max_gap=3.9 * step))
+    assert "field 'motor.rpm' holds 3 samples" in message
+    assert "no finite numbers" in message
+
+
 @pytest.mark.parametrize(("storage", "share"), [("sqlite3", 0.999), ("mcap", 0.3), ("mcap", 0.999)])
 def test_a_truncated_bag_is_refused(tmp_path, storage, share):
     bag = write_bag(tmp_path, drive(1.0), storage)

@@ -325,6 +325,14 @@ def test_offline_estimators_and_missing_channels_are_refused():
         GuardedRun(estimator)({"ay": drive["ay"]}, drive)
 
 
+@pytest.mark.parametrize(
+    ("bus", "rate", "milliseconds"), [(1000.0, 100.0, 10.3), (100.0, 20.0, 50.9)]
+)
+def test_front_end_delays_by_about_one_interval_of_the_estimator(bus, rate, milliseconds):
+    front = FrontEnd(("ay",), (), usual_limits(("ay",), rate), bus, rate)
+    assert 1e3 * front.delay == pytest.approx(milliseconds, abs=0.05)
+
+
 def test_front_end_filters_as_scipy_does_and_passes_on_at_the_estimators_rate():
     time = np.arange(2000) / 200.0
     samples = np.sin(2 * np.pi * 0.7 * time) + 0.3 * np.sin(2 * np.pi * 17.0 * time)

@@ -220,8 +220,8 @@ def test_what_makes_no_sense_is_one_line(arguments, message):
 
 
 def cells(start):
-    """Cells of the row of docs/trust.md that begins with this."""
-    text = (Path(__file__).parents[2] / "docs" / "trust.md").read_text(encoding="utf-8")
+    """Cells of the row of docs/faults.md that begins with this."""
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
     row = next(line for line in text.splitlines() if line.startswith(f"| {start}"))
     return [cell.strip() for cell in row.strip("|").split("|")]
 

@@ -297,7 +297,7 @@ def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_an
     assert domain_verdict(model, outside_domain(model, fast)) == ""
     fast["ay"][: len(drive) // 4] = 50.0
     assert domain_verdict(model, outside_domain(model, fast)).startswith(
-        "25 % of the drive outside what the model learnt: |ay| above "
+        "25 % of the drive outside the range of the training: |ay| above "
     )
     model = model_of()
     read = validated(

@@ -56,11 +56,11 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     code, out, err = run_vehest(
-        capsys, "estimate", str(folder), "lap.csv", "-o", "out.csv", "--json"
+        capsys, "estimate", str(folder), "lap.csv", "-o", "out.parquet", "--json"
     )
     assert code == 0, err
     assert "of the drive" in json.loads(out)["verdict"]
-    table = pd.read_csv("out.csv")
+    table = pd.read_parquet("out.parquet")
     then = read_estimate(folder / "estimate.parquet")
     for channel in ("vy", "sideslip", "band_sideslip"):
         np.testing.assert_allclose(

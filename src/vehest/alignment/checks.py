@@ -26,6 +26,7 @@ from vehest.alignment.signs import (
 )
 from vehest.alignment.standstill import BoolArray, standstill
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
@@ -37,6 +38,11 @@ STUCK_SECONDS = 1.0
 FEWEST_STUCK = 3  # seconds, samples
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
+USUAL_RANGE = (0.005, 0.995)  # quantiles
+SPIKE_EXCESS = 1.0  # of the usual range, beyond it
+SPIKE_SECONDS = 0.25
+USUAL_STEPS = 0.995  # quantile of the steps between samples
+SPIKE_STEP = 3.0  # of a usual step: a sensor that shakes jumps all the time
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
@@ -251,6 +257,50 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
                 yield Finding("warning", "saturated", name, message)
 
 
+def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Short excursions far beyond the usual range that begin and end with a jump.
+
+    A code for "not available" or a lost bit looks so; a manoeuvre needs longer to come and go.
+    Those beyond what a vehicle can do are the finding ``impossible``. A sideslip angle without
+    speed is noise.
+    """
+    speed = np.abs(recording["vx"]) if "vx" in recording else np.full(len(recording), np.inf)
+    for name, samples in recording.channels.items():
+        counts = (samples >= CHANNELS[name].low) & (samples <= CHANNELS[name].high)
+        if name == "sideslip_ref":
+            counts &= speed > STANDSTILL_SPEED
+        known = samples[np.isfinite(samples)]
+        if len(known) < FEWEST_SAMPLES:
+            continue
+        low, high = np.quantile(known, USUAL_RANGE)
+        excess = SPIKE_EXCESS * (high - low)
+        runs = true_runs((samples > high + excess) | (samples < low - excess))
+        steps = np.abs(np.diff(samples))
+        jump = max(excess, SPIKE_STEP * float(np.nanquantile(steps, USUAL_STEPS)))
+        most = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
+        spikes = [
+            (begin, end)
+            for begin, end in runs.tolist()
+            if begin > 0
+            and end < len(samples)
+            and end - begin <= most
+            and steps[begin - 1] > jump
+            and steps[end - 1] > jump
+            and counts[begin:end].all()
+        ]
+        if spikes:
+            worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
+            at = worst[0] + int(np.argmax(np.abs(samples[worst[0] : worst[1]])))
+            unit = CHANNELS[name].unit
+            times = "once" if len(spikes) == 1 else f"{len(spikes)} times"
+            message = (
+                f"jumps {times} for {SPIKE_SECONDS:g} s or less far beyond its usual "
+                f"range ({low:.4g} to {high:.4g} {unit}), to {samples[at]:.4g} {unit} at "
+                f"{recording.time[at]:.12g} s; mark such samples as missing, or cut them out"
+            )
+            yield Finding("warning", "spike", name, message)
+
+
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """Straight ahead the steering angle must be about zero: its median where a moving car hardly turns."""
     if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
@@ -363,6 +413,7 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _stuck,
     held_findings,
     _saturated,
+    _spikes,
     _steering_offset,
     _wheel_dropout,
     _reverse,

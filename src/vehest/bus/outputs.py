@@ -11,6 +11,7 @@ from typing import Any
 
 from vehest.bus.messages import dbc_text
 from vehest.data.errors import ConfigurationError
+from vehest.data.estimate import IN_DEGREES, number_cell, time_cell
 from vehest.data.files import writing_error
 from vehest.trust.health import reason_in_words
 
@@ -48,12 +49,14 @@ class Output:
             *(name for name in LAST[:2] if name in names),
         ]
         self._path = path or Path()
+        self._angles: list[str] = []  # columns of `IN_DEGREES`
         self._table: Any = None
         self._log: Any = None
         if path is not None and path.suffix.lower() == ".csv":
             with writing(path):
                 self._table = path.open("w", encoding="utf-8", newline="", buffering=1)
-            self._row(["time", "sampled", *self._names, *LAST[2:]])
+            self._angles = [name for name, angle in IN_DEGREES.items() if angle in self._names]
+            self._row(["time", "sampled", *self._names, *LAST[2:], *self._angles])
         elif path is not None:
             from can.io.asc import ASCWriter
 
@@ -64,10 +67,13 @@ class Output:
     def estimate(self, time: float, sampled: float, values: Mapping[str, float]) -> None:
         """Write an estimate that holds for ``time``, of the sample at ``sampled``, on the bus's clock [s]."""
         if self._table is not None:
-            numbers = [values.get(name, math.nan) for name in self._names]
-            cells = ["" if math.isnan(number) else f"{number:.9g}" for number in numbers]
+            cells = [number_cell(values.get(name, math.nan)) for name in self._names]
             health = [str(int(values["health"])), reason_in_words(values["health_reason"])]
-            self._row([f"{time:.6f}", f"{sampled:.6f}", *cells, *health])
+            angles = [
+                number_cell(math.degrees(values.get(IN_DEGREES[name], math.nan)))
+                for name in self._angles
+            ]
+            self._row([time_cell(time), time_cell(sampled), *cells, *health, *angles])
 
     def _row(self, cells: list[str]) -> None:
         with writing(self._path):

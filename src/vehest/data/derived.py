@@ -213,15 +213,24 @@ class VelocityFromSideslip:
     """Make the reference ``vy_ref`` from ``sideslip_ref``, as an optical sensor gives it: v = u·tan β.
 
     It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set, moves it from there.
+
+    Attributes
+    ----------
+    min_speed : float
+        Speed below which the angle has no meaning, so that ``vy_ref`` is 0 [m/s].
     """
+
+    min_speed: NonNegativeFloat = 0.0
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
 
         At standstill, where the angle means nothing, 90 degrees and more become 0.
         """
-        angle = recording["sideslip_ref"]
         speed = speed_of_reference(recording)
+        angle = recording["sideslip_ref"]
+        if self.min_speed:
+            angle = np.where(np.abs(recording[speed]) < self.min_speed, 0.0, angle)
         beyond = np.abs(angle) >= 0.5 * np.pi
         moving = beyond & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
         if moving.any():

@@ -7,7 +7,8 @@ something. Functions that take plain values of a configuration (``…_from_confi
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 
 
 class VehestError(Exception):
@@ -47,6 +48,17 @@ class JobsFailedError(VehestError):
 def listed(words: Sequence[str]) -> str:
     """``a``, ``a and b``, ``a, b and c``."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def closest(name: str, choices: Iterable[str]) -> str:
+    """The choice that is spelt most like a name; empty if none is close."""
+    return next(iter(get_close_matches(name, list(choices), n=1)), "")
+
+
+def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
+    """What was probably meant by an unknown name, to append to a message; empty if no choice is close."""
+    close = closest(name, choices)
+    return f"; did you mean '{prefix}{close}'?" if close else ""
 
 
 def printable(text: str, keep: str = "") -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -38,6 +39,22 @@ axle's force per slip angle where there is none, ``tyre_c1`` where its curve ben
 innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it. ``band_vy`` and ``band_sideslip`` are
 half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number
 (`vehest.trust`)."""
+
+IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "band_sideslip"}
+"""Columns of written tables in degrees -> the quantity [rad] that each repeats for people."""
+
+COLUMN_UNITS: dict[str, str] = {"time": "s", **QUANTITIES, **dict.fromkeys(IN_DEGREES, "deg")}
+"""Columns of written tables, with units."""
+
+
+def time_cell(seconds: float) -> str:
+    """A time in a table of text, to a microsecond."""
+    return f"{seconds:.6f}"
+
+
+def number_cell(value: float) -> str:
+    """A value in a table of text, to six significant digits; empty for NaN."""
+    return "" if math.isnan(value) else f"{value:.6g}"
 
 
 @dataclass(frozen=True, eq=False)

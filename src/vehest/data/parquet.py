@@ -65,9 +65,7 @@ def number_batches(
     """
     for name in names:
         kind = file.schema_arrow.field(name).type
-        if not (
-            pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_timestamp(kind)
-        ):
+        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or has_time_unit(kind)):
             raise DataError(
                 f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed"
             )
@@ -113,11 +111,16 @@ def read_numbers(
     return values
 
 
+def has_time_unit(kind: pa.DataType) -> bool:
+    """Whether a column counts time in a unit of its own: as a time stamp or a duration."""
+    return bool(pa.types.is_timestamp(kind) or pa.types.is_duration(kind))
+
+
 def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
     """Numbers of a column, (T,), NaN where one is missing; not by ``to_numpy``, which imports pandas."""
     found = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
-        counted = chunk.cast(pa.int64()) if pa.types.is_timestamp(chunk.type) else chunk
+        counted = chunk.cast(pa.int64()) if has_time_unit(chunk.type) else chunk
         numbers = (
             counted if counted.type == pa.float64() else counted.cast(pa.float64(), safe=False)
         )

@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin, g
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError, suggestion
 
 Schema = TypeVar("Schema")
 
@@ -174,11 +174,11 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
         case "unexpected_keyword_argument":
             beside = name.rpartition(".")[0]
             known = _keys_of(_type_at(kind, path[:-1]))
-            return (
-                f"{name} is not an option of {beside}; options: {known}"
-                if beside
-                else f"unknown key '{name}'; there are: {known}"
-            )
+            *_, key = name.split(".")
+            meant = suggestion(key, known.split(", "), f"{beside}." if beside else "")
+            if beside:
+                return f"{name} is not an option of {beside}{meant or ';'} options: {known}"
+            return f"unknown key '{name}'{meant or ';'} there are: {known}"
         case "literal_error":
             choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
             return f"{name} '{error['input']}' is not one of: {choices}"

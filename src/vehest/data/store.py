@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError
-from vehest.data.estimate import Estimate, Mode
+from vehest.data.estimate import COLUMN_UNITS, IN_DEGREES, QUANTITIES, Estimate, Mode
 from vehest.data.files import writing_error, written_aside
 from vehest.data.parquet import parquet_file, read_numbers
 from vehest.data.recording import Kind, Recording
@@ -125,21 +125,53 @@ def _content_of(path: Path) -> str:
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
     """Store one estimate, with its time column, so that other tools can read it. Raises `MissingError`: the file cannot be written."""
-    write_estimate_parts([estimate], path)
+    _write(path, estimate_columns([estimate]), "estimate", _about_estimate(estimate))
 
 
 def write_estimate_parts(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
-    """`write_estimate` for the parts of an estimate, one after another, with the quantities that the first has.
+    """Write the parts of an estimate, one after another, as a table for people and other tools.
 
-    ``band`` says what calibrated the bands, for the description beside the table.
+    It has the quantities of the first part, those of `IN_DEGREES` and, as metadata ``unit`` of each
+    field of the schema, their units. `read_estimate` reads it back.
+
+    Parameters
+    ----------
+    parts : iterable of Estimate
+        Parts on one clock.
+    path : Path
+        Parquet file.
+    band : str
+        What calibrated the bands, for the description beside the table.
+
+    Raises
+    ------
+    MissingError
+        The file cannot be written.
     """
     rest = iter(parts)
     first = next(rest)
-    about = _attributes(first, _OF_ESTIMATE)
-    if first.covariance is not None:
-        about |= {"n_states": first.covariance.shape[1], "covariance_of": list(first.covariance_of)}
-    about |= {"band": band} if band else {}
-    _write(path, estimate_columns(chain([first], rest)), "estimate", about)
+    about = _about_estimate(first) | ({"band": band} if band else {})
+    columns = map(with_degrees, estimate_columns(chain([first], rest)))
+    units = [QUANTITIES[name] for name in first.covariance_of]
+    of_covariance = {
+        f"{_COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
+    }
+    _write(path, columns, "estimate", about, COLUMN_UNITS | of_covariance)
+
+
+def with_degrees(columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Columns of an estimate, followed by the angles among them in degrees."""
+    angles = {name: angle for name, angle in IN_DEGREES.items() if angle in columns}
+    return {**columns, **{name: np.degrees(columns[angle]) for name, angle in angles.items()}}
+
+
+def _about_estimate(estimate: Estimate) -> dict[str, Any]:
+    """The description of an estimate beside its table."""
+    about = _attributes(estimate, _OF_ESTIMATE)
+    if estimate.covariance is not None:
+        about["n_states"] = estimate.covariance.shape[1]
+        about["covariance_of"] = list(estimate.covariance_of)
+    return about
 
 
 def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
@@ -171,6 +203,8 @@ def read_estimate(path: Path) -> Estimate:
     n_states = described.n_states
     try:
         del columns["time"]
+        for name in IN_DEGREES:
+            columns.pop(name, None)
         if n_states is not None:
             here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
             if n_states < 1 or n_states**2 != here:
@@ -212,8 +246,13 @@ def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _write(
-    path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, about: Mapping[str, Any]
+    path: Path,
+    parts: Iterable[Mapping[str, FloatArray]],
+    content: str,
+    about: Mapping[str, Any],
+    units: Mapping[str, str] | None = None,
 ) -> None:
+    """Write parts as one table with a description beside it; ``units``: column -> unit, for the schema."""
     try:
         described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
@@ -221,7 +260,8 @@ def _write(
             f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})"
         ) from None
     tables = (
-        _table(columns).replace_schema_metadata({_METADATA_KEY: described}) for columns in parts
+        _table(columns, units or {}).replace_schema_metadata({_METADATA_KEY: described})
+        for columns in parts
     )
     first = next(tables)
     with (
@@ -236,17 +276,19 @@ def _write(
             raise writing_error(path, OSError(str(error))) from error
 
 
-def _table(columns: Mapping[str, FloatArray]) -> pa.Table:
+def _table(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> pa.Table:
     buffers = {
         name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64))
         for name, values in columns.items()
     }  # without pandas
-    return pa.table(
-        {
-            name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own])
-            for name, own in buffers.items()
-        }
-    )
+    arrays = [
+        pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for own in buffers.values()
+    ]
+    fields = [
+        pa.field(name, pa.float64(), metadata={"unit": units[name]} if name in units else None)
+        for name in buffers
+    ]
+    return pa.table(arrays, schema=pa.schema(fields))
 
 
 def _read(

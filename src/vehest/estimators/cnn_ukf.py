@@ -137,7 +137,7 @@ class CnnUkf(NetworkUkf):
         True, "whether the filter measures the angle; otherwise σ_DD is held at 1 rad"
     )
     adaptive_distrust: bool = setting(
-        True, "whether σ_DD changes from sample to sample; otherwise one value is learnt"
+        True, "whether σ_DD changes from sample to sample; otherwise one value is trained"
     )
     adaptive_process: bool = setting(
         True, "whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels"

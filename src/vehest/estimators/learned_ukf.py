@@ -91,38 +91,38 @@ class CarSettings(Group):
     wheel_radius: float = setting(0.05, "known", unit="m", least=LENGTH.least, most=LENGTH.most)
     yaw_inertia: float = setting(
         F1TENTH["yaw_inertia"],
-        "learnt from here on",
+        "trained from here on",
         unit="kg m²",
         least=YAW_INERTIA.least,
         most=YAW_INERTIA.most,
     )
     cg_to_rear_axle: float = setting(
         F1TENTH["cg_to_rear_axle"],
-        "learnt from here on",
+        "trained from here on",
         unit="m",
         least=LENGTH.least,
         most=LENGTH.most,
     )
     drag_constant: float = setting(
-        F1TENTH["drag_constant"], "learnt from here on", unit="N", positive=True
+        F1TENTH["drag_constant"], "trained from here on", unit="N", positive=True
     )
     drag_linear: float = setting(
-        F1TENTH["drag_linear"], "learnt from here on", unit="N s/m", positive=True
+        F1TENTH["drag_linear"], "trained from here on", unit="N s/m", positive=True
     )
     drag_quadratic: float = setting(
-        F1TENTH["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True
+        F1TENTH["drag_quadratic"], "trained from here on", unit="N s²/m²", positive=True
     )
     powertrain_inertia: float = setting(
-        F1TENTH["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True
+        F1TENTH["powertrain_inertia"], "trained from here on", unit="kg m²", positive=True
     )
     torque_constant: float = setting(
-        F1TENTH["torque_constant"], "learnt from here on", unit="N m/A", positive=True
+        F1TENTH["torque_constant"], "trained from here on", unit="N m/A", positive=True
     )
     friction_viscous: float = setting(
-        F1TENTH["friction_viscous"], "learnt from here on", unit="N s", positive=True
+        F1TENTH["friction_viscous"], "trained from here on", unit="N s", positive=True
     )
     friction_coulomb: float = setting(
-        F1TENTH["friction_coulomb"], "learnt from here on", unit="N m", positive=True
+        F1TENTH["friction_coulomb"], "trained from here on", unit="N m", positive=True
     )
 
     def __post_init__(self) -> None:
@@ -204,7 +204,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     )
     curvature: bool = setting(
         False,
-        "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone",
+        "whether Pacejka's curves have the E terms of Eq. 3, trained from 0 on; of dynamics=pacejka alone",
     )
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 

@@ -15,7 +15,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import UNSET, setting
-from vehest.estimators.base import rate, require_positive, require_shapes
+from vehest.estimators.base import Trial, rate, require_positive, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import c_tables, packed
 from vehest.estimators.ksnn import Ksnn
@@ -51,6 +51,13 @@ class SelfCalibrating(Recursive):
 
     name = "self_calibrating"
     title = "Self-calibrating filter"
+    trials = (
+        Trial(
+            1.5,
+            "filter that identifies the car on each drive; nothing is trained, compiled once",
+            "estimator.wheelbase={wheelbase}",
+        ),
+    )
     version = "4"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
@@ -69,7 +76,7 @@ class SelfCalibrating(Recursive):
     )
     smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline")
     measured_ax: bool = setting(
-        True, "whether ax is measured; else the longitudinal equation tells nothing"
+        True, "whether ax is measured; else the longitudinal equation is unused"
     )
     grips: tuple[float, ...] = setting(
         (4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]"

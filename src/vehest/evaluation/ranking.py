@@ -33,7 +33,7 @@ class Comparison:
     low: float  # lower end of its interval, corrected by Holm over all comparisons of the table
     high: float  # its upper end
     p_value: float  # adjusted likewise
-    verdict: Verdict  # whether the first lies lower, higher, or is not told apart from the second
+    verdict: Verdict  # whether the first lies significantly lower or higher than the second
 
     @property
     def turned(self) -> Comparison:
@@ -72,7 +72,7 @@ class Ranking:
         ]
 
     def beats(self, name: Name, baseline: str) -> bool | None:
-        """Whether a candidate's RMSE lies below a baseline's; None where that is not told apart or was not compared."""
+        """Whether a candidate's RMSE lies significantly below a baseline's; None without a significant difference or a comparison."""
         found = [
             own
             for (candidate, other), own in self.pairs.items()
@@ -102,8 +102,19 @@ class Ranking:
         )
 
     @property
+    def recommendable(self) -> list[Name]:
+        """The best and those without a significant difference to it, as far as they beat every baseline significantly."""
+        if not self.order:
+            return []
+        return [
+            name
+            for name in (self.order[0], *self.not_told_apart)
+            if all(self.beats(name, baseline) for baseline in BASELINES)
+        ]
+
+    @property
     def not_told_apart(self) -> list[Name]:
-        """Those that the best is not told apart from."""
+        """Those without a significant difference to the best."""
         others = [(name, self.pairs.get((self.order[0], name))) for name in self.order[1:]]
         return [name for name, own in others if own is not None and own.verdict == "not told apart"]
 

@@ -43,6 +43,7 @@ _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _UNWANTED = {"html_inline", "html_block", "image"}
 _SCRIPTED = re.compile(r"(?!https?:|mailto:)[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+_APPENDIX = re.compile(r"\A## Appendix: (.)")  # the page lists these under "Appendices"
 _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 
@@ -103,9 +104,9 @@ class Document:
     ]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
     # name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    open_blocks: int | None = (
-        None  # how many of the first blocks the page shows; sections after them are folded, with None none
-    )
+    # how many of the first blocks the page shows, the sections after them being folded appendices; None: all
+    # up to the first heading that begins with "Appendix"
+    open_blocks: int | None = None
 
     def __post_init__(self) -> None:
         for kind in (Table, Figure):
@@ -127,7 +128,7 @@ def write_documents(
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
-        on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
+        on_page: text and tables that the page of ``report`` alone ends with, and no other file contains.
 
     Raises:
         ValueError: tables or figures of two documents share a name, or a name is no file name.
@@ -158,7 +159,7 @@ def write_document(
 
     Args:
         name: of both files, without ending.
-        on_page: text and tables that the page alone ends with, and no other file holds.
+        on_page: text and tables that the page alone ends with, and no other file contains.
 
     Raises:
         ValueError: a table of ``on_page`` has the name of another.
@@ -201,7 +202,7 @@ def as_code(text: str) -> str:
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
-    """Headers of a table, rows of cells, and for each column whether it holds numbers."""
+    """Headers of a table, rows of cells, and for each column whether it contains numbers."""
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
     shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
@@ -339,7 +340,7 @@ def _in_pipes(cell: str) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files; what it holds of them is shown as text."""
+    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files; what it contains of them is shown as text."""
     from markdown_it import MarkdownIt
 
     text = printable(text, keep="\n\t")
@@ -370,6 +371,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
+            block = _APPENDIX.sub(lambda heading: f"## {heading[1].upper()}", block)
             blocks.append(
                 {
                     "kind": "text",
@@ -390,6 +392,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             alternative = {
                 "image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"),
                 "alt": _spoken(block.caption),
+                "inches": f"{block.static.get_figwidth():.3g}",
             }
             interactive = Markup(block.interactive) if block.interactive else None
             blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
@@ -405,13 +408,25 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     return environment.get_template("page.html.j2").render(
         title=printable(document.title),
         blocks=blocks,
-        open_blocks=document.open_blocks,
+        open_blocks=_open_blocks(document),
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),
         plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if explored else "",
         plots_style=Markup(_packaged("uplot.css")) if explored else "",
         missing=MISSING,
     )
+
+
+def _open_blocks(document: Document) -> int | None:
+    """How many blocks the page shows before its appendices; those of `Document.open_blocks`, else all up to the first appendix."""
+    if document.open_blocks is not None:
+        return document.open_blocks
+    appendices = (
+        position
+        for position, block in enumerate(document.blocks)
+        if isinstance(block, str) and block.startswith("## Appendix")
+    )
+    return next(appendices, None)
 
 
 def _no_formula(cell: Any) -> Any:

@@ -13,6 +13,7 @@ from vehest.constants import FloatArray
 from vehest.report.style import (
     DOUBLE_COLUMN,
     REFERENCE,
+    REFERENCE_GREY,
     SINGLE_COLUMN,
     Line,
     MatplotlibFigure,
@@ -27,6 +28,8 @@ STATIC_POINTS = 500
 LEAST_SAMPLES = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other
+# the reference under the estimates: wide enough to show on both sides of a line
+BELOW_ESTIMATES = {"color": REFERENCE_GREY, "linewidth": 2.4}
 LOSSES = ("epoch", "train_loss", "validation_loss")  # columns of a training history
 
 Errors = tuple[
@@ -55,21 +58,16 @@ def traces_figure(
                 (left, reference.vy, estimate.vy),
                 (right, reference.sideslip, estimate.sideslip),
             ):
+                axes.plot(*decimated(time, measured, STATIC_POINTS), **BELOW_ESTIMATES)
                 axes.plot(
                     *decimated(time, estimated, STATIC_POINTS),
                     color=estimate.line.colour,
-                    linewidth=1.2,
-                )
-                axes.plot(
-                    *decimated(time, measured, STATIC_POINTS),
-                    color=reference.line.colour,
-                    linewidth=0.6,
+                    linewidth=0.8,
                 )
                 axes.margins(x=0.005)
             left.set_title(
                 estimate.label,
                 loc="left",
-                color=estimate.line.colour,
                 pad=2.0,
                 fontsize=7.5,
                 fontweight="bold",
@@ -86,41 +84,60 @@ def traces_figure(
     return figure
 
 
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Half widths of the calibrated 90 % bands of one estimate, NaN where there is none."""
+
+    estimate: Traces
+    vy: FloatArray  # [m/s], shape (K,)
+    sideslip: FloatArray  # [deg], shape (K,)
+
+
 def zoom_figure(
     time: FloatArray,
     ay: FloatArray | None,
     reference: Traces,
     estimates: Sequence[Traces],
     time_label: str,
+    band: Band | None = None,
 ) -> MatplotlibFigure:
-    """Reference and all estimates over a short time, (K,) [s]: lateral velocity, sideslip, its error and, if given, ``ay`` (K,) [m/s²]."""
+    """Reference and estimates over a short time, (K,) [s]: sideslip with a band, its error, v and, if given, ``ay`` (K,) [m/s²]."""
     from matplotlib.ticker import MaxNLocator
 
-    heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
+    heights = (2.0, 1.2, 1.3, 0.6) if ay is not None else (2.0, 1.2, 1.3)
     with new_figure(DOUBLE_COLUMN, 1.25 * sum(heights)) as figure:
         all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
         (top, middle, below) = all_axes[:3]
         bottom = all_axes[-1]
-        for source in (*reversed(estimates), reference):
+        for estimate in reversed(estimates):
             looks = {
-                "color": source.line.colour,
-                "linestyle": source.line.dash,
-                "linewidth": 1.4 if source is reference else 1.0,
+                "color": estimate.line.colour,
+                "linestyle": estimate.line.dash,
+                "linewidth": 1.0,
             }
-            top.plot(time, source.vy, label=source.label, **looks)
-            middle.plot(time, source.sideslip, **looks)
-            if source is not reference:
-                error = source.sideslip - reference.sideslip
-                below.plot(time, error, **looks)
-        below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
+            top.plot(time, estimate.sideslip, label=estimate.label, **looks)
+            middle.plot(time, estimate.sideslip - reference.sideslip, **looks)
+            below.plot(time, estimate.vy, **looks)
+        if band is not None:
+            for axes, centre, half in (
+                (top, band.estimate.sideslip, band.sideslip),
+                (below, band.estimate.vy, band.vy),
+            ):
+                axes.fill_between(
+                    time,
+                    centre - half,
+                    centre + half,
+                    color=band.estimate.line.colour,
+                    alpha=0.2,
+                    linewidth=0.0,
+                    label=f"90 % band of {band.estimate.label}",
+                )
+        top.plot(time, reference.sideslip, label=reference.label, zorder=1, **BELOW_ESTIMATES)
+        below.plot(time, reference.vy, zorder=1, **BELOW_ESTIMATES)
+        middle.axhline(0.0, color=reference.line.colour, linewidth=0.7)
         if ay is not None:
             bottom.plot(time, ay, color="#444444", linewidth=0.8)
-        labels = (
-            "lateral velocity [m/s]",
-            "sideslip [deg]",
-            "sideslip error [deg]",
-            "$a_y$ [m/s²]",
-        )
+        labels = ("sideslip [deg]", "error of sideslip [deg]", "v [m/s]", "$a_y$ [m/s²]")
         for axes, label in zip(all_axes, labels, strict=False):
             axes.set_ylabel(label)
             axes.margins(x=0.0)
@@ -163,7 +180,7 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
 
 
 def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of 1 m/s² of |a_y|, (K,) [m/s²], and how many samples each holds; bins of fewer than 20 show none."""
+    """RMSE of the sideslip in bins of 1 m/s² of |a_y|, (K,) [m/s²], and how many samples each contains; bins of fewer than 20 show none."""
     n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
     edges = np.arange(n_bins + 1)
     centres = edges[:-1] + 0.5
@@ -238,7 +255,7 @@ class Reliability:
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
-    """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal bands say what they hold."""
+    """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal, coverage is as stated."""
     nominal = np.array(levels)
     aside = SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
     with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
@@ -302,18 +319,18 @@ def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
 
 
 def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each stretch, in their order."""
+    """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each segment, in their order."""
     if len(values) <= n_points:
         return time, values
-    kept: list[int] = []
-    for stretch in np.array_split(np.arange(len(values)), max(n_points // 2, 1)):
-        part = values[stretch]
+    indices: list[int] = []
+    for segment in np.array_split(np.arange(len(values)), max(n_points // 2, 1)):
+        part = values[segment]
         finite = np.isfinite(part)
         if not finite.all():
-            kept.append(int(stretch[np.argmin(finite)]))
+            indices.append(int(segment[np.argmin(finite)]))
         if finite.any():
-            kept += [int(stretch[np.nanargmin(part)]), int(stretch[np.nanargmax(part)])]
-    order = np.unique([0, *kept, len(values) - 1])
+            indices += [int(segment[np.nanargmin(part)]), int(segment[np.nanargmax(part)])]
+    order = np.unique([0, *indices, len(values) - 1])
     return time[order], values[order]
 
 

@@ -22,6 +22,7 @@ DOUBLE_COLUMN = 7.16  # in, both columns
 MISSING = "–"
 
 REFERENCE_COLOUR = "#000000"
+REFERENCE_GREY = "#8c9096"  # of a wide line of the reference below estimates, 3:1 on white
 LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
@@ -110,7 +111,7 @@ def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
 
 
 def on_dark(colour: str) -> str:
-    """The colour that stands for ``colour`` on a dark page: greys change places with their opposites, hues get lighter."""
+    """The colour that replaces ``colour`` on a dark page: greys change places with their opposites, hues get lighter."""
     red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
     if max(red, green, blue) - min(red, green, blue) <= 12:
         level = _DARK_INK + (_DARK_PAPER - _DARK_INK) * (red + green + blue) / (3 * 255)
@@ -131,7 +132,7 @@ def paper_style() -> Iterator[None]:
 
 @contextmanager
 def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
-    """An empty figure of a width and height [in] that no global state knows of, drawn inside the ``with`` block in `paper_style`."""
+    """An empty figure of a width and height [in] without global state, drawn inside the ``with`` block in `paper_style`."""
     from matplotlib.figure import Figure
 
     with paper_style():

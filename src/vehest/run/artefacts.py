@@ -316,14 +316,21 @@ def library_versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Commit of the checkout that vehest runs from, marked if it has changes; empty without a checkout."""
+    """Commit of the checkout that vehest runs from, marked if it has changes; empty without a checkout.
+
+    Changes in results/ do not count: a command that writes tables there would mark its own record.
+    """
     if not (CHECKOUT / ".git").exists():
         return ""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    head = ["git", "rev-parse", "--short=12", "HEAD"]
+    changes = ["git", "status", "--porcelain", "--untracked-files=no", "--", ":(exclude)results"]
     try:
-        result = subprocess.run(
-            command, cwd=CHECKOUT, capture_output=True, text=True, timeout=10, check=True
+        name, changed = (
+            subprocess.run(
+                command, cwd=CHECKOUT, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
+            for command in (head, changes)
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return result.stdout.strip()
+    return f"{name}-dirty" if changed else name

@@ -5,29 +5,29 @@ tables, models -> `Estimate` each -> scored where all of them have values, besid
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
+from vehest.alignment.checks import refuse_errors
 from vehest.constants import FloatArray
 from vehest.data.car import CarValues
-from vehest.data.errors import ConfigurationError, DataError, listed, printable
+from vehest.data.errors import ConfigurationError, DataError, listed, printable, suggestion
 from vehest.data.estimate import Estimate
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 from vehest.data.splits import Span
-from vehest.data.store import is_stored_estimate, read_estimate
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
+from vehest.report.style import MISSING
 from vehest.run.car_record import adapted
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
@@ -40,44 +40,49 @@ from vehest.run.estimate import (
     same_vehicle_from_config,
     split_settings,
 )
+from vehest.run.estimate_tables import (
+    NamedColumn,
+    names_of_table,
+    parse_columns,
+    parse_shift,
+    read_estimate_table,
+)
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
-from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
 from vehest.sources.base import read_single
-from vehest.sources.tables import column_names
-from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
-SPELLINGS = {
-    "time": {"time", "t", "timestamp", "zeit"},
-    "vy_ref": {"vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"},
-    "sideslip_ref": {
-        "sideslip",
-        "beta",
-        "β",
-        "slip",
-        "slipangle",
-        "sideslipangle",
-        "betaest",
-        "betahat",
-    },
-}
-"""Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
-OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
-"""Columns that estimates of vehest have, and those of other tools do not."""
-USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
-TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 LEAST_SECONDS = 5.0
 LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
 def compare_files(
-    recording: Path, words: Sequence[str], models: Sequence[str]
+    recording: Path,
+    words: Sequence[str],
+    models: Sequence[str],
+    columns: Sequence[str] = (),
+    shift: str = "0",
 ) -> tuple[dict[str, Any], list[str | TerminalTable]]:
     """Score estimates of other tools, and models, on one recording: for JSON and for a terminal.
 
-    Raises `VehestError` where a file or model cannot be used.
+    Parameters
+    ----------
+    recording : Path
+        With its reference.
+    words : sequence of str
+        Files of estimates, then overrides of conf/estimate.yaml.
+    models : sequence of str
+        Models to run on the recording.
+    columns, shift : sequence of str, str
+        Of the tables of other tools, as `parse_columns` and `parse_shift` read them.
+
+    Raises
+    ------
+    VehestError
+        A file or model cannot be used.
     """
+    named_columns = parse_columns(columns)
+    seconds = parse_shift(shift)
     files = [Path(word) for word in words if is_file_name(word)]
     settings, overrides = split_settings([word for word in words if not is_file_name(word)])
     config = compose_config("estimate", overrides)
@@ -94,17 +99,17 @@ def compare_files(
         ]
         for finding in findings:
             complain(f"warning: '{recording}': {finding}")
-        estimates = {file.stem: read_estimate_table(file, drive) for file in files}
-        if len(estimates) < len(files):
-            raise ConfigurationError(
-                "two estimates have the same file name; rename one, since it names the row"
-            )
+        _check_rows([*(file.stem for file in files), *models])
+        _check_columns(named_columns, files)
+        estimates = {
+            file.stem: read_estimate_table(file, drive, named_columns, seconds) for file in files
+        }
         for name in models:
             folder, model, trust = open_model(name, Path(config["output"]), note)
             model, trust, remarks = adapted(model, trust, drive.car, settings)
             notes += [f"'{name}': {remark}" for remark in remarks]
             if is_training_recording(folder, drive.id):
-                trained_here.append(f"'{name}'")
+                trained_here.append(name)
                 complain(f"warning: '{name}' was trained on this recording: its row is no test")
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, same_vehicle_from_config(config)
@@ -115,13 +120,7 @@ def compare_files(
             wheelbase = validated(
                 CarValues, of_command, "", error=ConfigurationError, group="estimator"
             ).wheelbase
-        found = compare_estimates(drive, estimates, wheelbase)
-    if trained_here:
-        found["verdict"] = (
-            f"No estimator can be called best: {listed(trained_here)} "
-            f"{'was' if len(trained_here) == 1 else 'were'} trained on this recording. "
-            "Compare on another one."
-        )
+        found = compare_estimates(drive, estimates, wheelbase, trained_here)
     for text in notes:
         note(text)
     cells = [
@@ -141,95 +140,40 @@ def compare_files(
     ]
 
 
-def read_estimate_table(file: Path, vx: Recording) -> Estimate:
-    """Read v or β from a table of any tool, or of ``vehest estimate``; raises `DataError` where it has neither, or no time.
-
-    Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad; an unknown one
-    is a `DataError`. Where only β is there, v = u tan β with the recording's u. Prints a warning where unit or sign contradict the
-    recording.
-    """
-    if file.suffix == ".parquet" and is_stored_estimate(file):
-        return read_estimate(file)
-    names = column_names(file)
-    if file.suffix == ".parquet" and OF_VEHEST.intersection(names):
-        complain(
-            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
-            "description: another program has written it anew; it is read like another tool's table"
-        )
-    found: dict[str, dict[str, str]] = {}
-    for quantity, spellings in SPELLINGS.items():
-        for name in names:
-            if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
-                unit = _unit_of(quantity, name, file)
-                found.setdefault(quantity, {"column": name, "unit": unit})
-    time = found.pop("time", None)
-    channel = next(iter(found), None)
-    if time is None or channel is None:
-        wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
-        raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
-    options = {
-        "name": file.stem,
-        "source": "tabular",
-        "vehicle": "unknown",
-        "clock": "interpolate",
-        "gappy": [channel],
-    }
-    table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
-    _warn_of_estimate(file, found[channel]["column"], table, vx)
-    values = table[channel]
-    if channel == "sideslip_ref":
-        values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
-    return Estimate(
-        vx.id,
-        file.stem,
-        table.rate_hz,
-        table.start_time,
-        {"vy": values, "sideslip": np.zeros_like(values)},
-    )
+def _check_rows(names: Sequence[str]) -> None:
+    """Refuse two estimates of one name."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise ConfigurationError(
+                f"{count} estimates are called '{name}'; rename a file or leave one out, since the name stands for the row"
+            )
 
 
-def _unit_of(quantity: str, name: str, file: Path) -> str:
-    """The unit in brackets in a column's name, or the usual one where there are no brackets; raises `DataError` for an unknown one."""
-    written = re.search(r"[\[(](.*?)[\])]", name)
-    if written is None:
-        return USUAL_UNITS[quantity]
-    unit = TIME_UNITS.get(written[1]) if quantity == "time" else plain_unit(written[1])
-    if unit is None:
-        known = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
-        raise DataError(
-            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(written[1])}' (known are {known}); "
-            "convert it, or rename the column"
-        )
-    return unit
-
-
-def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recording) -> None:
-    """Print a warning where an estimate has another unit or sign than its column says, by the channels of the recording."""
-    (channel,) = table.channels
-    measured = drive.without_references()
-    values = np.interp(measured.time, table.time, table[channel], left=np.nan, right=np.nan)
-    beside = replace(
-        measured,
-        channels={**measured.channels, channel: values},
-        gappy=measured.gappy | {channel},
-    )
-    for finding in merged_findings([checks_of_recording(table), checks_of_recording(beside)]):
-        concerns = finding.channel == channel or (
-            not finding.channel and channel in finding.message
-        )
-        if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
-            complain(
-                f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
+def _check_columns(columns: Sequence[NamedColumn], files: Sequence[Path]) -> None:
+    """Refuse a column of ``--column`` that no file has."""
+    if not columns:
+        return
+    names = list(dict.fromkeys(chain.from_iterable(names_of_table(file) for file in files)))
+    for column in columns:
+        if column.find(names) is None:
+            meant = suggestion(column.text, names) or ";"
+            raise ConfigurationError(
+                f"--column: no estimate has a column '{printable(column.text)}'{meant} "
+                f"there are {printable(counted(names))}"
             )
 
 
 def compare_estimates(
-    drive: Recording, estimates: Mapping[str, Estimate], wheelbase: float | None = None
+    drive: Recording,
+    estimates: Mapping[str, Estimate],
+    wheelbase: float | None = None,
+    trained_here: Collection[str] = (),
 ) -> dict[str, Any]:
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m] (`min_sideslip_speed`). The map is fitted on one half
-    of the scored range and scored on the other, and vice versa, so that its samples are held out.
+    of the scored range and scored on the other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by models
+    that were trained on this recording, have rows, the last ones, and are left out of the verdict.
     Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and ``stop`` [s] and ``rate_hz`` of what is
     scored, ``min_sideslip_speed`` [m/s] and ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
     Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
@@ -261,11 +205,17 @@ def compare_estimates(
         for name, estimate in candidates.items()
     }
     ranking = rank(
-        {name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()},
+        {
+            name: [segments_of([own], reference.rate_hz)]
+            for name, own in scored.items()
+            if name[0] not in trained_here
+        },
         reference.rate_hz,
     )
     titles = {
-        name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0])
+        name: {"zero": "the zero-sideslip baseline", "static_map": "the static map"}.get(
+            name[0], name[0]
+        )
         for name in ranking.order
     }
     errors = {name: accuracy([own]) for name, own in scored.items()}
@@ -274,15 +224,26 @@ def compare_estimates(
         if ranking.order
         else f"Sideslip is not scored: the car is slower than {min_speed:.3g} m/s throughout."
     )
-    for words in ("**", " over its seeds", " and over seeds"):
+    for words in ("**", " over all seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
+    if trained_here:
+        verdict = _with_exclusions(
+            verdict, trained_here, has_others=len(estimates) > len(trained_here)
+        )
     rows = []
-    for ranked in ranking.order or sorted(errors, key=lambda name: errors[name]["rmse_vy"]):
+    by_error = sorted(errors, key=lambda name: errors[name]["rmse_vy"])
+    excluded = [name for name in by_error if name[0] in trained_here]
+    order = ranking.order or [name for name in by_error if name not in excluded]
+    for name in (*order, *excluded):
         figures = {
-            key: errors[ranked][key]
+            key: errors[name][key]
             for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
         }
-        rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
+        standing = standing_columns(ranking, name)
+        if name in excluded:
+            standing |= dict.fromkeys(("beats_zero", "beats_static_map"), MISSING)
+            standing["against_best"] = "trained on it"
+        rows.append({"estimate": name[0], **figures, **standing})
     return {
         "rows": rows,
         "verdict": verdict,
@@ -292,6 +253,15 @@ def compare_estimates(
         "min_sideslip_speed": min_speed,
         "share_below_min_speed": next(iter(errors.values()))["share_below_min_speed"],
     }
+
+
+def _with_exclusions(verdict: str, trained_here: Collection[str], *, has_others: bool) -> str:
+    """The verdict, preceded by which models it leaves out; no verdict if only baselines remain."""
+    names = listed([f"'{name}'" for name in trained_here])
+    were = "was" if len(trained_here) == 1 else "were"
+    if not has_others:
+        return f"No verdict: {names} {were} trained on this recording. Compare on another one."
+    return f"{names} {were} trained on this recording and left out of the verdict. {verdict}"
 
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
@@ -311,7 +281,7 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
             f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items()
         )
         raise DataError(
-            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?"
+            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift SECONDS or auto moves tables of other tools)"
         )
     if reference.rate_hz < LOWEST_RATE:
         raise DataError(

@@ -6,7 +6,7 @@ jobs -> `plan` (rates, required channels, trainings in groups that fit one batch
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,6 +28,7 @@ from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
 from vehest.run.train import TrainJob, estimator_rate, new_estimator, plan_train
 from vehest.run.usable import lack
+from vehest.studies.reference_minutes import start_in_words
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
@@ -71,8 +72,9 @@ class Comparison:
     @property
     def unfinished(self) -> list[str]:
         """Trainings for which no time was left, by name."""
-        left = [job.training.plan for job in self.usable if job.training is not None]
-        return list(dict.fromkeys(plan.label for plan in left if plan.key not in self.found))
+        trainings = [job.training for job in self.usable if job.training is not None]
+        remaining = [own for own in trainings if own.plan.key not in self.found]
+        return list(dict.fromkeys(map(label_of, remaining)))
 
     @property
     def failed(self) -> dict[str, str]:
@@ -298,6 +300,16 @@ def _check_name(job: Job, training: TrainJob, names: dict[Any, Any]) -> None:
             f"two jobs are both called {training.plan.label}: they differ in what its name does not say; "
             "sweep that in a pipeline of its own"
         )
+
+
+def name_in_part(part: str, name: str, parts: Collection[str]) -> str:
+    """Name of a training in messages on a study: parts of one study often train the same estimator and seed."""
+    return f"{name} in part '{part}'" if len(parts) > 1 else name
+
+
+def label_of(training: TrainJob) -> str:
+    """Name of a training in messages, with the model that it starts from, which its folder's name does not say."""
+    return training.plan.label + start_in_words(training.training)
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:

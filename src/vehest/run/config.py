@@ -33,7 +33,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import Container, DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from vehest.data.errors import ConfigurationError, VehestError, printable
+from vehest.data.errors import ConfigurationError, VehestError, closest, printable
 from vehest.data.files import stamp_of
 from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
 from vehest.data.schema import FURTHER_KEYS, validated
@@ -185,6 +185,7 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         _check(override)
     of_groups = tuple(str(one.input_line) for one in read if _is_group(str(one.key_or_group)))
     values = [one for one in read if one.input_line not in of_groups]
+    composed: DictConfig | None = None
     try:
         with _limited_references():
             composed = deepcopy(_composed(command, of_groups, stamp_of(*conf_folders())))
@@ -200,7 +201,8 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
             raise ConfigurationError(
                 f"the defaults of {names} lead back to themselves; remove an entry of them"
             ) from None
-        raise ConfigurationError(_one_line(error, command)) from None
+        composed_keys = OmegaConf.to_container(composed) if composed is not None else {}
+        raise ConfigurationError(_one_line(error, command, composed_keys)) from None
     validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]
     return {str(key): value for key, value in resolved.items()} | (
@@ -234,7 +236,7 @@ def _check(override: Override) -> None:
     text = _shortened(override.input_line)
     if override.is_sweep_override():
         raise ConfigurationError(
-            f"'{text}' names several values; one is wanted here (pipelines and sweeps take several)"
+            f"'{text}' names several values; one is required here (pipelines and sweeps take several)"
         )
     if override.is_delete() and "." not in group:
         raise ConfigurationError(
@@ -256,17 +258,18 @@ def _check(override: Override) -> None:
         )
 
 
-def _one_line(error: Exception, command: str) -> str:
-    """An error of Hydra in one line, with the next step where it is known."""
+def _one_line(error: Exception, command: str, composed: Any) -> str:
+    """An error of Hydra in one line, with the next step where it is known; ``composed``: the configuration before values were set."""
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return f"the configuration of '{command}' cannot be read ({first_line(error)})"
     text = str(error).strip()
     if unknown := re.search(r"Could not override '([^']+)'", text):
-        hint = (
-            option_hint(unknown[1])
-            or f"; 'vehest config {command}' prints the options there are; +{unknown[1]}=… adds one"
-        )
-        return f"unknown option '{unknown[1]}'{hint}"
+        listing = f"'vehest config {command}' prints the options there are"
+        meant = close_key(unknown[1], composed)
+        hint = option_hint(unknown[1])
+        if meant and not hint:
+            hint = f"; did you mean '{meant}'? {listing}"
+        return f"unknown option '{unknown[1]}'{hint or f'; {listing}; +{unknown[1]}=… adds one'}"
     if missing := re.search(r"You must specify '([^']+)'", text):
         return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
     key = getattr(error, "full_key", None)
@@ -357,6 +360,27 @@ def option_hint(key: str) -> str:
     """A hint where a key is an option of the command rather than of the configuration; else nothing."""
     option = key.replace("_", "-")
     return f"; an option is written --{option}" if option in COMMAND_OPTIONS else ""
+
+
+def close_key(key: str, config: Any) -> str:
+    """The dotted key of a configuration that is spelt most like an unknown one; empty if none is close.
+
+    A key that is given without its group, such as ``n_local``, is looked for in all groups.
+    """
+    group, _, rest = key.partition(".")
+    if not isinstance(config, dict):
+        return ""
+    names = [str(name) for name in config if name != GIVEN]
+    name = group if group in names else closest(group, names)
+    if name and not rest:
+        return name
+    inner = close_key(rest, config[name]) if name else ""
+    if inner:
+        return f"{name}.{inner}"
+    dotted = (
+        [] if rest else [f"{name}.{group}" for name in names if has_key(config, f"{name}.{group}")]
+    )
+    return next(iter(dotted), "")
 
 
 def has_key(config: Config, key: str) -> bool:

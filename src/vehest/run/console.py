@@ -5,6 +5,7 @@ Text from files is shown with control characters as escapes, and nothing in it i
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any
 
@@ -24,10 +25,11 @@ from rich.text import Text
 from vehest.data.errors import printable
 
 WARNING = "warn"
+REUSED = "skip"  # status of an existing artefact, also in records of finished studies
 MARKS = {
     WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
-    "skip": ("skipped", "dim"),
+    REUSED: ("reused", "dim"),
     "plan": ("would", "cyan"),
     "once": ("once", "cyan"),
     "note": ("note", "cyan"),
@@ -51,12 +53,14 @@ class Messages:
 
     Attributes:
         printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
+            Lines of reused artefacts are printed as one, by `print_reused`.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.console = _Console(stderr=True, highlight=False, soft_wrap=True)
         self.quiet = quiet
         self.printed: list[tuple[str, str, str, str]] = []
+        self._reused: list[tuple[str, str]] = []  # stage and label, not printed yet
 
     def warn(self, text: str) -> None:
         """Print a warning."""
@@ -65,13 +69,35 @@ class Messages:
     def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
         """Print the status of one artefact, or a warning."""
         self.printed.append((status, stage, label, detail))
+        if status == REUSED:
+            self._reused.append((stage, label))
+            return
         word, colour = MARKS[status]
         if status == WARNING:
             text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
         else:
             shown = (f" {printable(detail)}" if detail else "", "dim")
             text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown)
-        if status == WARNING or not self.quiet:
+        self._print(text, always=status == WARNING)
+
+    def print_reused(self) -> None:
+        """Print one line for all existing artefacts that were reused since the last such line."""
+        stages = Counter(stage for stage, _ in self._reused)
+        if not stages:
+            return
+        if len(self._reused) == 1:
+            [(stage, label)] = self._reused
+            text = f"{stage:<10} {printable(label)}"
+        else:
+            counts = ", ".join(f"{count} {stage}" for stage, count in stages.items())
+            text = f"{len(self._reused)} artefacts: {counts}"
+        self._reused.clear()
+        word, colour = MARKS[REUSED]
+        self._print(Text.assemble((f"{word:<7}", colour), f" {text}"))
+
+    def _print(self, text: Text, *, always: bool = False) -> None:
+        """Print a line, of a quiet run only if it is ``always`` printed."""
+        if always or not self.quiet:
             with suppress(OSError):  # a closed stream or a full disk does not end the work
                 self.console.print(text)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -46,9 +47,19 @@ def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path
         )
 
 
-def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, Any]) -> Recording:
-    """A recording, after the transforms of a preparation and by its method, at a rate that is no higher; else raises `DataError`."""
-    if recording.rate_hz < rate_hz * (1 - 1e-9):
+def resampled(
+    recording: Recording,
+    rate_hz: float,
+    preparation: Mapping[str, Any],
+    *,
+    slowest_hz: float = math.inf,
+) -> Recording:
+    """A recording, after the transforms of a preparation and by its method, at another rate.
+
+    Raises `DataError` for a rate that is higher than the recording's, unless this is sampled at
+    ``slowest_hz`` or faster.
+    """
+    if recording.rate_hz < min(rate_hz * (1 - 1e-9), slowest_hz):
         raise DataError(
             f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed"
         )
@@ -58,7 +69,11 @@ def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, An
 
 
 def resampled_parts(
-    parts: Iterable[Recording], rate_hz: float, preparation: Mapping[str, Any]
+    parts: Iterable[Recording],
+    rate_hz: float,
+    preparation: Mapping[str, Any],
+    *,
+    slowest_hz: float = math.inf,
 ) -> Iterator[Recording]:
     """`resampled` for a recording that comes in parts, to the same bits; a preparation with other transforms needs it whole."""
     if preparation["transforms"]:
@@ -67,7 +82,7 @@ def resampled_parts(
     done = 0  # samples at the start of the outcome that are out already
     for part in parts:
         whole = joined([*kept, part])
-        found = resampled(whole, rate_hz, preparation)
+        found = resampled(whole, rate_hz, preparation, slowest_hz=slowest_hz)
         ratio = (Fraction(found.rate_hz) / Fraction(whole.rate_hz)).limit_denominator(1000)
         reach = Resample.reach(ratio)
         begin = (len(whole) - 2 * reach) // ratio.denominator * ratio.denominator

@@ -24,11 +24,11 @@ from vehest.alignment.findings import Finding
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.estimate import QUANTITIES, Estimate
+from vehest.data.estimate import IN_DEGREES, QUANTITIES, Estimate, number_cell, time_cell
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import UNNAMED_VEHICLE, Recording, joined
-from vehest.data.store import estimate_columns, write_estimate_parts
+from vehest.data.store import estimate_columns, with_degrees, write_estimate_parts
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
@@ -40,6 +40,7 @@ from vehest.run.config import compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled, resampled_parts
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
+from vehest.run.estimate_summary import point_of_estimate
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import car_of, read_single, source_of_file
@@ -47,6 +48,7 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
+SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
 SUFFIXES = (".parquet", ".csv")
 SHARPEST_TURN = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
@@ -57,6 +59,13 @@ PRETRAINED = "pretrained"
 SELF_CALIBRATING = "self_calibrating"
 """Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
 WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
+SHIPPED_NOTES = {
+    PRETRAINED: "trained on simulated cars, not on yours; the KS-NN is patented by its authors (PCT/IT2023/050058); "
+    "errors and limits: docs/estimators/ksnn.md",
+    SELF_CALIBRATING: "the network inside was trained on simulated cars, not on yours; the KS-NN is patented by its "
+    "authors (PCT/IT2023/050058); errors and limits: docs/estimators/self_calibrating.md",
+}
+"""What users of these models should know, in one line; their model.yaml says more."""
 
 
 def pretrained_folder(name: str = PRETRAINED) -> Path:
@@ -81,14 +90,16 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
             )
         return pretrained_folder(name)
     if not found:
-        known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
+        known = (
+            f"'{output / 'train'}', which contains {counted([folder.name for folder in models])}"
+        )
         raise MissingError(
             f"there is no model '{name}', neither a folder nor in {known}; train one first"
         )
     newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
     if len(found) > 1:
         say(
-            f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}"
+            f"'{name}' is assumed to be {newest.name}, the newest of {counted([folder.name for folder in found])}"
         )
     return newest
 
@@ -206,6 +217,11 @@ def estimate_file(
         same_vehicle = same_vehicle_from_config(config)
         band = describe_band(trust, first.vehicle, same_vehicle, first.car)
         elsewhere = is_other_vehicle(trust, first.vehicle, same_vehicle, first.car)
+        if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
+            remarks.append(
+                f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
+                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the estimate"
+            )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
         log = out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
@@ -217,6 +233,7 @@ def estimate_file(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
+            slowest_hz=SLOWEST_LOG_HZ,
         )
         estimates = report.counted(_estimates(run, needed))
         if log:
@@ -235,14 +252,11 @@ def estimate_file(
         "model": name if name in WITH_VEHEST else str(folder),
         **({"car": str(car)} if car is not None else {}),
         **report.summary(),
+        "point": point_of_estimate(model, folder),
         **({"band": band} if band else {}),
         "verdict": report.verdict(),
         "findings": findings,
-        **(
-            {"note": " ".join(read_description(folder).about.note.split())}
-            if name in WITH_VEHEST
-            else {}
-        ),
+        **({"note": SHIPPED_NOTES[name]} if name in SHIPPED_NOTES else {}),
     }
 
 
@@ -441,6 +455,7 @@ def _too_short(model: Estimator, recording_id: str, seconds: float) -> DataError
 def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
     """Write an estimate, of parts that follow one another, as Parquet or CSV, by the file's ending.
 
+    Units are those of `COLUMN_UNITS`. CSV has six significant digits, times to a microsecond.
     ``band`` says what calibrated the bands, in the metadata of Parquet.
     """
     _check_table_name(path)
@@ -458,16 +473,17 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") 
 
 def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
     """Cells of a table of text, with the reasons of health in words."""
-    cells: dict[str, list[Any]] = {"time": columns["time"].tolist()}
-    own = {name: values for name, values in columns.items() if name in QUANTITIES}
-    cells |= {
-        name: ["" if np.isnan(value) else value for value in values.tolist()]
-        for name, values in own.items()
-    }
+    cells: dict[str, list[Any]] = {"time": [time_cell(time) for time in columns["time"].tolist()]}
+    quantities = [name for name in columns if name in QUANTITIES]
+    cells |= {name: [number_cell(value) for value in columns[name].tolist()] for name in quantities}
     if "health" in columns:
         cells["health"] = columns["health"].astype(int).tolist()
         cells["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
-    return cells
+    angles = with_degrees(columns)
+    in_degrees = [name for name in IN_DEGREES if name in angles]
+    return cells | {
+        name: [number_cell(value) for value in angles[name].tolist()] for name in in_degrees
+    }
 
 
 def _check_table_name(path: Path) -> None:
@@ -550,6 +566,11 @@ class _Report:
             "rate_hz": last.rate_hz,
             "samples": self.samples,
             "estimated": self.estimated,
+            "seconds": self.seconds,
+            "valid_percent": self.valid_percent,
+            "invalid_reasons": self.invalid_reasons,
+            "outside_training": self.outside_training,
+            "has_calibration": self.health is not None,
             "quantities": {name: QUANTITIES[name] for name in last.channels},
             "sideslip_deg": {
                 end: round(float(take.reduce(self.extremes)), 3)
@@ -568,18 +589,29 @@ class _Report:
             figures["band_sideslip_deg"] = band
         return figures
 
+    @property
+    def valid_percent(self) -> float:
+        """Share of the estimated samples whose health is valid [%]."""
+        return 100.0 * (1.0 - self.invalid / self.estimated)
+
+    @property
+    def invalid_reasons(self) -> list[str]:
+        """The two most frequent reasons for samples that are not valid."""
+        counts = sorted(self.reasons.items(), key=lambda reason: -reason[1])
+        return [reason_in_words(code) for code, _ in counts[:2]]
+
+    @property
+    def outside_training(self) -> str:
+        """Share of the drive outside the range of the training, and its channels; empty if there is none."""
+        return domain_verdict(self.health, self.outside) if self.health is not None else ""
+
     def verdict(self) -> str:
         """The share of valid samples and what makes others invalid, in a line."""
         if self.health is None:
             bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
-        worst = [
-            reason_in_words(code)
-            for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]
-        ]
-        share = 100.0 * (1.0 - self.invalid / self.estimated)
-        valid = f"valid in {share:.3g} % of the drive" + (
-            f"; else: {', '.join(worst)}" if worst else ""
+        reasons = self.invalid_reasons
+        valid = f"valid in {self.valid_percent:.3g} % of the drive" + (
+            f"; otherwise: {', '.join(reasons)}" if reasons else ""
         )
-        outside = domain_verdict(self.health, self.outside)
-        return f"{outside}; {valid}" if outside else valid
+        return "; ".join(filter(None, (self.outside_training, valid)))

@@ -244,7 +244,7 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
             }
             bars.close(f"download {file.name}")
             messages.line(
-                "skip" if file.what == "matched" else "done",
+                "note" if file.what == "matched" else "done",
                 "download",
                 file.name,
                 words[file.what],

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 SCORE_HEADER = (
     "RMSE(β) [deg]",
     "95 % interval [deg]",
-    "to the lowest [deg]",
-    "beats v = 0, static map",
+    "difference to best [deg]",
+    "beats zero, static map",
 )
 
 
@@ -203,7 +203,7 @@ def summary_of_leaderboard(
             )
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(
-                f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner"
+                f"test set '{test_set}' is too short to compare estimators: no interval, no winner"
             )
     figures = {"leaderboard": _records(board)} | ({"verdict": list(verdict)} if verdict else {})
     return _summary(tables, notes, figures, left_out)

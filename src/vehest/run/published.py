@@ -224,10 +224,14 @@ def _stale_list() -> dict[str, str]:
 def _pipeline_of(study: str) -> Study | None:
     """The pipeline whose outcome goes to results/STUDY; the one of the same name first."""
     for name in sorted(pipeline_names(), key=lambda name: name != study):
-        with suppress(VehestError):
+        try:
             pipeline = read_study(name)
-            if pipeline.study == study and pipeline.publish:
-                return pipeline
+        except VehestError:
+            if name == study:
+                raise
+            continue  # a broken file of another study
+        if pipeline.study == study and pipeline.publish:
+            return pipeline
     return None
 
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vehest.data.errors import ConfigurationError, VehestError
+from vehest.data.errors import ConfigurationError
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json
@@ -66,11 +66,14 @@ class Published:
 
 
 def published_in(folder: Path) -> Published | None:
-    """Read the record of a published study; none where nothing is published, or the record is damaged."""
-    try:
-        return validated(Published, read_json(folder / PROVENANCE), f"'{folder / PROVENANCE}'")
-    except VehestError:
+    """Read the record of a published study; none where nothing is published.
+
+    Raises `DataError` or `ConfigurationError` where the record is damaged.
+    """
+    path = folder / PROVENANCE
+    if not path.is_file():
         return None
+    return validated(Published, read_json(path), f"'{path}'")
 
 
 def publish_study(
@@ -100,7 +103,7 @@ def publish_study(
         if _is_published(report, folder, publication.keys):
             return folder
         if changed := uncommitted_changes():
-            messages.warn(f"not published: {changed}; commit them and run it again")
+            messages.warn(f"not published: {changed}")
             return None
         _publish(report, folder, publication.keys)
         messages.line("done", "publish", str(folder))
@@ -108,17 +111,20 @@ def publish_study(
 
 
 def uncommitted_changes() -> str:
-    """Files that determine results and differ from the last commit, in words; empty where there are none, or no git checkout."""
+    """Files that determine results and differ from the last commit, in words; empty where there are none, or no git
+    checkout."""
     command = ["git", "status", "--porcelain", "--untracked-files=all", "--", *SOURCES_OF_RESULTS]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    except (OSError, subprocess.SubprocessError):
+    except subprocess.TimeoutExpired:
+        return "git has not answered in 60 s whether the work tree has changes; run it again"
+    except (OSError, subprocess.SubprocessError):  # no git, or no repository
         return ""
     files = [line[3:] for line in result.stdout.splitlines()]
     if not files:
         return ""
     more = f" and {len(files) - 3} more" if len(files) > 3 else ""
-    return f"the work tree has changes that are not committed ({', '.join(files[:3])}{more})"
+    return f"the work tree has changes that are not committed ({', '.join(files[:3])}{more}); commit them and run it again"
 
 
 def check_results_folder(folder: Path) -> None:

@@ -20,11 +20,11 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.files import without_links
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import read_description
 from vehest.run.car_record import adapted
 from vehest.run.config import Config, compose_config
 from vehest.run.estimate import (
     PRETRAINED,
+    SHIPPED_NOTES,
     WITH_VEHEST,
     open_model,
     same_vehicle_from_config,
@@ -108,11 +108,7 @@ def replay_log(
         **({"band": band} if band else {}),
         "stopped": stopped(),
         "written": [str(file) for file in written],
-        **(
-            {"note": " ".join(read_description(folder).about.note.split())}
-            if model in WITH_VEHEST
-            else {}
-        ),
+        **({"note": SHIPPED_NOTES[model]} if model in SHIPPED_NOTES else {}),
     }
 
 

@@ -21,7 +21,7 @@ from vehest.data.splits import VALIDATION
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
-from vehest.run.comparison import Comparison
+from vehest.run.comparison import Comparison, name_in_part
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
@@ -80,7 +80,11 @@ def draw_report(
     Trials of searches are in no part, so that a report is the same whether they were trained here or published before.
     """
     shown = {name: part for name, part in comparisons.items() if part.members}
-    left_out = {name: reason for part in shown.values() for name, reason in part.failed.items()}
+    left_out = {
+        name_in_part(part_name, name, shown): reason
+        for part_name, part in shown.items()
+        for name, reason in part.failed.items()
+    }
     shown_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(
         study=study.study,
@@ -249,6 +253,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
                 else None,
             )
         )
+    models = with_distinct_titles(models)
     e = part.evaluation
     return PartArtefacts(
         study=study.study,
@@ -268,6 +273,19 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         facts=part.facts,
         failed=part.failed,
     )
+
+
+def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedModel]:
+    """Models in which estimators that share a title have their variant behind it, so that tables, legends and verdicts distinguish them."""
+    names: dict[str, set[tuple[str, str]]] = {}
+    for model in models:
+        names.setdefault(model.title, set()).add(model.name)
+    return [
+        replace(model, title=f"{model.title} ({model.variant})")
+        if len(names[model.title]) > 1
+        else model
+        for model in models
+    ]
 
 
 def _timings_of(part: PartArtefacts) -> pd.DataFrame:

@@ -32,7 +32,7 @@ from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, valid_artefact
 from vehest.run.config_files import conf_folders, find_pipeline, packaged
-from vehest.run.console import WARNING, Messages
+from vehest.run.console import REUSED, WARNING, Messages
 from vehest.run.launchers.base import RunOptions
 from vehest.run.printing import TerminalSummary
 from vehest.run.publishing import Publication, publish_study
@@ -134,10 +134,11 @@ class RunCache:
         messages = Messages(quiet=options.quiet)
         for line in (
             *record.notes,
-            *(("skip", own.stage, own.label, "up to date") for own in (*made, report)),
+            *((REUSED, own.stage, own.label, "up to date") for own in (*made, report)),
         ):
             messages.line(*line)
         published = None if options.dry_run else publish_study(record.publication, report, messages)
+        messages.print_reused()
         return Ran(record.summary, report.folder, True, published)
 
     def save(

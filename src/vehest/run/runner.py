@@ -1,4 +1,4 @@
-"""Runs stages into one output root: what is there is skipped, what is missing is made, every step is printed.
+"""Runs stages into one output root: existing artefacts are reused, missing ones are made, every step is printed.
 
 Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups -> launcher -> members -> tracking
 """
@@ -24,7 +24,7 @@ from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys, quoted
-from vehest.run.console import Bars, Messages
+from vehest.run.console import REUSED, Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.estimate import finding_in_words
 from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
@@ -245,7 +245,7 @@ class Runner:
             if found.skipped
             else f"{found.provenance['seconds']:.1f} s, {found.folder}"
         )
-        self.messages.line("skip" if found.skipped else "done", plan.stage, plan.label, detail)
+        self.messages.line(REUSED if found.skipped else "done", plan.stage, plan.label, detail)
         self.artefacts[plan.folder] = found
         return found
 
@@ -404,7 +404,7 @@ class Runner:
 def _in_words(made: Artefact) -> tuple[str, str]:
     """How a model, a calibration or an evaluation ended, and what came out."""
     if made.skipped:
-        return "skip", "up to date"
+        return REUSED, "up to date"
     if made.status == "interrupted":
         return "stop", f"the best so far is kept in {made.folder}; the next run goes on"
     if made.stage == "train":
@@ -430,5 +430,5 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         return "note", f"no bands: {trust.about.note}"
     return (
         "done",
-        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'stretches from turn to turn'}",
+        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
     )

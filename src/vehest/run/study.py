@@ -25,6 +25,7 @@ from vehest.run.config import (
     GIVEN,
     Config,
     check_jobs,
+    close_key,
     compose_config,
     count,
     expand,
@@ -337,7 +338,10 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
         if study.datasets and key_of(override).split(".")[0] == "tracking"
     }
 
+    matched: list[Config] = []  # configurations that overrides were matched with
+
     def suiting(config: Config) -> list[str]:
+        matched.append(config)
         found = [override for override in overrides if has_key(config, key_of(override))]
         used.update(found)
         return found
@@ -365,8 +369,12 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
             }
     for override in overrides:
         if override not in used:
-            hint = option_hint(key_of(override)) or f": none has an option '{key_of(override)}'"
-            raise ConfigurationError(f"'{override}' suits no {what} of '{study.file.name}'{hint}")
+            key = key_of(override)
+            meant = next(filter(None, (close_key(key, config) for config in matched)), "")
+            hint = option_hint(key) or f": none has an option '{key}'"
+            if meant:
+                hint += f"; did you mean '{meant}'?"
+            raise ConfigurationError(f"'{override}' matches no {what} of '{study.file.name}'{hint}")
     return jobs
 
 

@@ -6,7 +6,7 @@ jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> re
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,14 @@ from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.run.artefacts import Artefact, find
 from vehest.run.calibrate import calibration_of, plan_calibrate
-from vehest.run.comparison import Comparison, lower_rate, named_failures, print_notes, slowest
+from vehest.run.comparison import (
+    Comparison,
+    lower_rate,
+    name_in_part,
+    named_failures,
+    print_notes,
+    slowest,
+)
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
@@ -86,7 +93,10 @@ def open_runner(
         launcher,
     )
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
-        yield runner
+        try:
+            yield runner
+        finally:
+            messages.print_reused()
 
 
 def run_study(
@@ -98,7 +108,7 @@ def run_study(
     sweep: bool = False,
     only_report: bool = False,
 ) -> Ran:
-    """Run every stage of a pipeline, or of a sweep; what is there is skipped. A study that overrides changed is not published.
+    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that overrides changed is not published.
 
     Args:
         name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
@@ -165,7 +175,7 @@ def run_study(
         if any(status == "plan" for status, *_ in runner.messages.printed):
             runner.messages.line("plan", SWEEP if sweep else REPORT, study.study)
             raise DryRunStop
-        error = _error_of(study, list(comparisons.values()), runner)
+        error = _error_of(study, comparisons, runner)
         if sweep:
             report, summary = draw_sweep(study, comparisons[""], runner)
         else:
@@ -217,7 +227,7 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
             f"--publish-weights publishes what '{study.file}' says, unchanged; {why}"
         )
     if changes_of_tree := uncommitted_changes():
-        raise ConfigurationError(f"--publish-weights: {changes_of_tree}; commit them first")
+        raise ConfigurationError(f"--publish-weights: {changes_of_tree}")
     folder = RESULTS / study.study
     check_results_folder(folder)
     return PublishedWeights(folder / PUBLISHED_WEIGHTS)
@@ -292,15 +302,17 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
 
 
 def _error_of(
-    study: Study, comparisons: Sequence[Comparison], runner: Runner
+    study: Study, comparisons: Mapping[str, Comparison], runner: Runner
 ) -> JobsFailedError | None:
     """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
     reasons: dict[str, list[str]] = {}
-    for name, failure in (pair for own in comparisons for pair in named_failures(own.jobs)):
+    for name, failure in (
+        pair for own in comparisons.values() for pair in named_failures(own.jobs)
+    ):
         if failure.detail:
             runner.messages.warn(f"{name}:\n{failure.detail}")
         reasons.setdefault(failure.message, []).append(name)
-    jobs = [job for own in comparisons for job in own.jobs]
+    jobs = [job for own in comparisons.values() for job in own.jobs]
     error = None
     if reasons:
         listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
@@ -308,8 +320,12 @@ def _error_of(
         error = JobsFailedError(
             f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}"
         )
-    nothing = bool(study.parts) and not any(own.members for own in comparisons)
-    unfinished = [name for own in comparisons for name in own.unfinished]
+    nothing = bool(study.parts) and not any(own.members for own in comparisons.values())
+    unfinished = [
+        name_in_part(part, name, comparisons)
+        for part, own in comparisons.items()
+        for name in own.unfinished
+    ]
     if unfinished and runner.train_first and (nothing or not study.shows_failed):
         raise MissingError(
             f"{unfinished[0]} has not been trained and evaluated; run '{runner.train_first}' first"

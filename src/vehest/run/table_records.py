@@ -3,7 +3,8 @@
 command -> `record_tables` -> ``tables`` and ``keys`` in provenance.json of the folder -> `changes_of_tables` -> `vehest report --check`
 
 A key is named ``TABLE: WHAT``. WHAT is ``content`` (the table as it was written), ``script FILE`` (the line ``VERSION = "…"`` of the
-script that made it), ``data DATASET`` (its ingest and raw files) or a stage with a name, ``train ksnn``.
+script that made it), ``data DATASET`` (its ingest and raw files), ``files PATTERN`` (raw files below VEHEST_DATA that belong to no data
+set) or a stage with a name, ``train ksnn``.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ def record_tables(
         command: what makes them again.
         determined_by: what else their numbers follow from, as in the names of keys.
         without_keys: what of them was made before keys were recorded.
+
+    Raises:
+        MissingError: raw files that the numbers follow from are not here, as where a record is written
+            after the tables; without their digest the tables would be stale wherever the files are.
     """
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
@@ -56,7 +61,11 @@ def record_tables(
     }
     for name in names:
         for what in ("content", *determined_by):
-            keys[f"{name}: {what}"] = today_of(f"{name}: {what}", file.parent)
+            keys[f"{name}: {what}"] = key = today_of(f"{name}: {what}", file.parent)
+            if what.startswith(("data ", "files ")) and "data" not in key:
+                raise MissingError(
+                    f"'{file}' cannot record '{name}': raw files of {what} are not here"
+                )
     records = former.get("tables", {}) | dict.fromkeys(names, record)
     with written_aside(file) as aside:
         aside.write_text(
@@ -86,6 +95,10 @@ def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str,
         with suppress(MissingError):
             entry["data"] = hash_of(plan_ingest(config).inputs)[:16]
         return entry
+    if kind == "files":
+        root = Path(str(compose_config("ingest", ["dataset=tabular", *overrides])["root"]))
+        files = {str(file.relative_to(root)): sha256_of(file) for file in sorted(root.glob(name))}
+        return {"data": hash_of(files)[:16]} if files else {}
     return {"code": code_of(kind, name)}
 
 
@@ -106,7 +119,7 @@ def changes_of_tables(
             continue
         changes += [(what, cause) for cause in today if today[cause] != then.get(cause)]
         if "data" in then and "data" not in today:
-            missing.append(what.partition(": data ")[2])
+            missing.append(what.partition(": ")[2].partition(" ")[2])
     files = {file.name for file in folder.iterdir()} - {PROVENANCE}
     changes += [(f"{name} without a record", "data") for name in sorted(files - records.keys())]
     notes = [

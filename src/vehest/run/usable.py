@@ -26,6 +26,8 @@ from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
 from vehest.sources.base import car_of
 
+SUFFICES = "it does without"
+"""Of settings with which no channel is missing."""
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
 
@@ -70,13 +72,23 @@ class Usability:
     car: tuple[
         str, ...
     ] = ()  # keys of the car's parameters, which are those of another car unless given
+    settings_suffice: bool = False  # whether nothing is missing with ``settings``
+    of_car: str = ""  # overrides with values of the car that the user has to give; empty if none
 
     @property
     def usable(self) -> str:
-        """``yes`` as it is, without supplies and settings; ``not to train`` if only a trained model can be used; else ``no``."""
-        if self.to_give or self.missing.to_estimate:
+        """Whether it can be used.
+
+        ``yes`` as it is; ``with settings`` if overrides make it usable, those in ``settings`` and
+        ``patterns`` or values of the car, as `vehest new` writes them; ``not to train`` if only a
+        trained model can be used; else ``no``.
+        """
+        if self.to_give:
             return "no"
-        return "not to train" if self.missing.to_train or self.patterns else "yes"
+        is_missing = bool(self.missing.to_estimate or self.missing.to_train)
+        if is_missing and not self.settings_suffice:
+            return "no" if self.missing.to_estimate else "not to train"
+        return "with settings" if is_missing or self.patterns or self.of_car else "yes"
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -188,9 +200,31 @@ def _usability(
         for channel in estimator.channels
         if channel in gappy and channel not in estimator.skippable
     )
+    has_supplies = len(missing.unsupplied) < len(missing.supplies)
     return Usability(
-        name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own)
+        name,
+        rate,
+        own_rate,
+        missing,
+        gaps,
+        settings,
+        without,
+        patterns,
+        car=car_parameters(own),
+        settings_suffice=bool(settings) and not has_supplies and without.endswith(SUFFICES),
+        of_car=_overrides_of_car(estimator),
     )
+
+
+def _overrides_of_car(estimator: Estimator) -> str:
+    """Overrides with values of the car that a first comparison needs and the settings do not have yet, for people."""
+    needed = " ".join(trial.overrides for trial in estimator.trials)
+    if "{car}" in needed:
+        return "estimator.car.mass=… and the car's other values"
+    default = getattr(type(estimator.settings)(), "wheelbase", None)
+    if "{wheelbase}" in needed and getattr(estimator.settings, "wheelbase", None) == default:
+        return "estimator.wheelbase=…"
+    return ""
 
 
 def car_parameters(estimator: str) -> tuple[str, ...]:
@@ -221,7 +255,7 @@ def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     if borrowing:
         names = ", ".join(borrowing)
         lines.append(
-            f"your car's parameters, estimator.car.mass=… and so on, are wanted by {names}; else they take those of another car"
+            f"{names} require your car's parameters, estimator.car.mass=… and so on; without them they use those of another car"
         )
     return lines
 
@@ -247,6 +281,7 @@ def _cells(row: Usability) -> list[str]:
         made,
         f"{'the others are ' if made else ''}not in the log" if row.missing.unsupplied else "",
         row.without,
+        row.of_car if row.usable == "with settings" else "",
         row.to_give,
         *row.patterns,
         "leave gaps out in conf/split" if row.gaps else "",
@@ -387,19 +422,22 @@ def _settings_without(
         config = changed
         found[key] = value
     settings = tuple(
-        f"estimator.{key}=" + (f"[{','.join(own)}]" if isinstance(own, list) else f"{own}")
+        f"estimator.{key}="
+        + (f"[{','.join(own)}]" if isinstance(own, list) else str(own).replace("False", "false"))
         for key, own in found.items()
     )
-    rest = f"only {', '.join(missing)} of those would be missing" if missing else "it does without"
+    rest = f"only {', '.join(missing)} of those would be missing" if missing else SUFFICES
     return settings, f"with {' '.join(settings)} {rest}" if settings else ""
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, Any]]:
-    """Each other choice of a setting with a few, and each list of channels without one of them."""
+    """Each other choice of a setting with two or a few, and each list of channels without one of them."""
     settings = new_estimator(config["estimator"]).settings
     for key, hint in get_type_hints(type(settings)).items():
         now = getattr(settings, key, None)
-        if get_origin(hint) is Literal:
+        if isinstance(now, bool):
+            yield key, not now
+        elif get_origin(hint) is Literal:
             yield from ((key, value) for value in get_args(hint) if value != now)
         elif isinstance(now, tuple) and get_args(hint) == (str, Ellipsis):
             yield from ((key, [*now[:at], *now[at + 1 :]]) for at in range(len(now)))

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 import vehest.sources as package
 from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, MissingError, suggestion
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
@@ -148,7 +148,9 @@ class Source(ABC):
         check_name(self.name, "data set")
         keys = {field.name for field in fields(self.options_type)}
         if unknown := sorted(set(dataset) - COMMON_KEYS - keys):
-            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {', '.join(sorted(keys))}"
+            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'"
+            what += suggestion(unknown[0], keys | COMMON_KEYS, "dataset.") or ";"
+            what += f" it has {', '.join(sorted(keys))}"
             raise ConfigurationError(f"{self.where}: {what}")
         common = self._validated(CommonOptions)
         self.reference_point = common.reference_point

@@ -4,46 +4,75 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 
 DAY = 86_400.0  # s
 HOUR = 3600.0  # s
+MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one another
 WRITTEN = (
-    r"^\s*(?:(?P<date>\d{4}-\d{2}-\d{2}|\d{1,2}\.\d{1,2}\.\d{4})[T ]+)?"
-    r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,]\d+)?)\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
+    r"^\s*(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]+"
+    r"|(?P<days>\d+) days?,? *)?"
+    r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
+DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
 
 
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
-    """Times ``10:59:30.25``, ``2024-05-03T10:59:30.25Z`` or ``3.5.2024 10:59:30,25`` in seconds, (N,); None for other text.
+    """Times that are written as a clock's, in seconds, (N,); None for other text.
 
-    With a date they count from 1970, without one from midnight, and on beyond the next. The zone is not read.
+    ``10:59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024 10:59:30,25``,
+    ``5/3/2024 10:59:30 AM`` and ``0 days 00:00:30.25``. With a date they count from 1970, without
+    one from midnight, and on beyond the next. The zone is not read.
     """
     from pyarrow import compute
 
     found = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
     if not len(found) or found.null_count:
         return None
-    seconds = compute.replace_substring(found.field("second"), ",", ".")
+    seconds = compute.replace_substring_regex(found.field("second"), "[,:]", ".")
     hours, minutes, seconds = (
-        compute.cast(part, pa.float64())
+        np.asarray(compute.cast(part, pa.float64()))
         for part in (found.field("hour"), found.field("minute"), seconds)
     )
-    times = np.asarray(hours) * 3600.0 + np.asarray(minutes) * 60.0 + np.asarray(seconds)
+    half = compute.utf8_lower(found.field("half"))
+    is_afternoon = np.asarray(compute.cast(compute.equal(half, "p"), pa.int8()))
+    is_halved = np.asarray(compute.cast(compute.not_equal(half, ""), pa.int8()))
+    hours = np.where(is_halved, hours % 12.0, hours) + 12.0 * is_afternoon
+    times = hours * HOUR + minutes * 60.0 + seconds
     dates = found.field("date")
-    if not compute.any(compute.not_equal(dates, "")).as_py():
-        return past_midnight(times)
-    padded = compute.replace_substring_regex(dates, r"\b(\d)\.", r"0\1.")
-    try:
-        days = (
-            compute.replace_substring_regex(padded, r"^(\d+)\.(\d+)\.(\d+)$", r"\3-\2-\1")
-            .cast(pa.date32())
-            .cast(pa.int32())
-        )
-    except pa.ArrowInvalid:
+    if compute.all(compute.equal(dates, "")).as_py():
+        days = compute.if_else(compute.equal(found.field("days"), ""), "0", found.field("days"))
+        counted = np.asarray(compute.cast(days, pa.float64()))
+        return past_midnight(times) if not counted.any() else times + DAY * counted
+    parts = compute.extract_regex(dates, pattern=DATE)
+    if parts.null_count:
         return None
-    return np.asarray(times + DAY * np.asarray(days), dtype=np.float64)
+    first, second, third = (
+        np.asarray(compute.cast(parts.field(name), pa.int64()))
+        for name in ("first", "second", "third")
+    )
+    orders = [(third, first, second), (third, second, first)]  # of the United States, of Europe
+    if first.min() > 31:
+        orders = [(first, second, third)]
+    elif not is_halved.any():
+        orders.reverse()
+    for is_last, (year, month, day) in zip((len(orders) == 1, True), orders, strict=False):
+        if month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31:
+            dated = np.asarray(times + DAY * _days(year, month, day), dtype=np.float64)
+            if is_last or np.abs(np.diff(dated)).max(initial=0.0) < MAX_STEP:
+                return dated
+    return None
+
+
+def _days(
+    year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Days since 1970 of dates, (N,)."""
+    months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
+    return np.asarray((months.astype("datetime64[D]")).astype(np.int64) + day - 1)
 
 
 def past_midnight(times: FloatArray) -> FloatArray:

@@ -123,8 +123,38 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, where
     if steps[at] > longest:
         what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > longest).sum()} above {longest:.6g} s"
         raise DataError(
-            f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time"
+            f"{where} has {what}; raise its max_gap where values may be interpolated over that time, "
+            "or end the recording there: by the data set's max_gap, or by cutting the range out"
         )
+
+
+def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
+    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most ``longest`` [s] between two samples.
+
+    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches across.
+    """
+    known = np.flatnonzero(np.isfinite(samples))
+    if not 0 < len(known) < len(samples):
+        return samples
+    places = np.arange(len(samples))
+    before = known[np.maximum(np.searchsorted(known, places, side="right") - 1, 0)]
+    after = known[np.minimum(np.searchsorted(known, places, side="left"), len(known) - 1)]
+    longest *= 1.0 + 1e-9
+    steps = np.diff(times, prepend=times[0])
+    run = np.cumsum((steps < 0.0) | (steps > longest))
+    before, after = (
+        np.where(run[before] == run, before, after),
+        np.where(run[after] == run, after, before),
+    )
+    near = (
+        (run[before] == run)
+        & (np.abs(times[after] - times[before]) <= longest)
+        & (np.abs(times - times[before]) <= longest)
+    )
+    slope = (samples[after] - samples[before]) / np.maximum(after - before, 1)
+    return np.where(
+        np.isfinite(samples) | near, slope * (places - before) + samples[before], np.nan
+    )
 
 
 @dataclass(frozen=True)

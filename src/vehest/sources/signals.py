@@ -213,10 +213,14 @@ class SignalSource(FileSource):
                 signal.values, np.rint((signal.stamps - ticks[0]) * rate_hz), len(ticks)
             )
         near = SLACK / rate_hz
-        first = max(int(np.searchsorted(signal.stamps, ticks[0] + near, side="right")) - 1, 0)
-        last = int(np.searchsorted(signal.stamps, ticks[-1] - near, side="left"))
-        times = signal.stamps[first : last + 1]
-        values = signal.values[first : last + 1]
+        measured = ~np.isnan(signal.values)
+        times = signal.stamps[measured]
+        first = max(int(np.searchsorted(times, ticks[0] + near, side="right")) - 1, 0)
+        last = int(np.searchsorted(times, ticks[-1] - near, side="left"))
+        times = times[first : last + 1]
+        values = signal.values[measured][first : last + 1]
+        if n_missing := int(np.count_nonzero(~measured)):
+            where += f" {n_missing} samples of which are marked as not measured,"
         declared = self.channels[name]
         require_samples(
             values, times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where

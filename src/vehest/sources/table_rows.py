@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,8 +13,34 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.sources.columns import Column, Positive
 
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
+
+
+@dataclass(frozen=True)
+class TimeColumn(Column):
+    """Declaration of a table's column of times."""
+
+    wraps_at: Positive | None = None  # count, in the column's unit, at which it begins anew
+    sort: bool = False  # whether rows are brought into the order of their times
+
+    def in_order(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Columns of a table, (T,) each, with times that go on where they wrapped, sorted."""
+        times = values[self.column]
+        if self.wraps_at is not None:
+            times = unwrapped(times, self.wraps_at)
+        ordered = {**values, self.column: times}
+        if self.sort:
+            rows = np.argsort(times, kind="stable")
+            ordered = {name: samples[rows] for name, samples in ordered.items()}
+        return ordered
+
+
+def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
+    """Times, (T,), of a counter that begins anew at a count, going on there."""
+    wraps = np.cumsum(np.diff(times, prepend=times[:1]) < -0.5 * wraps_at)
+    return np.asarray(times + wraps_at * wraps, dtype=np.float64)
 
 
 def dropped_rows_from_config(

@@ -9,9 +9,10 @@ import codecs
 import csv
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -59,16 +60,53 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
     else:
-        decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
-        try:
-            lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))[
-                layout.skip_rows :
-            ]
-            names = next(csv.reader(filter(None, lines), delimiter=layout.delimiter), [])
-        except (ValueError, csv.Error) as error:
-            raise _unreadable(file, error) from None
+        header, first_row = (*_first_rows(file, layout), [], [])[:2]
+        names = names_of(header, first_row)
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
     return names
+
+
+def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
+    """Cells of the line of names, and of the first row of numbers."""
+    decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
+    try:
+        lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))
+        filled = filter(None, lines[layout.skip_rows :])
+        rows = csv.reader(filled, delimiter=layout.delimiter)
+        header = next(rows, [])
+        with suppress(csv.Error):  # of an endless line, which the reader of the rows reports
+            return [header, next(islice(rows, layout.rows_below_names, None), [])]
+        return [header, []]
+    except (ValueError, csv.Error) as error:
+        raise _unreadable(file, error) from None
+
+
+def names_of(header: Sequence[str], first_row: Sequence[str]) -> list[str]:
+    """Names of a table's columns, one for each cell of its rows, each once.
+
+    One that occurs again has the number of its column behind it. Rows that end in a delimiter have
+    a nameless column more than the line of names; one that ends so itself has one less.
+    """
+    names = list(header)
+    if len(first_row) == len(names) + 1 and not first_row[-1].strip():
+        names.append("")
+    elif len(first_row) == len(names) - 1 and not names[-1].strip():
+        names.pop()
+    return [
+        f"{name} #{place}" if name and names.count(name) > 1 else name
+        for place, name in enumerate(names, 1)
+    ]
+
+
+def with_names(file: Path, layout: TextLayout) -> TextLayout:
+    """A layout with the names of the columns, where the file's line of names is not as read."""
+    if layout.names is not None or is_parquet(file):
+        return layout
+    names = column_names(file, layout)
+    if names == _first_rows(file, layout)[0]:
+        return layout
+    below = layout.rows_below_names + 1  # the line of names itself
+    return replace(layout, names=tuple(names), rows_below_names=below)
 
 
 def read_head(file: Path, size: int = BLOCK) -> bytes:
@@ -88,6 +126,12 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
             raise DataError(
                 f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one"
             )
+        numbered = [one for one in names if re.fullmatch(rf"{re.escape(name)} #\d+", one)]
+        if not count and numbered:
+            raise DataError(
+                f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or remove "
+                f"all but one, or declare one of them: {listed(numbered)}"
+            )
         if not count:
             raise DataError(
                 f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset"
@@ -106,6 +150,7 @@ def read_columns(
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, wanted)
     opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
+    layout = with_names(file, layout)
     convert = _conversion(wanted, layout)
     if text is None:
         require_memory(file, layout)
@@ -139,6 +184,7 @@ def column_parts(
             if is_parquet(file):
                 batches = number_batches(file, opened.enter_context(parquet_file(file)), wanted)
             else:
+                layout = with_names(file, layout)
                 options = _options(layout, _conversion(wanted, layout))
                 stream = opened.enter_context(table_stream(file))
                 batches = iter(pc.open_csv(stream, **options))

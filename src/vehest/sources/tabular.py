@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import repeat, takewhile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from pydantic import AfterValidator, Field
 
@@ -32,7 +32,13 @@ from vehest.sources.columns import (
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
-from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, timed_runs
+from vehest.sources.table_rows import (
+    TimeColumn,
+    counted_runs,
+    dropped_rows_from_config,
+    kept_rows,
+    timed_runs,
+)
 from vehest.sources.tables import (
     TextLayout,
     column_names,
@@ -98,10 +104,13 @@ class TabularSource(FileSource):
         self.columns = (
             None if options.channels is None else columns_from_config(options.channels, self.name)
         )
-        self.time = (
+        self.time: TimeColumn | None = (
             None
             if options.time is None
-            else column_from_config(options.time, f"{where}: time", "s")
+            else cast(
+                TimeColumn,
+                column_from_config(options.time, f"{where}: time", "s", TimeColumn),
+            )
         )
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
@@ -149,6 +158,8 @@ class TabularSource(FileSource):
             small
             or not apart
             or time is None
+            or time.wraps_at
+            or time.sort
             or options.clock != "strict"
             or is_stored_recording(file)
         ):
@@ -217,8 +228,12 @@ class TabularSource(FileSource):
         return columns
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
-        """Columns without the rows that the data set leaves out."""
-        values = read_columns(file, wanted, self.layout)
+        """Columns in the order of their times, without the rows that the data set leaves out."""
+        time = self.time
+        sorting = [time.column] if time is not None and time.sort else []
+        values = read_columns(file, list(dict.fromkeys([*wanted, *sorting])), self.layout)
+        if time is not None and time.column in values:
+            values = time.in_order(values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vehest.constants import FloatArray
+from vehest.sources.clocks import bridged
 from vehest.sources.tabular import TabularOptions, TabularSource
 
 CLOCK = "clock"  # unit of times that are written as a clock's
@@ -61,35 +62,6 @@ class TextLogSource(TabularSource):
             name: samples if name == clock else bridged(samples, times, longest)
             for name, samples in values.items()
         }
-
-
-def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
-    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most ``longest`` [s] between two samples.
-
-    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches across.
-    """
-    known = np.flatnonzero(np.isfinite(samples))
-    if not 0 < len(known) < len(samples):
-        return samples
-    places = np.arange(len(samples))
-    before = known[np.maximum(np.searchsorted(known, places, side="right") - 1, 0)]
-    after = known[np.minimum(np.searchsorted(known, places, side="left"), len(known) - 1)]
-    longest *= 1.0 + 1e-9
-    steps = np.diff(times, prepend=times[0])
-    run = np.cumsum((steps < 0.0) | (steps > longest))
-    before, after = (
-        np.where(run[before] == run, before, after),
-        np.where(run[after] == run, after, before),
-    )
-    near = (
-        (run[before] == run)
-        & (np.abs(times[after] - times[before]) <= longest)
-        & (np.abs(times - times[before]) <= longest)
-    )
-    slope = (samples[after] - samples[before]) / np.maximum(after - before, 1)
-    return np.where(
-        np.isfinite(samples) | near, slope * (places - before) + samples[before], np.nan
-    )
 
 
 SOURCE = TextLogSource

@@ -124,6 +124,14 @@ class PartArtefacts:
         """The recording of a range at the evaluation rate, with all or some of its channels."""
         return read_recording(self.references[span.dataset, span.recording], channels)
 
+    def reference_ranges(self, spans: Iterable[Span]) -> list[Recording]:
+        """The recordings of ranges, cut to them; without those whose reference is not there."""
+        return [
+            self.reference(span).cut(span.start, span.stop)
+            for span in spans
+            if (span.dataset, span.recording) in self.references
+        ]
+
     def kinds_of(self, spans: Iterable[Span]) -> str:
         """Whether ranges are ``real``, ``simulated`` or ``real and simulated``."""
         return " and ".join(sorted({self.kinds[span.dataset] for span in spans}))

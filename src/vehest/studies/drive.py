@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import printable
 from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.data.store import read_recording
-from vehest.evaluation.metrics import Scored
 from vehest.report import figures
+from vehest.report.comparison_figures import ForestRow, forest_figure
 from vehest.report.document import (
     PATENT_NOTE,
     REPORT,
@@ -31,25 +31,35 @@ from vehest.report.document import (
     as_code,
     as_text,
 )
-from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of, listed
+from vehest.report.style import Line, decimals_for, fixed, lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.drawings import (
+    MIN_UNIX_SECONDS,
+    behaviour_blocks,
+    busiest_block,
+    error_over_ay_block,
+    histogram_block,
+    is_scored_somewhere,
+    signals_of,
+    traces_block,
+)
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
-from vehest.studies.kit.explorer import chained, explorer_of
+from vehest.studies.kit.recommendation import plain_text, recommendation_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import (
+    BEST,
+    NOT_SIGNIFICANT,
+    basis_sentence,
     interval_in_words,
     ranking_of,
     standing_columns,
-    verdict_sentences,
 )
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
-ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
-EARLIEST_UNIX = 1e8  # s, from which on times count from 1970
 
-VERSION = "4"
+VERSION = "5"
 _ACCURACY = (
     "rmse_sideslip",
     "rmse_vy",
@@ -69,50 +79,121 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: comparison(artefacts.first)}
 
 
-def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None) -> Document:
-    """The report of a comparison: errors as bars and traces of the first test set, headline, each test set, training; the appendix is how.
+@dataclass(frozen=True)
+class Additions:
+    """What a study adds to the report of a comparison.
 
-    Args:
-        named: test set -> estimator that its traces begin with.
-
-    Raises:
-        DataError: metrics are missing or ambiguous, or an estimate does not cover its range.
+    Parameters
+    ----------
+    verdicts : Mapping[str, Sequence[str]]
+        Test set -> sentences of its verdict, in Markdown.
+    recommended : Mapping[str, Name]
+        Test set -> recommended estimator, which its figures show first.
+    opening : Sequence[Block]
+        Blocks after the minutes of reference.
+    appendices : Sequence[Block]
+        Sections after those of the comparison.
     """
+
+    verdicts: Mapping[str, Sequence[str]]
+    recommended: Mapping[str, Name]
+    opening: Sequence[Block] = ()
+    appendices: Sequence[Block] = ()
+
+
+def verdict(artefacts: StudyArtefacts) -> list[str]:
+    """The verdict on each test set as lines of plain text."""
+    part = artefacts.first
+    return [
+        plain_text(" ".join(recommendation_of(part, test_set).describe()))
+        for test_set in part.split.tests
+    ]
+
+
+def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> Document:
+    """The report of a comparison: verdict, figures of the first test set, minutes of reference; then the appendices.
+
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        The comparison.
+    additions : Additions, optional
+        What the study adds; without it, the verdict is that of `recommendation_of`.
+
+    Raises
+    ------
+    DataError
+        Metrics are missing or ambiguous, or an estimate does not cover its range.
+    """
+    additions = additions or _additions(artefacts)
     board = leaderboard(artefacts)
     lines = lines_of(dict.fromkeys(model.name for model in artefacts.models))
-    titles = {name: as_text(models[0].title) for name, models in by_name(artefacts.models).items()}
-    verdicts = [
-        verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set))
-        for test_set in artefacts.split.tests
-    ]
-    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append("\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)]))
-    warned = warnings_of(artefacts)
-    if warned:
-        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
-    for test_set in artefacts.split.tests:
-        blocks += _test_set(
+    figures_of_tests = {
+        test_set: _figures_of(
             artefacts,
             board[board["test_set"] == test_set],
             test_set,
             lines,
-            (named or {}).get(test_set),
+            additions.recommended.get(test_set),
         )
+        for test_set in artefacts.split.tests
+    }
     first = next(iter(artefacts.split.tests))
-    traces = [
-        block
-        for block in blocks
-        if isinstance(block, Figure) and block.name == f"traces_{file_of(first)}"
+    opening = [
+        _verdict_block(artefacts, additions.verdicts),
+        *figures_of_tests[first].forest,
+        _basis_block(artefacts, figures_of_tests[first].remark),
+        *figures_of_tests[first].opening,
+        *_minutes_blocks(artefacts),
+        *additions.opening,
     ]
-    blocks = [
-        _bars(artefacts, board[board["test_set"] == first], first),
-        *traces,
-        *(block for block in blocks if block not in traces),
-    ]
-    blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
+    appendices = list[Block]()
+    for test_set, drawn in figures_of_tests.items():
+        if test_set != first:
+            appendices += [f"## Test set `{test_set}`", *drawn.forest, *drawn.opening]
+        appendices += _sections_of_test(
+            artefacts, board[board["test_set"] == test_set], test_set, lines, drawn
+        )
+    appendices += _training(artefacts, board, lines)
+    appendices += [*additions.appendices, *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
-        blocks.append(PATENT_NOTE)
-    return Document(artefacts.title, blocks)
+        appendices.append(PATENT_NOTE)
+    return Document(artefacts.title, [*opening, *appendices], open_blocks=len(opening))
+
+
+def _additions(artefacts: PartArtefacts) -> Additions:
+    recommendations = {name: recommendation_of(artefacts, name) for name in artefacts.split.tests}
+    sentences = {name: outcome.describe() for name, outcome in recommendations.items()}
+    models = {
+        name: outcome.model.name
+        for name, outcome in recommendations.items()
+        if outcome.model is not None
+    }
+    return Additions(sentences, models)
+
+
+def _verdict_block(artefacts: PartArtefacts, verdicts: Mapping[str, Sequence[str]]) -> str:
+    """The section that the report opens with: the verdicts, and whether data are real."""
+    paragraphs = []
+    for test_set, sentences in verdicts.items():
+        named = f"Test set {as_code(test_set)}: " if len(verdicts) > 1 else ""
+        paragraphs.append(named + " ".join(sentences))
+    paragraphs.append(data_sentence(artefacts))
+    return "## Verdict\n\n" + "\n\n".join(paragraphs)
+
+
+def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
+    """What was compared, how, and warnings."""
+    paragraphs = [artefacts.about.strip()] if artefacts.about.strip() else []
+    paragraphs.append(f"{budget_sentence(artefacts)}{remark}")
+    for test_set in artefacts.split.tests:
+        ranking = ranking_of(artefacts, test_set)
+        if ranking.order:
+            paragraphs.append(basis_sentence(ranking, _where(artefacts, test_set)))
+    warned = warnings_of(artefacts)
+    if warned:
+        paragraphs.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
+    return "\n\n".join(paragraphs)
 
 
 def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
@@ -121,11 +202,11 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 % interval over blocks of the drive and seeds;
     ``_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
     figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on the validation range (the lower seed of
-    two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to the lowest error) are
+    two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to best) are
     corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
     ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``, at which sideslip is not scored.
-    ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
-    initial state over, else ``own``.
+    ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol passes the true
+    initial state, else ``own``.
     Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
     """
     runs = runs_of(artefacts)
@@ -214,7 +295,7 @@ def data_sentence(artefacts: PartArtefacts) -> str:
 
 
 def budget_sentence(artefacts: PartArtefacts) -> str:
-    """How many estimators, seeds and epochs stand behind the numbers."""
+    """Numbers of estimators, seeds and epochs."""
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = (
@@ -222,7 +303,7 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
         if len(counts) == 1
         else f"{counts[0]} to {counts[-1]} seeds each"
     )
-    words = f"Compared are {len(groups)} estimator{'s' * (len(groups) != 1)} with {seeds}, {len(artefacts.models)} fits in all"
+    words = f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with {seeds}, {len(artefacts.models)} fits in all"
     runs = runs_of(artefacts)
     epochs = np.array(
         [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]
@@ -242,9 +323,9 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     """How one of several parts was made; its tables are called after it."""
     made, ranges = how_it_was_made(part)
-    title = f"## Appendix: {as_text(part.title)}, how it was made"
+    title = f"## Appendix: {as_text(part.title)}, method and ranges"
     return [
-        made.replace("## Appendix: how it was made", title),
+        made.replace("## Appendix: method and ranges", title),
         replace(ranges, name=f"ranges_{name}"),
     ]
 
@@ -300,7 +381,7 @@ def how_it_was_made(
             "seconds": Column("length [s]", decimals=0),
         },
     )
-    return "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges
+    return "## Appendix: method and ranges\n\n" + "\n".join(f"- {line}" for line in lines), ranges
 
 
 def _describe_excluded(artefacts: PartArtefacts) -> str:
@@ -325,7 +406,7 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     file = artefacts.references.get((span.dataset, span.recording))
     begin = 0.0
     bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
-    if file is not None and bounds and min(bounds) >= EARLIEST_UNIX:
+    if file is not None and bounds and min(bounds) >= MIN_UNIX_SECONDS:
         begin = read_recording(file, ["vx"]).start_time
     start = span.start - begin
     stop = span.stop - begin
@@ -347,52 +428,125 @@ def file_of(test_set: str) -> str:
     return re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
 
 
-def _test_set(
+@dataclass(frozen=True)
+class DrawnTest:
+    """Figures of a test set, by where the report shows them."""
+
+    forest: Sequence[Block]
+    opening: Sequence[Block]  # after the forest plot
+    traces: Sequence[Block]  # of the whole test set
+    remark: str  # a sentence, after a space, where not all estimators are in them
+    estimators: Mapping[Name, tuple[str, int]]  # in them -> title and seed
+
+
+def _figures_of(
     artefacts: PartArtefacts,
     board: pd.DataFrame,
     test_set: str,
-    lines: dict[Name, Line],
-    named: Name | None,
-) -> list[Block]:
+    lines: Mapping[Name, Line],
+    recommended: Name | None,
+) -> DrawnTest:
+    """Figures of the estimators of a test set; none where sideslip is scored nowhere."""
     file = file_of(test_set)
+    finite = board[np.isfinite(board["rmse_sideslip"])]
+    if finite.empty:
+        return DrawnTest([], [], [], "", {})
+    rows = _shown(finite, recommended)
+    forest = _forest(artefacts, finite, test_set, lines)
+    signals = signals_of(artefacts, rows, test_set, lines)
+    estimators = {
+        name: (title, model.seed) for name, (model, title, _) in signals.candidates.items()
+    }
+    if not is_scored_somewhere(signals):
+        return DrawnTest([forest], [], [], "", estimators)
+    remark = ""
+    if len(rows) < len(finite):
+        remark = (
+            f" Figures of signals show {len(rows)} of them: those with the lowest RMSE(v) on validation, the best on the test "
+            "and the recommended one."
+        )
+    opening: list[Block] = [busiest_block(signals, file)]
+    if signals.has_ay:
+        opening.append(error_over_ay_block(signals, file))
+    opening += behaviour_blocks(signals, file)
+    traces = [traces_block(signals, file), histogram_block(signals, file)]
+    return DrawnTest([forest], opening, traces, remark, estimators)
+
+
+def _sections_of_test(
+    artefacts: PartArtefacts,
+    board: pd.DataFrame,
+    test_set: str,
+    lines: Mapping[Name, Line],
+    drawn: DrawnTest,
+) -> list[Block]:
+    """Tables of a test set, its bands, and traces of all of it, a section each."""
+    file = file_of(test_set)
+    of_test = f" on test set `{test_set}`" if len(artefacts.split.tests) > 1 else ""
     blocks: list[Block] = [
-        f"## Test set `{test_set}`",
+        f"## Errors of all estimators{of_test}",
         *_leaderboard_table(artefacts, board, f"leaderboard_{file}", test_set),
     ]
     lost = board[~np.isfinite(board["rmse_sideslip"])]
     if len(lost):
         blocks.append(f"No finite error, and so not in the figures: {', '.join(lost['title'])}.")
-    blocks.append(floors_table(artefacts, test_set, f"floors_{file}"))
+    blocks += [
+        f"## Noise floor and Cramér-Rao bound{of_test}",
+        floors_table(artefacts, test_set, f"floors_{file}"),
+    ]
     finite = board[np.isfinite(board["rmse_sideslip"])]
-    if finite.empty:
-        return blocks
     chosen = {
         (row["estimator"], row["variant"]): (row["title"], row["seed"])
         for row in finite.to_dict("records")
     }
-    by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}")
+    by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}") if chosen else None
     if by_regime is not None:
-        blocks.append(by_regime)
-    shown = _shown(finite, named)
-    if len(shown) < len(finite):
-        first = (
-            dict.fromkeys([chosen[named][0], finite.iloc[0]["title"]])
-            if named is not None and named in chosen
-            else ()
-        )
-        which = f"{', '.join(first)} and those" if first else "those"
-        lowest = "with the lowest RMSE(v) on the validation range"
-        blocks.append(
-            f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}."
-        )
-    in_bands = {
-        name: chosen[name] for name in zip(shown["estimator"], shown["variant"], strict=True)
+        blocks += [f"## Errors by regime{of_test}", by_regime]
+    bands = band_blocks(artefacts, test_set, drawn.estimators, lines, file)
+    if bands:
+        blocks += [f"## Calibrated bands{of_test}", *bands]
+    if drawn.traces:
+        blocks += [f"## Traces and distribution of the error{of_test}", *drawn.traces]
+    return blocks
+
+
+def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
+    """Section ``Minutes of reference``: how much was recorded for each role, and how hard it was driven."""
+    split = artefacts.split
+    roles = {
+        "training": split.train,
+        "validation": split.validation,
+        **{f"test set {name}": spans for name, spans in split.tests.items()},
     }
-    return [
-        *blocks,
-        *band_blocks(artefacts, test_set, in_bands, lines, file),
-        *_figures_of(artefacts, shown, test_set, lines, file),
-    ]
+    rows = []
+    for role, spans in roles.items():
+        recordings = artefacts.reference_ranges(spans)
+        if not recordings:
+            continue
+        sideslip = np.concatenate(
+            [np.arctan2(recording["vy_ref"], recording["vx"]) for recording in recordings]
+        )
+        row = {
+            "role": role,
+            "minutes": sum(len(recording) / recording.rate_hz for recording in recordings) / 60.0,
+            "sideslip_99": float(np.nanquantile(np.degrees(np.abs(sideslip)), 0.99)),
+        }
+        if all("ay" in recording for recording in recordings):
+            ay = np.concatenate([recording["ay"] for recording in recordings])
+            row["ay_99"] = float(np.nanquantile(np.abs(ay), 0.99))
+        rows.append(row)
+    if not rows:
+        return []
+    columns = {
+        "role": Column("used for"),
+        "minutes": Column("reference [min]", decimals=1),
+        "ay_99": Column("|ay|, 99 % [m/s²]", decimals=1),
+        "sideslip_99": Column("|β|, 99 % [deg]", decimals=1),
+    }
+    frame = pd.DataFrame(rows)
+    caption = "Minutes of recording with a reference of v, and 99th percentiles of lateral acceleration and sideslip in them."
+    columns = {name: column for name, column in columns.items() if name in frame}
+    return ["## Minutes of reference", Table("minutes", caption, frame, columns)]
 
 
 _INTERVAL = Column(
@@ -400,18 +554,26 @@ _INTERVAL = Column(
 )
 
 
-def _bars(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> Table:
-    interval = [
-        interval_in_words(row, decimals_for(board["rmse_sideslip"].tolist()))
+def _forest(
+    artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: Mapping[Name, Line]
+) -> Figure:
+    """Figure ``forest_FILE``: RMSE(β) of every estimator with its interval."""
+    rows = [
+        ForestRow(
+            row["title"],
+            lines[row["estimator"], row["variant"]],
+            row["rmse_sideslip"],
+            row["rmse_sideslip_low"],
+            row["rmse_sideslip_high"],
+            row["against_best"] in (BEST, NOT_SIGNIFICANT),
+        )
         for row in board.to_dict("records")
     ]
-    caption = f"RMSE(β) of every estimator over all its seeds, with its 95 % interval, on {_where(artefacts, test_set)}."
-    columns = {
-        "title": Column("estimator"),
-        "rmse_sideslip": Column("RMSE(β) [deg]"),
-        "interval": _INTERVAL,
-    }
-    return Table(f"bars_{file_of(test_set)}", caption, board.assign(interval=interval), columns)
+    caption = (
+        f"RMSE(β) of every estimator over all its seeds with its 95 % interval, on {_where(artefacts, test_set)}. "
+        "Filled: the best and those that are not significantly worse."
+    )
+    return Figure(f"forest_{file_of(test_set)}", caption, forest_figure(rows))
 
 
 def _leaderboard_table(
@@ -430,9 +592,9 @@ def _leaderboard_table(
     standing = Table(
         name,
         f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
-        "another stretch of such a drive and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
-        "validation. The difference to the lowest, and whether v = 0 and the static map are beaten: paired over blocks and seeds, "
-        "corrected by Holm. FVU is the fraction of the variance of v that is left unexplained."
+        "another drive of this kind and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
+        "validation. The difference to the best, and whether an estimator is significantly better than zero and the static map: "
+        "paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v that remains unexplained."
         f"{bound if has_bound else ''}",
         frame,
         {
@@ -440,8 +602,8 @@ def _leaderboard_table(
             "n_parameters": Column("params", decimals=0),
             "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
             "interval": _INTERVAL,
-            "against_best": Column("to the lowest [deg]"),
-            "beats_zero": Column("beats v = 0"),
+            "against_best": Column("difference to best [deg]"),
+            "beats_zero": Column("beats zero"),
             "beats_static_map": Column("beats static map"),
             "rmse_sideslip_training": Column("training [deg]", decimals=decimals),
             "rmse_sideslip_validation": Column("validation [deg]", decimals=decimals),
@@ -481,8 +643,10 @@ def _leaderboard_table(
 
 
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
-    """At most `MOST_SHOWN` rows in the order of the board, picked by validation; where one is ``named``, it comes first, and the lowest
-    error on the test is among them, since the verdict names both."""
+    """At most `MOST_SHOWN` rows in the order of the board, picked by validation.
+
+    Where an estimator is ``named``, it comes first, and the best on the test is among them, since the verdict names both.
+    """
     ours = (
         (board["estimator"] == named[0]) & (board["variant"] == named[1])
         if named
@@ -496,134 +660,6 @@ def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
         .index[:MOST_SHOWN]
     )
     return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
-
-
-def _joined(parts: Sequence[Scored], step: float) -> Scored:
-    """Ranges one after another; a single one keeps its times."""
-    if len(parts) == 1:
-        return parts[0]
-    gap = _gap_of(parts)
-
-    def over(name: str) -> FloatArray:
-        return chained([getattr(part, name) for part in parts], gap)
-
-    vy = over("vy")
-    time: FloatArray = np.arange(len(vy), dtype=np.float64) * step
-    is_scored = np.nan_to_num(over("is_sideslip_scored")).astype(np.bool_)
-    return Scored(
-        time, vy, over("vy_ref"), over("sideslip"), over("sideslip_ref"), over("ay"), is_scored
-    )
-
-
-def _drawn(part: Scored, sideslip: FloatArray) -> FloatArray:
-    """Sideslip where it is scored, else NaN, (K,) [deg]."""
-    return np.where(part.is_sideslip_scored, np.degrees(sideslip), np.nan)
-
-
-def _gap_of(parts: Sequence[Scored]) -> int:
-    """Samples between two ranges, enough to be seen."""
-    return max(sum(len(part.time) for part in parts) // 60, 1)
-
-
-def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[float, float]:
-    """Times between which the mean square of the reference sideslip is largest, within one range."""
-    best = -math.inf
-    first = 0
-    length = 1
-    offset = 0
-    for part in parts:
-        n = min(round(ZOOM_SECONDS / step), len(part.time))
-        sideslip = np.where(part.is_sideslip_scored, part.sideslip_ref, 0.0)
-        power = np.convolve(np.square(sideslip), np.full(n, 1.0 / n), mode="valid")
-        if power.max() > best:
-            best = float(power.max())
-            first = offset + int(power.argmax())
-            length = n
-        offset += len(part.time) + _gap_of(parts)
-    return float(time[first]), float(time[first + length - 1])
-
-
-def _figures_of(
-    artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], file: str
-) -> list[Block]:
-    """Traces and errors of the board's rows over all scored ranges of a test set, on one time axis with a gap of NaN between two ranges."""
-    models = {(*model.name, model.seed): model for model in artefacts.models}
-    rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
-    shown = {
-        name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()
-    }
-    parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
-    if not any(part.is_sideslip_scored.any() for part in next(iter(parts.values()))):
-        return []
-    step = 1.0 / artefacts.protocol.rate_hz
-    drives = {name: _joined(own, step) for name, own in parts.items()}
-    first = next(iter(parts.values()))
-    drive = next(iter(drives.values()))
-    label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
-    zoom = _busiest(first, drive.time, step)
-    start = float(drive.time[0])
-    begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
-    axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
-    reference = figures.Traces(
-        "measured", REFERENCE, drive.vy_ref, _drawn(drive, drive.sideslip_ref)
-    )
-    traces = [
-        figures.Traces(rows[name]["title"], lines[name], own.vy, _drawn(own, own.sideslip))
-        for name, own in drives.items()
-    ]
-    inside = (drive.time >= zoom[0]) & (drive.time <= zoom[1])
-    zoomed = [
-        figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside])
-        for t in (reference, *traces)
-    ]
-    errors = [
-        (
-            str(rows[name]["title"]),
-            lines[name],
-            np.degrees(own.sideslip - own.sideslip_ref)[own.is_sideslip_scored],
-        )
-        for name, own in drives.items()
-    ]
-    has_ay = bool(np.isfinite(drive.ay[~np.isnan(drive.vy_ref)]).all())  # at samples, not in gaps
-    found: list[Block] = [
-        Figure(
-            f"traces_{file}",
-            "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated "
-            "(coloured), of each estimator the seed chosen on validation.",
-            figures.traces_figure(drive.time, reference, traces, label),
-            explorer_of(artefacts, test_set, shown, parts, axis),
-        ),
-        Figure(
-            f"zoom_{file}",
-            f"The {zoom[1] - zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
-            f"its error (estimate − measured){', and the measured lateral acceleration' * has_ay}.",
-            figures.zoom_figure(
-                drive.time[inside],
-                drive.ay[inside] if has_ay else None,
-                zoomed[0],
-                zoomed[1:],
-                label,
-            ),
-        ),
-        Figure(
-            f"errors_{file}",
-            "Distribution of the sideslip error; the few errors beyond the axis are counted in its outermost bins.",
-            figures.error_histogram(errors),
-        ),
-    ]
-    if has_ay:
-        caption = (
-            "Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
-            f"{figures.LEAST_SAMPLES} samples show no error."
-        )
-        found.append(
-            Figure(
-                f"errors_over_ay_{file}",
-                caption,
-                figures.error_over_ay(drive.ay[drive.is_sideslip_scored], errors),
-            )
-        )
-    return found
 
 
 # The training

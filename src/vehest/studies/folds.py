@@ -1,6 +1,6 @@
-"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated by a model that had not seen it.
+"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated by a model that was not trained on it.
 
-Used by pipelines whose split has ``folds``. Errors of all folds count together, so that all that was driven decides, not one stretch of it.
+Used by pipelines whose split has ``folds``. Errors of all folds count together, so that the whole recording decides, not one segment of it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TAKES = "folds"
 SHOWS_FAILED = True
 TEST = "test"
 
-VERSION = "2"
+VERSION = "3"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -45,7 +45,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         if set(artefacts.titles) <= set(parts)
         else f"{len(parts)} of {len(artefacts.titles)} folds"
     )
-    where = f"{number} ({kinds} data), each estimated by models that had not seen it"
+    where = f"{number} ({kinds} data), each estimated by models that were not trained on it"
     board = overview(ranking, folds, titles, list(parts))
     blocks: list[Block] = [
         _table(board, list(parts)),
@@ -66,7 +66,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         f"{title} is not here: nothing could be trained or scored on it." for title in lost
     ]
     if left_out:
-        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in left_out))
+        blocks.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in left_out))
     blocks += how_it_was_made(first)[:1]
     for name, part in parts.items():
         warned = [line for line in warnings_of(part) if "is left out" not in line]
@@ -160,14 +160,14 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "interval": Column(
             "95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")
         ),
-        "against_best": Column("to the lowest [deg]"),
-        "beats_zero": Column("beats v = 0"),
+        "against_best": Column("difference to best [deg]"),
+        "beats_zero": Column("beats zero"),
         "beats_static_map": Column("beats static map"),
         **{part: Column(part.replace("_", " "), decimals=decimals) for part in parts},
     }
     caption = (
         "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
-        "difference to the lowest, and whether v = 0 and the static map are beaten: paired, corrected by Holm."
+        "difference to best, and whether an estimator is significantly better than zero and the static map: paired, corrected by Holm."
     )
     frame = board.drop(columns=["estimator", "variant"]).assign(
         interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]

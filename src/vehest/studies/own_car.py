@@ -1,4 +1,4 @@
-"""The study of a car of one's own: which estimator to trust on it and how far, in words; then the comparison as of any drive.
+"""The study of a user's car: which estimator is recommended on it and with which error; then the comparison as of any drive.
 
 Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was recorded; further ones, with
 ``split.minutes``, make the curve of how much reference is needed. `documents` makes the report, `leaderboard` the table in it, `verdict`
@@ -7,7 +7,6 @@ what the terminal says at the end.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -18,178 +17,101 @@ from vehest.data.files import file_name
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_classes
-from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.metrics import is_fast_enough, pieces_of, scored_range
-from vehest.evaluation.ranking import BASELINES, Ranking
-from vehest.report.document import REPORT, Block, Document, as_code, as_text
+from vehest.evaluation.ranking import BASELINES
+from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.runs import Name, by_name, chosen_seed, runs_of, values_of
-from vehest.studies.kit.standing import BASELINE_TITLES, ranking_of
-from vehest.studies.kit.warnings import cannot_rank
+from vehest.studies.kit.recommendation import Recommendation, plain_text, recommendation_of
 from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
 SHOWS_FAILED = True
-HARD = 4.0  # m/s², from which on driving says something of the tyres
+HARD = 4.0  # m/s², above which the tyres leave their linear range
 PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
-VERSION = "8"
+VERSION = "9"
 leaderboard = drive.leaderboard
 Verdict = tuple[
     list[str], EvaluatedModel | None
-]  # sentences in Markdown, and the model to go on with, if one can be recommended
+]  # sentences in Markdown, and the recommended model, if there is one
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
+    """Verdict, figures and next commands; then the appendices: what was not compared and the whole comparison."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    compared = drive.comparison(
-        part, {name: model.name for name, (_, model) in verdicts.items() if model is not None}
-    )
-    texts = [
-        f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(sentences)}"
-        for name, (sentences, _) in verdicts.items()
-    ]
-    opening = next(
-        n for n, block in enumerate(compared.blocks) if isinstance(block, str)
-    )  # bars, and traces where there are any
-    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
     commands = "\n".join(_commands(artefacts, verdicts))
-    if commands:
-        blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
-    absent = not_compared(part)
-    folded: list[Block] = (
-        ["## Not compared\n\n" + "\n".join(f"- {as_text(line)}" for line in absent)]
-        if absent
-        else []
-    )
-    curves = curves_of(list(artefacts.parts.values()))
-    learnt = [
+    next_steps = [f"## Next steps\n\n```sh\n{commands}\n```"] if commands else []
+    curves = [
         block
-        for curve in curves
+        for curve in curves_of(list(artefacts.parts.values()))
         for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))
     ]
-    needed: list[Block] = ["## How much reference is needed", *learnt] if learnt else []
-    further = [
-        block
-        for name, other in list(artefacts.parts.items())[1:]
-        for block in drive.appendix_of(name, other)
-    ]
-    whole = [*blocks, *folded, *needed, "## The comparison", *compared.blocks[opening:], *further]
-    return {REPORT: replace(compared, title=artefacts.title, blocks=whole, open_blocks=len(blocks))}
+    absent = not_compared(part)
+    appendices: list[Block] = []
+    if absent:
+        lines = "\n".join(f"- {as_text(line)}" for line in absent)
+        appendices.append(f"## Estimators that were not compared\n\n{lines}")
+    for name, other in list(artefacts.parts.items())[1:]:
+        appendices += drive.appendix_of(name, other)
+    sentences = {name: text for name, (text, _) in verdicts.items()}
+    models = {name: model.name for name, (_, model) in verdicts.items() if model is not None}
+    report = drive.comparison(
+        part,
+        drive.Additions(sentences, models, [*curves, *next_steps], appendices),
+    )
+    return {REPORT: replace(report, title=artefacts.title)}
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    lines = [
-        " ".join(sentences).replace("**", "").replace("`", "") for sentences, _ in verdicts.values()
-    ]
+    lines = [plain_text(" ".join(sentences)) for sentences, _ in verdicts.values()]
     commands = _commands(artefacts, verdicts)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
-    """Which estimator to trust on a test set and how far; that none can be recommended, and why.
-
-    One estimator is named, whose error is given and which the next commands take: the winner, which lies below every other candidate, v = 0
-    and the static map by more than chance (`Ranking.winner`); else a plain one that nothing beats; else, of those that are not told apart
-    from the lowest error, the one with the lowest RMSE(v) on validation.
-    """
-    ranking = ranking_of(part, test_set)
-    titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
-    silent = cannot_rank(part, test_set)
-    if not ranking.order:
-        return [f"No estimator has a finite sideslip error on test set `{test_set}`."], None
-    if ranking.n_blocks < LEAST_BLOCKS:
-        silent = [
-            f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least",
-            *silent,
-        ]
-    if silent:
-        return [
-            f"**These recordings cannot rank estimators**, because {listed(silent)}.",
-            _wanted(part),
-        ], None
-    model = _to_go_on_with(part, ranking)
-    name = model.name
-    expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
-    best = titles[ranking.order[0]]
-    level = [titles[own] for own in ranking.not_told_apart]
-    if ranking.winner is not None:
-        words = f"**Use {titles[name]}.** Expected {expected}."
-    elif ranking.order[0][0] in PLAIN:
-        none = "no estimator that learns is worth its while on these data"
-        why = (
-            none
-            if any(other not in PLAIN for other, *_ in ranking.order)
-            else "none that learns was compared"
-        )
-        words = f"**Nothing beats {titles[name]} here**, which has {expected}: {why}."
-    elif level:
-        others = listed(level) if len(level) <= 6 else f"{len(level)} others"
-        words = (
-            f"**Take {titles[name]}**, expected {expected}. **No estimator can be called best:** {best} has the lowest error and is not "
-            f"told apart from {others}; of these {titles[name]} has the lowest RMSE(v) on validation."
-        )
-    else:
-        words = f"**Take {titles[name]}**, which has the lowest error, {expected}. **No estimator can be called best.**"
-    sentences = (words, _beaten(ranking, name, titles), _counted(part, test_set), _wanted(part))
-    return [sentence for sentence in sentences if sentence], model
+    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be expected, and what it beats."""
+    recommendation = recommendation_of(part, test_set)
+    sentences = recommendation.describe(_reach(part, test_set))
+    if not recommendation.ranking.order:
+        return sentences, None
+    if not recommendation.obstacles:
+        if recommendation.model is not None:
+            sentences.append(_comparison_with_plain(recommendation))
+        sentences.append(_counted(part, test_set))
+    sentences.append(_hard_driving(part))
+    return [sentence for sentence in sentences if sentence], recommendation.model
 
 
-def _figure(ranking: Ranking, name: Name) -> str:
-    low, high = ranking.intervals.get(name, (math.nan, math.nan))
-    size = fixed(ranking.rmse[name], 2)
-    return f"{size}° ({fixed(low, 2)} to {fixed(high, 2)})" if math.isfinite(low) else f"{size}°"
-
-
-def _beaten(ranking: Ranking, name: Name, titles: Mapping[Name, str]) -> str:
-    """Which of the plain estimators that it was compared with it beats, and which beat it, by more than chance."""
+def _comparison_with_plain(recommendation: Recommendation) -> str:
+    """How the recommended estimator compares with the plain ones other than the baselines, which it beats."""
+    ranking = recommendation.ranking
+    name = recommendation.model.name if recommendation.model is not None else ranking.order[0]
     sentences = {
-        "lower": "It beats",
-        "not told apart": "It is not told apart from",
-        "higher": "It has a higher error than",
+        "lower": "It is also significantly better than",
+        "not told apart": "It is not significantly different from",
+        "higher": "It is significantly worse than",
     }
-    found: dict[str, list[str]] = {verdict: [] for verdict in sentences}
-    for other in (other for other in ranking.order if other[0] in PLAIN and name[0] not in PLAIN):
-        if (name, other) in ranking.pairs:
-            found[ranking.pairs[name, other].verdict].append(
-                BASELINE_TITLES.get(other[0], titles[other])
-            )
+    others: dict[str, list[str]] = {verdict: [] for verdict in sentences}
+    for other in ranking.order:
+        if other != name and other[0] in PLAIN and other[0] not in BASELINES:
+            pair = ranking.pairs.get((name, other))
+            if pair is not None:
+                others[pair.verdict].append(recommendation.titles[other])
     return " ".join(
-        f"{words} {listed(found[verdict])}."
+        f"{words} {listed(others[verdict])}."
         for verdict, words in sentences.items()
-        if found[verdict]
+        if others[verdict]
     )
 
 
-def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
-    """The winner, or a plain estimator of the lowest error; else the lowest RMSE(v) on validation of those level with the lowest error."""
-    alone = ranking.winner is not None or ranking.order[0][0] in PLAIN
-    names = [ranking.order[0], *([] if alone else ranking.not_told_apart)]
-    runs = runs_of(part)
-    groups = by_name(part.models)
-    chosen = []
-    for name in names:
-        seeds = sorted(model.seed for model in groups[name])
-        seed = chosen_seed(seeds, name, runs)
-        error = values_of(runs, name, [seed], "validation", "rmse_vy")[0]
-        chosen.append(
-            (
-                error if math.isfinite(error) else math.inf,
-                next(model for model in groups[name] if model.seed == seed),
-            )
-        )
-    return min(chosen, key=lambda pair: pair[0])[1]
-
-
 def _counted(part: PartArtefacts, test_set: str) -> str:
-    """How much of a test the score counts, and the sideslip that the start of each range hides."""
+    """Share of a test that is scored, and the sideslip in the start of each range, which is not."""
     protocol = part.protocol
     scored = list[FloatArray]()
     hidden = list[FloatArray]()
@@ -214,10 +136,10 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     most, most_hidden = (
         float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out)
     )
-    words = f"The score counts {fixed(share, 0)} % of the test"
+    words = f"{fixed(share, 0)} % of the test is scored"
     words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
     if most_hidden > most:
-        words += f", **which hide the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
+        words += f", **which contain the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
     if n_slow:
         speed = protocol.describe_min_sideslip_speed(
             span.dataset for span in part.split.tests[test_set]
@@ -261,8 +183,8 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
     )
 
 
-def _wanted(part: PartArtefacts) -> str:
-    """How much hard driving there is, and how much more would halve the interval: its width goes as one over the root of the time."""
+def _hard_driving(part: PartArtefacts) -> str:
+    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one over the root of the time."""
     split = part.split
     spans = [
         *split.train,
@@ -274,8 +196,14 @@ def _wanted(part: PartArtefacts) -> str:
         return ""
     minutes = float((np.abs(ay) > HARD).sum()) / part.protocol.rate_hz / 60.0
     if minutes < 0.5:
-        return f"Your recordings hold {fixed(60.0 * minutes, 0)} s beyond {HARD:g} m/s²: drive harder, for ten minutes at least."
-    return f"Your recordings hold {fixed(minutes, 1)} min beyond {HARD:g} m/s²: {fixed(3.0 * minutes, 0)} more would halve the interval."
+        return (
+            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above {HARD:g} m/s²: record at least ten minutes "
+            "of harder driving."
+        )
+    return (
+        f"Your recordings contain {fixed(minutes, 1)} min with |ay| above {HARD:g} m/s²: "
+        f"{fixed(3.0 * minutes, 0)} min more would halve the interval."
+    )
 
 
 def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatArray:

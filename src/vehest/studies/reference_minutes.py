@@ -82,8 +82,8 @@ class Point:
     variant: str  # its variant
     title: str  # for people
     start: str  # what its training starts from; `SCRATCH` for nothing
-    minutes: float  # with reference that it learnt and stopped on, as they were asked for
-    n_trainings: int  # stretches of the drive times seeds
+    minutes: float  # with reference for training and validation, as configured
+    n_trainings: int  # segments of the drive times seeds
 
     @property
     def name(self) -> Name:
@@ -203,16 +203,16 @@ def minutes_of(part: PartArtefacts) -> float:
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """Sentences, figure and table of a curve; ``name`` ends the files' names."""
     caption = (
-        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference that were learnt and stopped "
-        f"on; bars are 95 % intervals over blocks of the test and trainings. Dashed: v = 0."
+        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference for training and "
+        f"validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
     )
     return [
         _in_words(curve),
         Figure(f"reference_minutes_{name}", caption, _figure(curve)),
         Table(
             f"reference_minutes_{name}",
-            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: stretches of the drive times seeds. The last column: against the "
-            f"same estimator from scratch on as much, corrected by Holm.",
+            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive times seeds. The last column: compared with "
+            f"the same estimator from scratch on as many minutes, corrected by Holm.",
             pd.DataFrame(rows_of_curve(curve)),
             COLUMNS,
         ),
@@ -242,13 +242,13 @@ def _against_scratch(curve: Curve, point: Point) -> str:
 
 
 def _lines(curve: Curve) -> list[list[Point]]:
-    """Points by estimator and start, each with more minutes than the one before; none of v = 0."""
+    """Points by estimator and start, each with more minutes than the one before; none of the zero-sideslip baseline."""
     groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
     return [list(own) for key, own in groups if key[0] != BASELINES[0]]
 
 
 def _in_words(curve: Curve) -> str:
-    """What more reference brings to each estimator, and what starting from another model does; only what is more than chance."""
+    """Errors with the fewest and the most minutes of reference, and significant effects of starting from another model."""
     sentences = []
     for first, *_, last in (own for own in _lines(curve) if len(own) > 1):
         how = "" if first.start == SCRATCH else f" ({first.start})"
@@ -263,12 +263,12 @@ def _in_words(curve: Curve) -> str:
         f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"
     ]
     if any(_against_scratch(curve, point) for point in curve.points):
-        found = [f"lower by more than chance with {listed(better)} min"] if better else []
-        found += [f"higher with {listed(worse)} min"] if worse else []
+        found = [f"significantly lower with {listed(better)} min"] if better else []
+        found += [f"significantly higher with {listed(worse)} min"] if worse else []
         sentences.append(
             f"Starting from another model, the error is {' and '.join(found)}."
             if found
-            else "Starting from another model is not told apart from starting from scratch with any amount."
+            else "Starting from another model makes no significant difference to starting from scratch with any amount."
         )
     return f"**{curve.title}.** " + " ".join(sentences)
 

@@ -45,7 +45,7 @@ from vehest.studies.kit.standing import (
 )
 from vehest.studies.kit.warnings import warnings_of
 
-VERSION = "2"
+VERSION = "3"
 TAKES = "parts"
 SHOWS_FAILED = True
 COLUMNS = 4
@@ -69,8 +69,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     }
     board = overview(parts, rankings)
     caption = (
-        "RMSE(β) over that of v = 0, with 95 % intervals: left of 1, an estimator knows more than nothing. The vertical line in each row "
-        "is the static map, which learns two numbers from the same ranges."
+        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an estimator is better than it. The "
+        "vertical line in each row is the static map, whose two numbers are fitted on the same ranges."
     )
     blocks: list[Block] = [
         Figure("transfer", caption, _drawn(board)),
@@ -147,7 +147,7 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
 
 
 def carried_over(board: pd.DataFrame) -> str:
-    """Sentences: on which vehicles an estimator beats v = 0 and the static map, each by more than chance."""
+    """Sentences: on which vehicles an estimator is significantly better than zero and the static map."""
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     tested = board[~board["estimator"].isin(BASELINES)]
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
@@ -162,11 +162,11 @@ def carried_over(board: pd.DataFrame) -> str:
             f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}"
         )
     if everywhere:
-        first = f"On every one of {len(places)} tests {listed(everywhere)} beat v = 0 and the static map, each by more than chance."
+        first = f"On every one of {len(places)} tests {listed(everywhere)} are significantly better than zero and the static map."
     else:
-        first = f"**No estimator beats both v = 0 and the static map on each of the {len(places)} tests.**"
+        first = f"**No estimator is significantly better than both zero and the static map on each of the {len(places)} tests.**"
     return (
-        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten:\n\n"
+        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten significantly:\n\n"
         + "\n".join(lines)
     )
 
@@ -188,9 +188,9 @@ def _matrix(board: pd.DataFrame) -> Table:
         for title, row in rows.items():
             row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
-        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * beats v = 0 and the static map, each "
-        "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
-        "vehicle to vehicle under one name; they stand in the pipeline's file."
+        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * significantly better than zero and the "
+        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
+        "vehicle to vehicle under one name; they are listed in the pipeline's file."
     )
     return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
 
@@ -207,7 +207,7 @@ def _cell(row: Mapping[Any, Any]) -> str:
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
-    """A panel a test, a row an estimator: RMSE(β) over that of v = 0 with its interval, and the static map as a vertical line."""
+    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the static map as a vertical line."""
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     names = list(
         dict.fromkeys(
@@ -266,7 +266,7 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
         for axes in grid[:, 0]:
             axes.set_yticks(range(len(names)), [name[2] for name in names])
             axes.set_ylim(len(names) - 0.5, -0.5)
-        figure.supxlabel("RMSE(β) over that of v = 0", fontsize=7.5)
+        figure.supxlabel("RMSE(β) over that of the zero-sideslip baseline", fontsize=7.5)
     return figure
 
 
@@ -289,7 +289,7 @@ def _part(
         )
     warned = warnings_of(part)
     if warned:
-        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
+        blocks.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
     blocks.append(budget_sentence(part))
     decimals = decimals_for(board["rmse_sideslip"].tolist())
     shown = board.assign(
@@ -302,8 +302,8 @@ def _part(
         "estimator_title": Column("estimator"),
         "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
         "interval": Column("95 % interval [deg]"),
-        "against_best": Column("to the lowest [deg]"),
-        "beats_zero": Column("beats v = 0"),
+        "against_best": Column("difference to best [deg]"),
+        "beats_zero": Column("beats zero"),
         "beats_static_map": Column("beats static map"),
     }
     caption = f"{as_text(part.title)}: baselines first, then by error. Differences are paired over blocks and seeds, corrected by Holm."

@@ -73,7 +73,7 @@ class ThroughFilterSettings(Group):
     )
     mirrored: float = setting(
         0.5,
-        "share of sequences and pairs that are seen in a mirror, left for right; paper: 0",
+        "share of sequences and pairs that are mirrored, left for right; paper: 0",
         least=0.0,
         most=1.0,
     )

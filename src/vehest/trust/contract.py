@@ -363,7 +363,7 @@ class GuardedStepper(Stepper):
         Args:
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
             time: of the sample [s], if known: repeated samples are skipped, missing ones bridged. While stamps stand still, go back, jump
-                or are uneven, the estimate is invalid (docs/trust.md, Clocks). None, or no number: the sample is the next one at the rate.
+                or are uneven, the estimate is invalid (docs/online_contract.md). None, or no number: the sample is the next one at the rate.
 
         Returns:
             ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and

@@ -4,7 +4,7 @@
 
 All random numbers come from the fault's seed. Sizes are round numbers of engineering judgement, from faults that a driver would not notice
 to those of no car, and were set before the error of any estimator under them was looked at;
-docs/trust.md, "Kinds and sizes", is the table of all of them.
+docs/faults.md, "Kinds and sizes", is the table of all of them.
 """
 
 from __future__ import annotations

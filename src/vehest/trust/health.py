@@ -108,7 +108,7 @@ REASONS: dict[int, tuple[str, float]] = {
     kernel.SIGN: ("{channel} has the wrong sign", 0.0),
     kernel.UNIT: ("{channel} has the wrong unit", 0.0),
     kernel.CONTRADICTION: ("{channel} and {partner} contradict each other", 3.0),
-    kernel.OUTSIDE: ("outside what the model learnt: |{channel}|", 1.0),
+    kernel.OUTSIDE: ("outside the range of the training: |{channel}|", 1.0),
     kernel.SPIN: ("spin", 0.0),
     kernel.LOCKED: ("locked wheel: {channel}", 9.0),
     kernel.DROPOUT: ("lost wheel: {channel}", 9.0),
@@ -648,4 +648,6 @@ def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
     if not named:
         return ""
     words = ", ".join(text for _, text in sorted(named, reverse=True)[:3])
-    return f"{100.0 * outside / samples:.3g} % of the drive outside what the model learnt: {words}"
+    return (
+        f"{100.0 * outside / samples:.3g} % of the drive outside the range of the training: {words}"
+    )

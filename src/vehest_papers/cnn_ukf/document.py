@@ -1,4 +1,4 @@
-"""The report: claims and verdicts, Table II with what has to be beaten, why; then Table III and the paper's figures as appendices."""
+"""The report: claims and verdicts, Table II with what has to be beaten, ablations; then Table III and the paper's figures as appendices."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from vehest.data.errors import DataError
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
-from vehest.report.style import fixed, listed
+from vehest.report.style import listed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.cnn_ukf import (
-    claims,
+    block_errors,
     distributions,
     observability,
     paper,
@@ -23,14 +23,14 @@ from vehest_papers.cnn_ukf import (
     tables,
     traces,
 )
+from vehest_papers.cnn_ukf.block_errors import DOUBLED, FULL, LIMITED
+from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.limited import Limited, limited
-from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
     CUTOFF_HZ,
     KPIS,
     LARGEST_SIDESLIP,
-    OWN,
     TEST,
     Prepared,
     Run,
@@ -39,24 +39,17 @@ from vehest_papers.cnn_ukf.subjects import (
     chosen,
     filter_of,
     kpi_table,
+    name_in,
     runs_of,
 )
 from vehest_papers.kit import methods
-from vehest_papers.kit.claims import claims_table
+from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
+from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
-from vehest_papers.kit.statements import decided
+from vehest_papers.kit.verdict_table import claims_table, one_line
 
-FULL = "full"
-BEFORE = "before"
+NAME = "cnn_ukf"  # of the paper's package
 FREE = "free"
-STANDARD = "standard"
-LIMITED = "limited"
-RENAMED = {
-    BEFORE: {paper.CNN: paper.BEFORE},
-    FREE: {paper.SMOOTH: paper.FREE, paper.CNN: paper.CNN_FREE},
-    STANDARD: {paper.DATA: paper.Z_SCORES},
-}
-"""Part -> what its candidates are called beside those of the full set."""
 NETWORKS = (
     paper.DATA,
     paper.Z_SCORES,
@@ -64,8 +57,8 @@ NETWORKS = (
 )  # networks without a filter, in a table of their own
 IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in tables.ORACLES)
 NOTE = (
-    "Changes are CNN-UKF's to the other's unless stated. Seeds 3 and 4 of the hybrids and the limited set were added after the test "
-    "had been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
+    "Seeds 3 and 4 of the hybrids and the limited set were added after the test had been seen, by rules "
+    "fixed before they were trained."
 )
 
 
@@ -104,14 +97,11 @@ def _place(candidate: str) -> int:
 
 
 def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
-    """Candidates of all parts that learnt on the full set, by names that tell them apart."""
+    """Candidates of all parts that were trained on the full set, by unique names."""
     found: dict[str, Sequence[Run]] = {}
     for name, runs in parts.items():
-        if name != LIMITED and not search.is_point(name):
-            found |= {
-                RENAMED.get(name, {}).get(candidate, candidate): own
-                for candidate, own in runs.items()
-            }
+        if name not in (LIMITED, DOUBLED) and not search.is_point(name):
+            found |= {name_in(name, candidate): own for candidate, own in runs.items()}
     return found
 
 
@@ -122,7 +112,7 @@ def _report(
     prepared: Mapping[str, Prepared],
 ) -> Document:
     kind = words_of_kinds(artefacts.parts[FULL])
-    main = ManoeuvreErrors(runs, "test")
+    main = ManoeuvreErrors(runs)
     own = prepared[FULL]
     filters_with_networks = ("ensemble_ukf", "cnn_ukf")
     hybrids = [
@@ -132,47 +122,39 @@ def _report(
     ]
     outputs = {name: [outputs_of(run, own) for run in runs[name]] for name in hybrids}
     shifts = {name: [shift_of(run, own) for run in runs[name]] for name in hybrids}
-    active = claims.activity(outputs, shifts)
-    titles = {
-        name: f"{name}{OWN}"
-        if name in paper.OWN_FILTER
-        and claims.is_own_filter(main, name, float(np.median(shifts[name])))
-        else name
-        for name in runs
-    }
+    active = tables.activity(outputs, shifts)
     off = perturbed.perturbed(runs, own)
     driven = _whole_drives(artefacts)
     smooth = filter_of(load_model(chosen(runs[paper.SMOOTH]).model.model_folder))
     assert smooth is not None
     local = observability.local(smooth)
     learnt = limited(runs, parts[LIMITED], own) if LIMITED in parts else None
-    statements = [
-        *claims.on_accuracy(main, kind),
-        *claims.on_parts(main, kind),
-        *claims.on_networks(main, outputs, kind),
-        *claims.on_robustness(off, kind),
-        *claims.on_limited(learnt, kind),
+    content = claims_of(NAME)
+    rows = [
+        *block_errors.error_rows(parts, learnt, content),
+        *block_errors.measured_rows(main, outputs, off, local),
     ]
-    verdicts = [*decided(statements), *observability.claims(local), *claims.not_testable()]
-    picked = {
+    trained = block_errors.training_rows(parts, content)
+    drawn = {
         name: chosen(seeds)
         for name, seeds in runs.items()
         if name in paper.TABLE_II or name in (paper.SMOOTH, paper.FREE)
     }
-    drawn = {titles[name]: run for name, run in picked.items()}
     data = {
         f"kpis_{name}": kpi_table(seeds)
         for name, seeds in parts.items()
         if not search.is_point(name)
     }
     data["stiffness"] = perturbed.values(off)
+    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     blocks: list[Block] = [
-        *_asked(artefacts, main, driven, titles, active, learnt),
-        claims_table(verdicts, NOTE),
-        *_results(artefacts, main, parts, prepared, active, titles, drawn),
-        *_appendices(artefacts, main, runs, prepared, titles, drawn, data),
+        *_summary(artefacts, main, driven, one_line(content.recommendation)),
+        *_results(artefacts, main, prepared, active, drawn),
+        "## Claims",
+        claims_table(content, rows, trained),
+        *_appendices(artefacts, runs, prepared, drawn, data),
         "## Appendix: summary",
-        overview(artefacts, parts, main, titles),
+        overview(artefacts, parts, main),
         "## Appendix: networks and process noise",
         tables.networks_alone(
             main,
@@ -197,107 +179,49 @@ def _report(
     return Document(artefacts.title, blocks, data)
 
 
-def _asked(
-    artefacts: StudyArtefacts,
-    main: ManoeuvreErrors,
-    driven: ManoeuvreErrors,
-    titles: Mapping[str, str],
-    active: pd.DataFrame,
-    learnt: Limited | None,
+def _summary(
+    artefacts: StudyArtefacts, main: ManoeuvreErrors, driven: ManoeuvreErrors, answer: str
 ) -> list[Block]:
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
-    count = len(main.manoeuvres)
-    words = (
-        f"**{kind} data**, {count} held-out test manoeuvres, scored until |β| exceeds 12°; the paper's recordings are real, of a "
-        f"BMW 545i, and not public. {artefacts.about}"
-    )
-    words += methods.absent_parts(artefacts)
-    four = sorted(paper.OF_FOUR, key=lambda name: main.get(name, MSE_NL).value)
-    order = ", ".join(f"{titles[name]} {main.in_words(name, MSE_NL)}" for name in four)
-    published = {name: paper.TABLE_II[name].mse_nonlinear for name in paper.OF_FOUR}
-    paper_order = ", ".join(
-        f"{name} {fixed(published[name], 3)}"
-        for name in sorted(published, key=published.__getitem__)
-    )
-    sentences = [f"**Order by MSE_nl [deg²], best first:** {order} (paper: {paper_order})."]
-    if paper.BEFORE in main:
-        change = main.change(paper.CNN, paper.BEFORE, MSE_NL)
-        sentences.append(
-            f"**Training through the filter** changes CNN-UKF's MSE_nl by {change.in_percent()}."
-        )
-    if paper.FREE in main:
-        change = main.change(paper.CNN, paper.FREE, MSE_NL)
-        name = titles[paper.CNN]
-        sentences.append(
-            f"**A filter alone** whose process noise is free, as no row of the paper is, has {main.in_words(paper.FREE, MSE_NL)} deg²: "
-            f"{name} against it {change.in_percent()}."
-        )
-    if learnt is not None:
-        own = learnt.comparison
-        order = ", ".join(
-            f"{name} {own.in_words(name, MSE_NL)}"
-            for name in sorted(paper.OF_FOUR, key=lambda name: own.get(name, MSE_NL).value)
-        )
-        sentences.append(f"**Learnt without the limit of handling** (|ay| ≤ 7 m/s²): {order}.")
-    shown = ", ".join(
-        f"{name} {driven.in_words(name, MSE_NL)}"
-        for name in (paper.CNN, paper.SMOOTH, paper.FREE)
-        if name in driven
-    )
-    sentences.append(
-        f"**Mind:** {_cut_in_words(driven)} cut at 12°; scored whole, beyond what networks learnt from: {shown} deg²."
-    )
-    row = active[active["candidate"] == paper.CNN].iloc[0]
-    sentences.append(
-        f"**Influence of the network on the filter:** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°."
-    )
-    return [words, " ".join(sentences)]
+    return [
+        f"**{kind} data**, {len(main.manoeuvres)} held-out test manoeuvres, scored until |β| exceeds 12°: "
+        f"{_cut_in_words(driven)} cut there. The paper's recordings are real, of a BMW 545i, and not public. "
+        f"{artefacts.about}{methods.absent_parts(artefacts)} {NOTE}",
+        f"**{answer}**",
+    ]
 
 
 def _results(
     artefacts: StudyArtefacts,
     main: ManoeuvreErrors,
-    parts: Mapping[str, Runs],
     prepared: Mapping[str, Prepared],
     active: pd.DataFrame,
-    titles: Mapping[str, str],
     drawn: Mapping[str, Run],
 ) -> list[Block]:
     part = artefacts.parts[FULL]
     own = prepared[FULL]
     kind = words_of_kinds(part).upper()
     slalom = traces.manoeuvre_of(part, own, "slalom")
-    four = {
-        name: run
-        for name, run in drawn.items()
-        if run.candidate in paper.OF_FOUR and not name.startswith(paper.FREE)
-    }
-    learnt = {
-        run.candidate if name == titles.get(run.candidate) else name: tables.training_error(
-            run, own
-        )
-        for name, run in drawn.items()
-    }
-    in_table = {titles[name]: seeds for name, seeds in main.runs.items() if name in IN_TABLE_II}
+    four = {name: run for name, run in drawn.items() if name in paper.OF_FOUR}
+    training = {name: tables.training_error(run, own) for name, run in drawn.items()}
+    in_table = {name: seeds for name, seeds in main.runs.items() if name in IN_TABLE_II}
     caption = (
         "Table II: ours with 95 % intervals, means over seeds (paper's in brackets). RMSE of validation and training: means over "
         f"manoeuvres. Data: {kind}."
     )
-    published = {titles[name]: known for name, known in paper.TABLE_II.items()}
-    shown = {titles.get(name, name): value for name, value in learnt.items()}
-    variants = ManoeuvreErrors({name: main.runs[name] for name in active["candidate"]}, "test")
+    variants = ManoeuvreErrors({name: main.runs[name] for name in active["candidate"]})
     return [
         traces.compared(
             four, slalom, 7, "Slalom with the largest sideslip angle of those without a spin", kind
         ),
         "## Full set",
-        tables.accuracy(ManoeuvreErrors(in_table, "test"), published, shown, "table_2", caption),
-        "## Why: what each part of CNN-UKF does",
+        tables.accuracy(ManoeuvreErrors(in_table), paper.TABLE_II, training, "table_2", caption),
+        "## Ablations",
         tables.ablation(
             variants,
             active,
-            "CNN-UKF with one thing taken away, and what is active: shift of β, lowest to highest seed; deviations: 5, 50 and 95 % of all "
-            f"test samples. Data: {kind}.",
+            "CNN-UKF with one part removed, and how active its parts are: shift of β, lowest to highest seed; deviations: 5, 50 and 95 % of "
+            f"all test samples. Data: {kind}.",
         ),
     ]
 
@@ -306,7 +230,6 @@ def overview(
     artefacts: StudyArtefacts,
     parts: Mapping[str, Runs],
     main: ManoeuvreErrors,
-    titles: Mapping[str, str],
 ) -> Table:
     """What the terminal shows: both errors of both sets, beside the paper's."""
     rows = []
@@ -323,7 +246,7 @@ def overview(
             known = paper.TABLES[name].get(candidate)
             row: dict[str, object] = {
                 "part": artefacts.titles[name],
-                "candidate": titles[candidate] if name == FULL else candidate,
+                "candidate": candidate,
             }
             for kpi in (MSE, MSE_NL):
                 values = [getattr(run.kpis, kpi) for run in own]
@@ -346,10 +269,8 @@ def overview(
 
 def _appendices(
     artefacts: StudyArtefacts,
-    main: ManoeuvreErrors,
     runs: Runs,
     prepared: Mapping[str, Prepared],
-    titles: Mapping[str, str],
     drawn: Mapping[str, Run],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
@@ -358,9 +279,7 @@ def _appendices(
     kind = words_of_kinds(part).upper()
     title = artefacts.titles[FULL].lower()
     shown = {
-        titles[name]: runs[name]
-        for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
-        if name in runs
+        name: runs[name] for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE) if name in runs
     }
     both = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
     figure, values = distributions.errors_figure(shown, 5, title, kind)
@@ -443,14 +362,12 @@ def _networks_and_oracles(
         also = {name: main.runs[name] for name in (paper.STATIC_MAP, paper.ZERO) if name in main}
         caption = f"Networks without a filter on the full set: inputs in [0, 1], as z-scores, and a recurrent network. Data: {words}."
         blocks.append(
-            tables.accuracy(
-                ManoeuvreErrors(known | also, "test"), {}, training, "networks_alone", caption
-            )
+            tables.accuracy(ManoeuvreErrors(known | also), {}, training, "networks_alone", caption)
         )
     if any(map(search.is_point, parts)):
         blocks.append(search.search_table(parts, parts[FULL], words))
     oracles_alone = ManoeuvreErrors(
-        {name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}, "test"
+        {name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}
     )
     caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
     return [
@@ -466,7 +383,7 @@ def _whole_drives(artefacts: StudyArtefacts) -> ManoeuvreErrors:
     runs = _together(
         {name: runs_of(part, Prepared(part, whole=True)) for name, part in parts.items()}
     )
-    return ManoeuvreErrors(runs, "whole")
+    return ManoeuvreErrors(runs)
 
 
 def _cut_in_words(driven: ManoeuvreErrors) -> str:
@@ -486,9 +403,7 @@ def _cut_in_words(driven: ManoeuvreErrors) -> str:
 
 def _all_that_was_driven(own: ManoeuvreErrors, kind: str) -> list[Block]:
     """Indicators without the limit of 12°."""
-    rows = [
-        {"candidate": name, **{kpi: own.in_words(name, kpi) for kpi in KPIS}} for name in own.runs
-    ]
+    rows = [{"candidate": name, **{kpi: own.text(name, kpi) for kpi in KPIS}} for name in own.runs]
     columns = {"candidate": Column("method")} | {
         kpi: Column(header) for kpi, header in KPIS.items()
     }

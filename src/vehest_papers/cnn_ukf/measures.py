@@ -1,118 +1,173 @@
-"""The paper's indicators of candidates on manoeuvres, resampled together, and relative changes from one to another with their intervals."""
+"""Values by block and seed for those claims that are not comparisons of errors (``measure`` in claims.yaml).
+
+Each function returns an array of shape (S, B), S seeds by B manoeuvres unless it says otherwise; NaN where a
+manoeuvre has no samples of what is measured. Two candidates have their seeds paired in order.
+"""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
+from scipy import stats
 
 from vehest.constants import FloatArray
-from vehest.evaluation.metrics import Scored
-from vehest.evaluation.significance import CONFIDENCE
-from vehest_papers.cnn_ukf.manoeuvres import group_of, is_nonlinear
-from vehest_papers.cnn_ukf.subjects import Manoeuvres, Run, Runs
-from vehest_papers.kit.reading import sideslip_error
-from vehest_papers.kit.sampled import SampledErrors, resampled
-from vehest_papers.kit.statements import Change, Measured, short
+from vehest_papers.cnn_ukf.indicators import (
+    MSE,
+    MSE_NL,
+    ManoeuvreErrors,
+    nonlinear_samples,
+    sideslip_errors,
+)
+from vehest_papers.cnn_ukf.manoeuvres import GROUPS
+from vehest_papers.cnn_ukf.networks import Outputs
+from vehest_papers.cnn_ukf.observability import PAPER_MEASUREMENTS
+from vehest_papers.kit.measured import paired_seeds
 
-N_RESAMPLES = 4000
-MSE = "mse"
-MSE_NL = "mse_nonlinear"
-ME = "max_error"
-ME_NL = "max_error_nonlinear"
-BALANCED = "balanced"  # mean over manoeuvres of their RMSE, by which seeds and settings are chosen
-
-Sums = tuple[FloatArray, FloatArray]  # of each manoeuvre a sum and what it is divided by, (M,) each
+HIGH_SIDESLIP = 5.0  # deg
+LOW_SIDESLIP = 1.0  # deg
+LATERAL_VELOCITY = 0  # column of Outputs.process
+YAW_RATE = 1
+Seeds = Sequence[Sequence[Outputs]]  # outputs of a network, seed by seed, manoeuvre by manoeuvre
 
 
-def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:
-    """What an indicator is made of, manoeuvre by manoeuvre."""
-    errors = [
-        np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()
-    ]
-    beyond = [
-        np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()
-    ]
-    if indicator in (MSE_NL, ME_NL):
-        errors = [error[kept] for error, kept in zip(errors, beyond, strict=True)]
-    if indicator == BALANCED:
-        return np.array([float(np.sqrt(np.mean(np.square(error)))) for error in errors]), np.ones(
-            len(errors)
-        )
-    if indicator in (ME, ME_NL):
-        found = [float(np.abs(error).max()) if len(error) else 0.0 for error in errors]
-        return np.array(found), np.array([float(len(error) > 0) for error in errors])
-    return np.array([float(np.square(error).sum()) for error in errors]), np.array(
-        [float(len(error)) for error in errors]
+def mean_error_over_least_of_others(
+    main: ManoeuvreErrors, candidate: str, others: Sequence[str]
+) -> FloatArray:
+    """Contributions of the manoeuvres to |mean error| less the smallest |mean error| of the others [deg].
+
+    Where |ay| is at least 4 m/s². Their mean over manoeuvres is the difference of the two magnitudes:
+    the sign of each mean error is that over all manoeuvres.
+    """
+    magnitudes = [_magnitude_parts(main, name) for name in others]
+    least = min(magnitudes, key=lambda parts: float(parts.mean()))
+    return np.subtract(*paired_seeds(_magnitude_parts(main, candidate), least))
+
+
+def _magnitude_parts(main: ManoeuvreErrors, candidate: str) -> FloatArray:
+    """Contributions of each manoeuvre to the magnitude of a mean error, (S, M) [deg]."""
+    sums = []
+    for run in main.runs[candidate]:
+        parts = list(run.test.values())
+        errors = [sideslip_errors(part)[nonlinear_samples(part)] for part in parts]
+        counts = sum(len(error) for error in errors) / len(errors)
+        sums.append([float(error.sum()) / max(counts, 1.0) for error in errors])
+    means = np.array(sums)
+    return means * np.sign(means.mean(axis=1, keepdims=True))
+
+
+def is_best_in_group(
+    main: ManoeuvreErrors, candidate: str, others: Sequence[str]
+) -> tuple[list[str], FloatArray]:
+    """Groups of manoeuvres, and 1 where a seed has a lower MSE in non-linear driving than the mean of each other, (S, groups)."""
+    groups = [group for group in GROUPS.values() if group in main.groups]
+    columns = []
+    for group in groups:
+        values = _values_of_seeds(main, candidate, group)
+        limit = min(float(_values_of_seeds(main, name, group).mean()) for name in others)
+        columns.append((values < limit).astype(np.float64))
+    return groups, np.stack(columns, axis=1)
+
+
+def _values_of_seeds(main: ManoeuvreErrors, candidate: str, group: str) -> FloatArray:
+    errors = main.errors(candidate, MSE_NL, group)
+    return errors.sums.sum(axis=1) / max(float(errors.sizes.sum()), 1.0)
+
+
+def distrust_correlations(outputs: Seeds) -> FloatArray:
+    """Rank correlation of a network's deviation with the magnitude of its error."""
+
+    def correlation(own: Outputs) -> float:
+        if np.ptp(own.distrust) == 0:
+            return 0.0
+        return float(stats.spearmanr(own.distrust, np.abs(own.error)).statistic)
+
+    return np.array([[correlation(own) for own in seed] for seed in outputs])
+
+
+def distrust_decades_ratios(first: Seeds, second: Seeds) -> FloatArray:
+    """Decades that the deviation of one network spans over those of another, from the 1st to the 99th percentile."""
+    return np.divide(*paired_seeds(_decades(first), _decades(second)))
+
+
+def _decades(outputs: Seeds) -> FloatArray:
+    ends = np.array(
+        [[np.percentile(own.distrust, [1.0, 99.0]) for own in seed] for seed in outputs]
+    )
+    return np.asarray(np.log10(ends[..., 1] / ends[..., 0]))
+
+
+def yaw_rate_noise_rises(outputs: Seeds) -> FloatArray:
+    """Median process noise of the yaw rate where |β| is at least 5° over that where it is below 1°."""
+
+    def rise(own: Outputs) -> float:
+        angle = np.abs(own.sideslip)
+        return _ratio_of_medians(own, YAW_RATE, angle >= HIGH_SIDESLIP, angle < LOW_SIDESLIP)
+
+    return np.array([[rise(own) for own in seed] for seed in outputs])
+
+
+def lateral_velocity_noise_rises(outputs: Seeds) -> FloatArray:
+    """Median process noise of the lateral velocity in non-linear driving over that in linear driving."""
+    return np.array(
+        [
+            [
+                _ratio_of_medians(own, LATERAL_VELOCITY, own.nonlinear, ~own.nonlinear)
+                for own in seed
+            ]
+            for seed in outputs
+        ]
     )
 
 
-class ManoeuvreErrors(SampledErrors):
-    """Candidates on one test, all on the same resamples of whole manoeuvres; seeds of each candidate are drawn on their own.
+def _ratio_of_medians(own: Outputs, column: int, above: np.ndarray, below: np.ndarray) -> float:
+    assert own.process is not None
+    if not (above.any() and below.any()):
+        return float("nan")
+    noise = own.process[:, column]
+    return float(np.median(noise[above]) / np.median(noise[below]))
 
-    Args:
-        runs: candidate -> its seeds; all over the same manoeuvres.
-        name: of the test; resamples of tests with different names are independent.
-        paired: candidates whose runs are the same trainings under other conditions are drawn together.
+
+def stiffness_rise_differences(
+    conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str, other: str
+) -> FloatArray:
+    """Contributions of the manoeuvres to the rise of a candidate's MSE less that of another's [deg²].
+
+    Each has its own worst combination of stiffnesses, by the MSE over all manoeuvres.
     """
-
-    def __init__(self, runs: Runs, name: str, *, paired: bool = False) -> None:
-        super().__init__(runs, paired=paired)
-        self.runs = runs
-        self.manoeuvres = list(next(iter(runs.values()))[0].test)
-        self.groups = [group_of(manoeuvre) for manoeuvre in self.manoeuvres]
-        generator = np.random.default_rng(zlib.crc32(name.encode()))
-        self._counts = resampled(len(self.manoeuvres), N_RESAMPLES, generator)
-        self._seed = int(generator.integers(2**31))
-        self._known: dict[tuple[str, str, str], Measured] = {}
-
-    def get(self, candidate: str, indicator: str, group: str = "") -> Measured:
-        """An indicator of a candidate, over all manoeuvres or those of a group."""
-        key = candidate, indicator, group
-        if key not in self._known:
-            pieces = [sums_of(run.test, indicator) for run in self.runs[candidate]]
-            kept = np.array([group in ("", own) for own in self.groups], dtype=np.float64)
-            sums = np.stack([own for own, _ in pieces]) * kept
-            sizes = pieces[0][1] * kept
-            self._known[key] = self.measured(sums, sizes, int(np.count_nonzero(kept)))
-        return self._known[key]
-
-    def measured(self, sums: FloatArray, sizes: FloatArray, count: int | None = None) -> Measured:
-        """A mean, of sums by seed and manoeuvre (S, M) over sizes (M,)."""
-        total = np.maximum(self._counts @ sizes, 1e-12)
-        values = self._counts @ sums.T / total[:, None]
-        generator = np.random.default_rng(self._seed if self.paired else zlib.crc32(sums.tobytes()))
-        return self.figure(values, len(sizes) if count is None else count, generator)
-
-    def change(self, first: str, second: str, indicator: str, group: str = "") -> Change:
-        """From the second candidate to the first."""
-        return Change.of(self.get(first, indicator, group), self.get(second, indicator, group))
-
-    def in_words(self, candidate: str, indicator: str, group: str = "") -> str:
-        """The figure with its interval: ``0.12 [0.09, 0.15]``."""
-        own = self.get(candidate, indicator, group)
-        low, high = own.interval
-        return f"{short(own.value)} [{short(low)}, {short(high)}]"
-
-    def of_statistic(
-        self, candidate: str, statistic: Callable[[Sequence[Run], FloatArray], float]
-    ) -> tuple[float, float, float]:
-        """Any figure of a candidate's seeds and how often each manoeuvre counts, with the 2.5 and 97.5 % of 500 resamples."""
-        runs = self.runs[candidate]
-        generator = np.random.default_rng(self._seed)
-        found = []
-        for number, counts in enumerate(self._counts[:501]):
-            picked = (
-                runs
-                if number == 0
-                else [runs[at] for at in generator.integers(len(runs), size=len(runs))]
-            )
-            found.append(statistic(picked, counts))
-        low, high = np.nanquantile(found[1:], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
-        return found[0], float(low), float(high)
+    return np.subtract(
+        *paired_seeds(
+            _worst_rise(conditions, nominal, candidate), _worst_rise(conditions, nominal, other)
+        )
+    )
 
 
-def whole(parts: Sequence[Scored]) -> FloatArray:
-    """Errors of a manoeuvre [deg]."""
-    return np.concatenate([sideslip_error(part) for part in parts])
+def _worst_rise(
+    conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str
+) -> FloatArray:
+    errors = [own.errors(candidate, MSE) for own in (*conditions, nominal)]
+    sizes = errors[0].sizes
+    worst = max(errors, key=lambda own: float(own.sums.mean(axis=0).sum()))
+    return np.asarray((worst.sums - errors[-1].sums) / sizes.mean())
+
+
+def largest_ratios_over_stiffnesses(
+    conditions: Sequence[ManoeuvreErrors], candidate: str, other: str
+) -> FloatArray:
+    """MSE of a candidate over that of another in non-linear driving, at the stiffnesses where its geometric mean is largest."""
+    ratios = []
+    for own in conditions:
+        first, second = (own.errors(name, MSE_NL) for name in (candidate, other))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratios.append(np.divide(*paired_seeds(first.sums, second.sums)))
+    return max(ratios, key=lambda own: float(np.nanmean(np.log(own))))
+
+
+def ranks(table: pd.DataFrame, is_straight: bool) -> tuple[list[str], FloatArray]:
+    """Steady turns, or straight drives, and the rank of the observation matrix in each, (1, B), with the paper's measurements."""
+    rows = table[
+        ((table["steer"] == 0.0) == is_straight) & (table["measured"] == PAPER_MEASUREMENTS)
+    ]
+    names = [f"{row.speed:g} m/s, {row.steer:g}°" for row in rows.itertuples()]
+    return names, rows["rank"].to_numpy(dtype=np.float64)[None]

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
 from vehest.report.document import Column, Table
-from vehest.report.style import fixed
-from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)
@@ -20,6 +18,7 @@ ANGLES = (0.0, 0.1, 1.0, 3.0)  # deg, of the front wheels
 SETTLED = 400  # samples, in which a car with a constant steering angle comes to its steady turn
 SIZES = np.array([1.0, 0.2])  # m/s, rad/s: a lateral velocity and a yaw rate of ordinary size
 WINDOW = 10
+PAPER_MEASUREMENTS = "ay, yaw rate, both forces"
 
 
 def local(estimator: DugoffUkf) -> pd.DataFrame:
@@ -38,7 +37,7 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
             states, driven = (
                 np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs)
             )
-            for words, n in (("ay, yaw rate, both forces", 4), ("ay, yaw rate", 2)):
+            for words, n in ((PAPER_MEASUREMENTS, 4), ("ay, yaw rate", 2)):
 
                 def observed(states: Tensor, inputs: Tensor, n: int = n) -> Tensor:
                     return track.observation(states, inputs)[..., :n]
@@ -81,39 +80,3 @@ def observability_table(found: pd.DataFrame) -> Table:
         "samples with the sensors' levels of noise alone determine the lateral velocity. Computed, no recording."
     )
     return Table("observability", caption, found, columns)
-
-
-def claims(found: pd.DataFrame) -> list[Claim]:
-    """Rank two wherever the car steers, and less at zero steering."""
-    steered = found[found["steer"] > 0]
-    straight = found[found["steer"] == 0]
-    full = int((steered["rank"] == 2).sum())
-    lost = int((straight["rank"] < 2).sum())
-    worst = float(
-        straight["deviation"].max()
-        / found[found["steer"] == min(steered["steer"])]["deviation"].max()
-    )
-    ours = f"rank 2 in {full} of {len(steered)} steady turns"
-    beside = f"deviation of V_y there {fixed(worst, 2)} times that at {min(steered['steer']):g}°"
-    verdict: Verdict = (
-        "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided"
-    )
-    steers: Verdict = "reproduced" if full == len(steered) else "not reproduced"
-    return [
-        Claim(
-            "III-B: observable where the car steers (rank 2)",
-            "yes",
-            ours,
-            "computed",
-            steers,
-            "exact",
-        ),
-        Claim(
-            "III-B: unobservable at δ = 0",
-            "yes",
-            f"rank below 2 in {lost} of {len(straight)}; {beside}",
-            "computed",
-            verdict,
-            "exact",
-        ),
-    ]

@@ -13,15 +13,20 @@ SMOOTH = "Model-based, smooth tyres"  # not in the paper: the filter of the CNN-
 FREE = "Model-based, free noise"
 """Not in the paper: the same filter, whose process noise may be as large as serves it best, far beyond the paper's."""
 CNN_FREE = "CNN-UKF, free noise"  # not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise
-BEFORE = "not trained through the filter"
+BEFORE = "CNN-UKF before training through the filter"
 Z_SCORES = "Data-driven, z-scores"
+CNN_Z_SCORES = "CNN-UKF, z-scores"
 RECURRENT = "Recurrent network"
-PLAIN = "plain tyres"
+PLAIN = "CNN-UKF, plain tyres"
+CONSTANT_NOISE = "CNN-UKF, constant process noise"
+CONSTANT_DISTRUST = "CNN-UKF, constant distrust"
+WITHOUT_PSEUDO = "CNN-UKF without pseudo-measurement"
+FULL_SCALING = "DE-UKF, scaling of the full set"
 ORACLE_FILTER = "Oracle: filter fitted to the test"
 ORACLE_DISTRUST = "Oracle: CNN-UKF, perfect distrust"
-ZERO = "v = 0"
-STATIC_MAP = "Static map"
-DATA_SHEET = "Data sheet"
+ZERO = "zero"
+STATIC_MAP = "static map"
+DATA_SHEET = "data sheet"
 
 CANDIDATES = (
     MODEL,
@@ -40,11 +45,6 @@ CANDIDATES = (
 """In the order of Table II, then those that are not in it and those that have to be beaten."""
 OF_FOUR = (MODEL, DATA, DEEP, CNN)
 HYBRIDS = (DEEP, CNN)
-OWN_FILTER = {
-    DEEP: MODEL,
-    CNN: SMOOTH,
-    CNN_FREE: FREE,
-}  # hybrid -> what is left of it without its network
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from vehest.training.context import FitContext
 from vehest.training.search import finite_cost, optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
+from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_of, line_of
 from vehest_papers.kit.legends import legend_above
 
@@ -103,8 +103,8 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
 
 def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
-    """The filters of the study, of each the seed that validation chooses, under all perturbations; only p₁ and p₂ are ever tuned anew."""
-    own = {candidate: [chosen(runs[candidate])] for candidate in WITH_FILTER if candidate in runs}
+    """The filters of the study, all seeds, under all perturbations; p₁ and p₂ alone are tuned anew, of the seed that validation chooses."""
+    own = {candidate: runs[candidate] for candidate in WITH_FILTER if candidate in runs}
     fitted = {
         candidate: [load_model(run.model.model_folder) for run in seeds]
         for candidate, seeds in own.items()
@@ -132,7 +132,8 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
     }
     tuned = []
     judged = prepared.ranges(VALIDATION)
-    for run, model in zip(own.get(paper.DEEP, []), fitted.get(paper.DEEP, []), strict=True):
+    for run in [chosen(own[paper.DEEP])] if paper.DEEP in own else []:
+        model = fitted[paper.DEEP][own[paper.DEEP].index(run)]
         assert isinstance(model, EnsembleUkf)
         softer = with_stiffness(model, *COMBINATIONS[SOFTEST])
         assert isinstance(softer, EnsembleUkf)
@@ -142,7 +143,7 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
 
 def figure_14(found: Perturbed, data: str) -> Figure:
     """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
-    comparisons = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
+    comparisons = [ManoeuvreErrors(runs) for runs in found.stiffness]
     with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         panels = figure.subplots(1, 2)
         for axes, indicator, label in zip(
@@ -150,11 +151,11 @@ def figure_14(found: Perturbed, data: str) -> Figure:
         ):
             for candidate in found.stiffness[NOMINAL]:
                 line = line_of(candidate)
-                measured = [own.get(candidate, indicator) for own in comparisons]
+                figures = [own.figure(candidate, indicator) for own in comparisons]
                 at = np.arange(len(COMBINATIONS))
-                low, high = np.array([own.interval for own in measured]).T
+                low, high = np.array([(own.low, own.high) for own in figures]).T
                 axes.fill_between(at, low, high, color=line.colour, alpha=0.1, linewidth=0)
-                values = [own.value for own in measured]
+                values = [own.value for own in figures]
                 axes.plot(
                     at,
                     values,
@@ -172,8 +173,8 @@ def figure_14(found: Perturbed, data: str) -> Figure:
             axes.set_yscale("log")
         legend_above(figure, panels[0], columns=5)
     caption = (
-        "Errors of the test where cornering stiffnesses of the axles in the filters are off by 10 % (Figure 14 of the paper), of the "
-        f"seed that validation chooses; bands: 95 % intervals over manoeuvres. Nothing is trained again. Data: {data}."
+        "Errors of the test where cornering stiffnesses of the axles in the filters are off by 10 % (Figure 14 of the paper), means "
+        f"over seeds; bands: 95 % intervals over manoeuvres and seeds. Nothing is trained again. Data: {data}."
     )
     return Figure("figure_14", caption, figure)
 
@@ -191,19 +192,19 @@ def perturbed_table(found: Perturbed, data: str) -> Table:
         conditions[f"stiffness {LABELS[SOFTEST]}, p₁ and p₂ tuned anew"] = {paper.DEEP: found.tuned}
     rows: list[dict[str, object]] = []
     for words, runs in conditions.items():
-        own = ManoeuvreErrors(runs, "test")
+        own = ManoeuvreErrors(runs)
         rows.append(
             {
                 "condition": words,
-                **{candidate: own.in_words(candidate, MSE_NL) for candidate in runs},
+                **{candidate: own.text(candidate, MSE_NL) for candidate in runs},
             }
         )
     columns = {"condition": Column("the filter takes")} | {
         candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]
     }
     caption = (
-        "MSE_nl [deg²] where filters take tyres or body for others than they are, front / rear, of the chosen seed, with 95 % "
-        f"intervals over manoeuvres. The plant's mass and inertia are known exactly otherwise. Data: {data}."
+        "MSE_nl [deg²] where filters take tyres or body for others than they are, front / rear, means over seeds with 95 % "
+        f"intervals. The plant's mass and inertia are known exactly otherwise. Data: {data}."
     )
     return Table("perturbed", caption, pd.DataFrame(rows).fillna("–"), columns)
 

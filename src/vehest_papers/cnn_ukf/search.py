@@ -12,8 +12,9 @@ from vehest.estimators.sideslip_ffnn import SideslipFfnn
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.measures import BALANCED, ManoeuvreErrors
+from vehest_papers.cnn_ukf.indicators import BALANCED, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Run, Runs, balanced
+from vehest_papers.kit.verdict_table import figure_in_words
 
 PREFIX = "search_"  # parts whose names begin so are points of the search, one network each
 
@@ -37,7 +38,7 @@ def search_table(parts: Mapping[str, Runs], full: Runs, data: str) -> Table:
     points = points_of(parts, full)
     given = _network(full[paper.DATA][0]).settings.hidden
     judged = {_words(widths): [replace(run, test=run.validation)] for widths, run in points.items()}
-    own = ManoeuvreErrors(judged, "validation")
+    own = ManoeuvreErrors(judged)
     rows = []
     for widths, run in points.items():
         fit = run.model.fit_metrics()
@@ -46,10 +47,10 @@ def search_table(parts: Mapping[str, Runs], full: Runs, data: str) -> Table:
                 "first": widths[0],
                 "second": widths[1],
                 "weights": _network(run).n_parameters,
-                "validation": own.in_words(_words(widths), BALANCED),
-                "change": MISSING
+                "validation": own.text(_words(widths), BALANCED),
+                "ratio": MISSING
                 if widths == given
-                else own.change(_words(widths), _words(given), BALANCED).in_percent(),
+                else figure_in_words(own.ratio(_words(widths), _words(given), BALANCED)),
                 "best_epoch": fit.get("best_epoch", float("nan")),
             }
         )
@@ -58,7 +59,7 @@ def search_table(parts: Mapping[str, Runs], full: Runs, data: str) -> Table:
         "second": Column("second layer", decimals=0),
         "weights": Column("weights", decimals=0),
         "validation": Column("RMSE of a validation manoeuvre [deg]"),
-        "change": Column(f"against {_words(given)}"),
+        "ratio": Column(f"over that of {_words(given)}"),
         "best_epoch": Column("best epoch", decimals=0),
     }
     caption = (

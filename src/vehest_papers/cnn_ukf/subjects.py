@@ -47,17 +47,11 @@ LINES = {
     paper.STATIC_MAP: Line("#6b7682", "dashed", "+"),
     paper.ZERO: Line("#c3cad2", "dotted", "."),
 }
-OWN = ", its own filter"  # what follows the name of a hybrid that is its own filter
-
-
-def plain_name(candidate: str) -> str:
-    """A candidate's name without what it was found to be."""
-    return candidate.removesuffix(OWN)
 
 
 def line_of(candidate: str) -> Line:
     """How a candidate is drawn."""
-    return LINES[plain_name(candidate)]
+    return LINES[candidate]
 
 
 KPIS = {
@@ -82,12 +76,25 @@ _NAMES = {
     ("data_sheet", False): paper.DATA_SHEET,
 }
 PARTS_AWAY = {
-    "_no_pseudo_measurement": "without pseudo-measurement",
-    "_no_adaptive_distrust": "σ_DD constant",
-    "_no_adaptive_process": "process noise constant",
+    "_no_pseudo_measurement": paper.WITHOUT_PSEUDO,
+    "_no_adaptive_distrust": paper.CONSTANT_DISTRUST,
+    "_no_adaptive_process": paper.CONSTANT_NOISE,
     "_plain": paper.PLAIN,
 }
 """Part of a variant's name -> what is taken away, in words."""
+
+
+RENAMED: Mapping[str, Mapping[str, str]] = {
+    "before": {paper.CNN: paper.BEFORE},
+    "free": {paper.SMOOTH: paper.FREE, paper.CNN: paper.CNN_FREE},
+    "z_scores": {paper.DATA: paper.Z_SCORES, paper.CNN: paper.CNN_Z_SCORES},
+}
+"""Part -> what its candidates are called among those of the full set."""
+
+
+def name_in(part: str, candidate: str) -> str:
+    """What a candidate of a part is called among those of all parts."""
+    return RENAMED.get(part, {}).get(candidate, candidate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,10 @@ from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.claims import OutputsOf, squares
-from vehest_papers.cnn_ukf.measures import ManoeuvreErrors
+from vehest_papers.cnn_ukf.block_errors import network_squares
+from vehest_papers.cnn_ukf.indicators import ManoeuvreErrors
+from vehest_papers.cnn_ukf.measures import LATERAL_VELOCITY, YAW_RATE
+from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.subjects import (
     KPIS,
     TEST,
@@ -29,8 +31,14 @@ from vehest_papers.cnn_ukf.subjects import (
     chosen,
     filter_of,
 )
-from vehest_papers.kit.reading import median_and_range, metric_values, with_interval
+from vehest_papers.kit.block_errors import BlockErrors
+from vehest_papers.kit.reading import median_and_range, metric_values
+from vehest_papers.kit.verdict_table import figure_in_words
+from vehest_papers.kit.verdicts import value_of
 
+OutputsOf = Mapping[
+    str, Sequence[Sequence[Outputs]]
+]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 SAME = 0.01  # difference up to which given tyres and levels are those that were found
 PROCESS = ("process_vy", "process_yaw_rate")
@@ -59,7 +67,7 @@ def accuracy(
         for kpi in KPIS:
             known = getattr(published[candidate], kpi) if candidate in published else math.nan
             row[f"paper_{kpi}"] = known
-            row[f"ours_{kpi}"] = comparison.in_words(candidate, kpi)
+            row[f"ours_{kpi}"] = comparison.text(candidate, kpi)
             row[kpi] = (
                 row[f"ours_{kpi}"]
                 if math.isnan(known)
@@ -105,9 +113,9 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) ->
             "n_seeds": len(comparison.runs[candidate]),
         }
         for kpi in ("mse", "mse_nonlinear"):
-            own[kpi] = comparison.in_words(candidate, kpi)
-            own[f"change_{kpi}"] = (
-                comparison.change(paper.CNN, candidate, kpi).in_percent()
+            own[kpi] = comparison.text(candidate, kpi)
+            own[f"ratio_{kpi}"] = (
+                figure_in_words(comparison.ratio(paper.CNN, candidate, kpi))
                 if candidate != paper.CNN
                 else MISSING
             )
@@ -115,7 +123,7 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) ->
     columns = {
         "candidate": Column("method"),
         "mse_nonlinear": Column("MSE_nl [deg²]"),
-        "change_mse_nonlinear": Column("CNN-UKF against it"),
+        "ratio_mse_nonlinear": Column("MSE_nl, CNN-UKF over it"),
         "shift_range": Column("β for 1° of β_DD [deg]"),
         "distrust": Column("σ_DD [deg]"),
         "process_vy": Column("σ_Vy [m/s]"),
@@ -123,6 +131,29 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) ->
         "n_seeds": Column("seeds", decimals=0),
     }
     return Table("ablation", caption, pd.DataFrame(rows), columns)
+
+
+def activity(outputs: OutputsOf, shifts: Mapping[str, Sequence[float]]) -> pd.DataFrame:
+    """Which parts of each hybrid are active.
+
+    Median shift of β for 1° of β_DD [deg], and quantiles of its deviations over all seeds, as text.
+    """
+    rows = []
+    for name, seeds in outputs.items():
+        of_all = [own for seed in seeds for own in seed]
+        row: dict[str, object] = {"candidate": name, "shift": float(np.median(shifts[name]))}
+        row["shift_range"] = f"{fixed(min(shifts[name]), 2)} … {fixed(max(shifts[name]), 2)}"
+        row["distrust"] = _quantiles([own.distrust for own in of_all])
+        for column, place in (("process_vy", LATERAL_VELOCITY), ("process_yaw_rate", YAW_RATE)):
+            noise = [own.process[:, place] for own in of_all if own.process is not None]
+            row[column] = _quantiles(noise) if len(noise) == len(of_all) else "the filter's"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _quantiles(parts: Sequence[FloatArray]) -> str:
+    values = np.concatenate([part[::10] for part in parts])
+    return " / ".join(f"{value:.2g}" for value in np.percentile(values, [5, 50, 95]))
 
 
 def consistency(part: PartArtefacts, runs: Runs, data: str) -> Table:
@@ -169,7 +200,9 @@ def networks_alone(
     """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
     rows = []
     for candidate, seeds in outputs.items():
-        measured = comparison.measured(*squares(seeds))
+        squares, sizes = network_squares(seeds)
+        names = tuple(str(seed) for seed in comparison.seeds(candidate))
+        errors = BlockErrors(names, comparison.manoeuvres, squares, sizes)
         every = [own for seed in seeds for own in seed]
         beyond = np.concatenate([own.nonlinear for own in every])
         error = np.concatenate([own.error for own in every])
@@ -177,8 +210,8 @@ def networks_alone(
         rows.append(
             {
                 "candidate": candidate,
-                "network": with_interval(measured.value, *measured.interval, 3),
-                "filter": comparison.in_words(candidate, "mse"),
+                "network": figure_in_words(value_of(errors, "mse")[1]),
+                "filter": comparison.text(candidate, "mse"),
                 "rms": float(np.sqrt(np.mean(np.square(error[beyond])))),
                 "sigma": float(np.median(distrust[beyond])),
             }

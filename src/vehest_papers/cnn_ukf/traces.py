@@ -19,7 +19,7 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
 from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
-from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
+from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import sideslip_error
 
@@ -78,9 +78,7 @@ def inner_life(
 
     ``constant``, (2,), are deviations of the filter's process noise where no network gives them; ``warm_up`` [s] is of the estimates.
     """
-    hybrids = {
-        candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS
-    }
+    hybrids = {candidate: run for candidate, run in runs.items() if candidate in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with new_figure(DOUBLE_COLUMN, 4.4) as figure:
@@ -178,9 +176,7 @@ def lap(
         candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()
     }
     drive = prepared.recording(span.dataset, span.recording).cut(*window)
-    hybrids = {
-        candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS
-    }
+    hybrids = {candidate: run for candidate, run in runs.items() if candidate in paper.HYBRIDS}
     with new_figure(DOUBLE_COLUMN, 4.9) as figure:
         grid = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
         _angles(grid[0], parts)

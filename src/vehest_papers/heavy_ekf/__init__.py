@@ -8,6 +8,6 @@ Table ``blocks`` holds the errors by block, ``training`` how candidates were tra
 from vehest_papers.heavy_ekf.document import documents
 
 TAKES = "parts"
-VERSION = "2"  # errors by block are a table
+VERSION = "3"  # claims are judged from the errors by block
 
 __all__ = ["TAKES", "VERSION", "documents"]

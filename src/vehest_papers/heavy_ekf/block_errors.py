@@ -6,17 +6,20 @@ A block is a stretch of a drive that is about independent of its neighbours; a d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from vehest.constants import FloatArray
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
 from vehest.evaluation.blocks import Segments, block_labels, block_sums, segments_of
 from vehest.evaluation.regimes import regimes_of
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest_papers.heavy_ekf import candidates, draws, paper, twin_report, vehicle
-from vehest_papers.heavy_ekf.claims import titles_of
+from vehest_papers.heavy_ekf import accuracy, candidates, draws, paper, twin_report, vehicle
 from vehest_papers.heavy_ekf.factorial import SEEDS, Factorial
+from vehest_papers.heavy_ekf.subjects import titles_of
 from vehest_papers.heavy_ekf.twin import RATE, SECONDS
 from vehest_papers.kit.block_rows import (
     BASELINE_NAMES,
@@ -27,6 +30,7 @@ from vehest_papers.kit.block_rows import (
 )
 
 NAMES = (*paper.ORDER, *BASELINE_NAMES)  # candidates that claims name, as the report calls them
+LAPS = "nominal_laps"
 REGIMES = ("straight", "turning")
 CORRECTED = "corrected wheel speeds"
 MEASURED = "measured wheel speeds"
@@ -118,6 +122,48 @@ def wheel_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
                 head = BlockRow(name, title, 0, test, "rmse_wheel_speed_spread", "", 0.0, 0)
                 rows += block_rows(head, names, values, sizes)
     return rows
+
+
+def measured_rows(
+    name: str,
+    drives: Mapping[str, Recording],
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    minimum_speed: float,
+) -> list[BlockRow]:
+    """Values of claims that need a measurement of their own, a row a block; the metric is the claim's id.
+
+    Parameters
+    ----------
+    drives, estimates
+        Test set -> its drive, and candidate -> its estimate, baselines among them.
+    minimum_speed
+        Below which errors do not count [m/s].
+    """
+
+    def rows(
+        claim: str, test: str, title: str, values: FloatArray, names: Sequence[str]
+    ) -> list[BlockRow]:
+        head = BlockRow(name, _named(title), 0, test, claim, "", 0.0, 0)
+        return block_rows(head, names, values, 1.0)
+
+    found = []
+    for test in (LAPS, "worn_laps"):
+        for title in (paper.LINT, paper.RATT):
+            # that a baseline underestimates too says nothing on a claim of underestimation
+            gains = accuracy.gains_of(drives[test], estimates[test][title])
+            starts = drives[test].start_time + accuracy.BLOCK_SECONDS * np.arange(len(gains))
+            names = [f"{drives[test].id} {start:.2f} s" for start in starts]
+            found += rows(f"{title.lower()}_underestimates_{test}", test, title, gains, names)
+    for title in (paper.RATTE, *BASELINE_NAMES):
+        if title not in estimates[LAPS]:
+            continue
+        own = (drives[LAPS], estimates[LAPS][title])
+        changes = accuracy.log_change_of_last_lap(*own, minimum_speed)
+        names = [f"stretch {number} of {len(changes)}" for number in range(1, len(changes) + 1)]
+        found += rows("ratte_better_on_faster_laps", LAPS, title, changes, names)
+        error = np.array([accuracy.error_before_stop(*own)])
+        found += rows("ratte_until_0_4_s_before_stop", LAPS, title, error, ["the stop"])
+    return found
 
 
 def training_rows() -> list[TrainingRow]:

@@ -10,12 +10,12 @@ from vehest.data.derived import SpeedFromWheels
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code, as_text
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import (
     accuracy,
     block_errors,
-    claims,
     draws,
     laps,
     paper,
@@ -25,20 +25,30 @@ from vehest_papers.heavy_ekf import (
     vehicle,
     watching,
 )
-from vehest_papers.heavy_ekf.factorial import every_cell, factorial
+from vehest_papers.heavy_ekf.factorial import Factorial, every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import (
     TYRES,
     Filter,
+    baseline_errors,
     curves_of,
     filters_of,
     rmse_of,
+    titles_of,
     validation_drives,
     whole_drive,
 )
 from vehest_papers.kit import methods
-from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
-from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.block_rows import (
+    BASELINE_NAMES,
+    BLOCKS,
+    TRAINING,
+    BlockRow,
+    TrainingRow,
+    frame,
+)
+from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
+from vehest_papers.kit.verdict_table import claims_table
 
 TRUCK = "truck"
 DRAWS = "seeds"
@@ -75,19 +85,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         test: {name: own.of(drive) for name, own in shown.items()} for test, drive in drives.items()
     }
     traces, of_ferrari = _ferrari(real, real_filters, real_rmse) if real else ([], [])
-    errors = {**rmse, **claims.baseline_errors(truck)}
-    real_errors = {**real_rmse, **claims.baseline_errors(real)} if real else {}
+    errors = {**rmse, **baseline_errors(truck)}
+    real_errors = {**real_rmse, **baseline_errors(real)} if real else {}
     twin = factorial()
-    twin_front, twin_claims, twin_data, twin_appendix = twin_report.twin_blocks(twin)
-    wheels, wheel_claims = (
-        vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else ([], [])
-    )
-    lap_blocks, lap_claims = _lap_by_lap(filters, drives, estimates)
-    rear = float(filters[paper.RATTE].fitted.settings.car.cg_to_rear_axle)
-    drawn, drawn_claims = (
-        draws.draws_blocks(artefacts.parts[DRAWS], rear) if DRAWS in artefacts.parts else ([], [])
-    )
-    others = [*drawn_claims, *twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
+    twin_front, twin_data, twin_appendix = twin_report.twin_blocks(twin)
+    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
+    car = filters[paper.RATTE].fitted.settings.car
+    rows = _error_rows(artefacts, twin)
+    rows += block_errors.measured_rows(TRUCK, drives, _with_baselines(truck, estimates), slowest)
+    trained = block_errors.training_rows()
+    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
     warned = methods.warnings_in_words(
         {
             as_text(artefacts.titles[name]): part
@@ -95,71 +102,81 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             if name not in (WHEELED, DRAWS)
         }
     )
-    claimed, best = claims.claims_blocks(truck, real, others)
     blocks: list[Block] = [
         *_asked(artefacts),
-        claimed,
+        claims_table(claims_of("heavy_ekf"), rows, trained, kinds),
         *traces,
         tables.overview(
             errors,
             real_errors,
             [
                 *filters,
-                *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL),
+                *(title for title, test in baseline_errors(truck) if test == NOMINAL),
             ],
         ),
         *twin_front,
-        f"## Appendix: the best filter\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
         *twin_appendix,
-        *drawn,
-        *lap_blocks,
+        *(
+            draws.draws_blocks(artefacts.parts[DRAWS], float(car.cg_to_rear_axle))
+            if DRAWS in artefacts.parts
+            else []
+        ),
+        *_lap_by_lap(drives, estimates, slowest),
         "## Appendix: the vehicle",
-        vehicle.table_2(filters[paper.RATTE].fitted.settings.car),
-        vehicle.eigenvalues_table(filters[paper.RATTE].fitted.settings.car),
-        *wheels,
+        vehicle.table_2(car),
+        vehicle.eigenvalues_table(car),
+        *(vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else []),
         *_truck(truck, filters, rmse, drives, estimates),
         *of_ferrari,
         *_how_it_was_made(artefacts),
     ]
-    rows = [*block_errors.drive_rows(TRUCK, truck), *block_errors.twin_rows(twin)]
-    if real:
-        rows += block_errors.drive_rows(FERRARI, real)
-    if DRAWS in artefacts.parts:
-        rows += block_errors.draw_rows(DRAWS, artefacts.parts[DRAWS])
-    if WHEELED in artefacts.parts:
-        rows += block_errors.wheel_rows(WHEELED, artefacts.parts[WHEELED])
     data = {
         **twin_data,
         "twin_cells": every_cell(twin),
         BLOCKS: frame(rows, BlockRow),
-        TRAINING: frame(block_errors.training_rows(), TrainingRow),
+        TRAINING: frame(trained, TrainingRow),
     }
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
+def _error_rows(artefacts: StudyArtefacts, twin: Factorial) -> list[BlockRow]:
+    """Errors by block of all parts and of the twin."""
+    parts = artefacts.parts
+    rows = [*block_errors.drive_rows(TRUCK, parts[TRUCK]), *block_errors.twin_rows(twin)]
+    if FERRARI in parts:
+        rows += block_errors.drive_rows(FERRARI, parts[FERRARI])
+    if DRAWS in parts:
+        rows += block_errors.draw_rows(DRAWS, parts[DRAWS])
+    if WHEELED in parts:
+        rows += block_errors.wheel_rows(WHEELED, parts[WHEELED])
+    return rows
+
+
+def _with_baselines(
+    truck: PartArtefacts, estimates: Mapping[str, Mapping[str, Estimate]]
+) -> dict[str, dict[str, Estimate]]:
+    """Estimates on the nominal laps with those of the baselines that claims name."""
+    found = {test: dict(own) for test, own in estimates.items()}
+    seen = whole_drive(truck, NOMINAL).without_references()
+    titles = titles_of(truck)
+    for model in truck.models:
+        if titles[model.name] in BASELINE_NAMES:
+            found[NOMINAL][titles[model.name]] = load_model(model.model_folder).estimate([seen])[0]
+    return found
+
+
 def _lap_by_lap(
-    filters: Mapping[str, Filter],
     drives: Mapping[str, Recording],
     estimates: Mapping[str, Mapping[str, Estimate]],
-) -> tuple[list[Block], list[Claim]]:
-    """Errors a lap, underestimation and the stop, with the claims that go with them."""
-    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
-    names = [name for name in paper.ORDER if name in filters]
-    gains = accuracy.gains_of(drives, estimates, names)
-    blocks: list[Block] = [
+    slowest: float,
+) -> list[Block]:
+    """Errors a lap, underestimation and the stop."""
+    return [
         "## Appendix: lap by lap, underestimation, and the stop",
-        accuracy.per_lap_table(drives, estimates, names, slowest),
-        accuracy.underestimation_table(gains, names),
-        accuracy.stop_table(drives, estimates, names),
-    ]
-    ratte = estimates[NOMINAL][paper.RATTE]
-    three = drives[NOMINAL]
-    faster = accuracy.faster_is_better_claim(three, ratte, slowest)
-    return blocks, [
-        faster,
-        *accuracy.underestimation_claims(gains),
-        accuracy.stop_claim(three, ratte),
+        accuracy.per_lap_table(drives, estimates, paper.ORDER, slowest),
+        accuracy.underestimation_table(drives, estimates, paper.ORDER),
+        accuracy.stop_table(drives, estimates, paper.ORDER),
     ]
 
 

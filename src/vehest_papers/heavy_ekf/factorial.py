@@ -12,7 +12,13 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.estimators.filtering.tyre_fit import axle_motion, fit_motion
-from vehest.evaluation.significance import difference_of_blocks, root_interval
+from vehest.evaluation.significance import (
+    CONFIDENCE,
+    Interval,
+    difference_of_blocks,
+    holm,
+    root_interval,
+)
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import (
@@ -30,7 +36,6 @@ from vehest_papers.heavy_ekf.candidates import (
     tuning_drives,
 )
 from vehest_papers.heavy_ekf.twin import CURVES, TRUCK, Conditions, Drive, drive
-from vehest_papers.kit.statements import corrected
 
 SLIPS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)  # deg
 MISMATCHES = (-0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2)
@@ -187,7 +192,7 @@ def changes(
         for at, (first, second) in asked
     ]
     found = {}
-    for key, (own, told_apart) in zip(asked, corrected(differences), strict=True):
+    for key, (own, told_apart) in zip(asked, _corrected(differences), strict=True):
         other = math.sqrt(float(cells[key[0]].squared[key[1][1]].mean()))
         found[key] = Change(
             100.0 * own.value / other,
@@ -195,6 +200,16 @@ def changes(
             100.0 * own.high / other,
             told_apart,
         )
+    return found
+
+
+def _corrected(differences: Sequence[Interval]) -> list[tuple[Interval, bool]]:
+    """Differences of one table with intervals at the level that Holm asks of each, and whether that excludes zero."""
+    found = []
+    for own, p_value in zip(differences, holm([own.p_value for own in differences]), strict=True):
+        factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(differences))
+        low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
+        found.append((replace(own, low=low, high=high), p_value < 1.0 - CONFIDENCE))
     return found
 
 

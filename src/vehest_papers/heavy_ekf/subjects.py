@@ -16,6 +16,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.filtering.tyre_fit import TyreFit, axle_force, axle_motion
 from vehest.estimators.model_files import load_model
 from vehest.estimators.rational_ekf import RationalFilter
+from vehest.evaluation.ranking import Name
 from vehest.report.style import REFERENCE, Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.heavy_ekf import paper
@@ -30,6 +31,14 @@ LINES = {
     paper.HELD: Line("#8e24aa", "solid", "v"),
 }
 MEASURED = REFERENCE
+FAMILY = "rational_ekf"
+BASELINE_TITLES = {
+    "zero": "zero",
+    "static_map": "static map",
+    "kinematic": "kinematic",
+    "data_sheet": "data sheet",
+}
+"""Estimators that the filters have to beat -> what they are called in tables."""
 CORNERING = 1.5  # m/s²
 TYRES = {"nominal": "nominal tyres", "worn": "worn tyres", "wet": "wet road"}
 TYRE_COLOURS = {"nominal": "#0b4f9c", "worn": "#b8480b", "wet": "#17a2b8"}
@@ -52,7 +61,7 @@ def filters_of(part: PartArtefacts) -> dict[str, Filter]:
     """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first; raises `DataError` where one is missing."""
     found: dict[str, Filter] = {}
     for model in part.models:
-        if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:
+        if model.estimator == FAMILY and model.variant in paper.VARIANTS:
             fitted = load_model(model.model_folder)
             assert isinstance(fitted, RationalFilter)
             name = paper.VARIANTS[model.variant]
@@ -63,6 +72,17 @@ def filters_of(part: PartArtefacts) -> dict[str, Filter]:
             f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three"
         )
     return {name: found[name] for name in paper.VARIANTS.values() if name in found}
+
+
+def titles_of(part: PartArtefacts) -> dict[Name, str]:
+    """Estimator and variant -> what it is called in this report, for all models of a part."""
+    names = {(model.estimator, model.variant) for model in part.models}
+    return {
+        name: paper.VARIANTS[name[1]]
+        if name[0] == FAMILY
+        else BASELINE_TITLES.get(name[0], ": ".join(name))
+        for name in names
+    }
 
 
 def whole_drive(part: PartArtefacts, test: str) -> Recording:
@@ -112,4 +132,13 @@ def rmse_of(part: PartArtefacts, filters: Mapping[str, Filter]) -> dict[tuple[st
         (names[variant, seed], test): value
         for (_, variant, seed, test, metric), value in metric_values(part).items()
         if metric == "rmse_sideslip" and (variant, seed) in names
+    }
+
+
+def baseline_errors(part: PartArtefacts) -> Mapping[tuple[str, str], float]:
+    """(baseline's title, test set) -> RMSE(β) [deg], as evaluated."""
+    return {
+        (BASELINE_TITLES[estimator], test): value
+        for (estimator, _, _, test, metric), value in metric_values(part).items()
+        if metric == "rmse_sideslip" and estimator in BASELINE_TITLES
     }

@@ -42,7 +42,6 @@ from vehest_papers.heavy_ekf.factorial import (
     interval,
 )
 from vehest_papers.heavy_ekf.twin import CG_HEIGHT, NOISE, SECONDS, TRACK, Plant
-from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import with_interval
 
 DATA = "SIMULATED, the paper's single track"
@@ -65,33 +64,10 @@ ASKED_BEFOREHAND = (
 )
 
 
-def claims_of(own: Factorial, found: Changes) -> list[Claim]:
-    """The paper's two gains in the shown cells of the plain plant."""
-    claims = []
-    for slip, mismatch in SHOWN:
-        at = MISMATCHES.index(mismatch) * len(SLIPS) + SLIPS.index(slip)
-        for pair in CLAIMED:
-            change = found[at, pair]
-            words = with_interval(change.percent, change.low, change.high, 0, " %")
-            verdict: Any = "undecided"
-            if change.told_apart:
-                verdict = "reproduced" if change.percent < 0.0 else "not reproduced"
-            name = f"{pair[0]} below {pair[1]}"
-            data = f"simulated, twin, {slip:g}°, {100 * mismatch:+.0f} %"
-            why = {
-                "undecided": "the corrected interval holds zero",
-                "reproduced": "it lies below zero",
-            }.get(verdict, "it lies above zero")
-            claims.append(
-                Claim(name, f"{paper.GAINS[pair]:.0f} % below", words, data, verdict, why)
-            )
-    return claims
-
-
 def twin_blocks(
     own: Factorial,
-) -> tuple[list[Block], list[Claim], dict[str, pd.DataFrame], list[Block]]:
-    """What stands in front, the claims, tables that are written alone, and the appendix."""
+) -> tuple[list[Block], dict[str, pd.DataFrame], list[Block]]:
+    """What stands in front, tables that are written alone, and the appendix."""
     cells = _flat(own.grid())
     found = changes(cells, PAIRS)
     absorbed_table, absorbed_words = _absorbed_blocks(own)
@@ -114,7 +90,7 @@ def twin_blocks(
         _map(plain, changes(plain, PAIRS), "twin_map_plain", PLAIN_ONLY),
     ]
     data = {"twin_map_cells": _map_cells(cells, found)}
-    return front, claims_of(own, found), data, appendix
+    return front, data, appendix
 
 
 def _flat(grid: Sequence[Sequence[Cell]]) -> list[Cell]:

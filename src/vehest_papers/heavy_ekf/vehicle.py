@@ -17,7 +17,6 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_model
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.claims import Claim, verdict_below
 from vehest_papers.kit.reading import recordings_of, with_interval
 
 SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0)
@@ -126,12 +125,10 @@ def tracks_of(drive: Recording) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
+def wheels_blocks(part: PartArtefacts) -> list[Block]:
     """Eqs. 61 to 64 on the AV-21's wheel speeds: tracks from the training range, then the test ranges."""
     tracks = trained_tracks(part)
-    turning = np.where(tracks > LOCKED, tracks, 0.0)
     rows = []
-    claims = []
     for test, of_drives in wheel_sums(part).items():
         sums = of_drives.values()
         raw, corrected, raw_spread, spread, sizes = (
@@ -151,21 +148,6 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
             )
             row[f"{name}_change"] = with_interval(own.value, own.low, own.high, 3)
         rows.append(row)
-        verdict = verdict_below(spreads.low, spreads.high)
-        why = (
-            "interval of the change" if turning.all() else "interval of the change; one axle alone"
-        )
-        words = f"{fixed(row['spread_raw'], 3)} to {fixed(row['spread'], 3)} m/s; change {row['spread_change']}"  # type: ignore[arg-type]
-        claims.append(
-            Claim(
-                "Eqs. 61 to 64 bring wheels together",
-                "Figure 5",
-                words,
-                f"real, AV-21, {row['test']}",
-                verdict,
-                why,
-            )
-        )
     columns = {
         "test": Column("range"),
         "blocks": Column("blocks of 10 s", decimals=0),
@@ -182,7 +164,7 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         f"least squares, {fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
         f"{_locked_in_words(tracks)}Its yaw rate is low-passed by 0.4 s."
     )
-    return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)], claims
+    return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)]
 
 
 def _locked_in_words(tracks: FloatArray) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -59,24 +59,51 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
     MissingError
         There is no such file.
     DataError
-        A value is not a number, a block of a seed occurs twice or is missing, or the size of a
-        block differs between seeds.
+        As `blocks_of`, or a value is not a number.
+    """
+    rows = (
+        BlockRow(
+            row["part"],
+            row["candidate"],
+            int(number_in(row, "seed", path)),
+            row["test_set"],
+            row["metric"],
+            row["block"],
+            number_in(row, "value", path) if row["value"] else np.nan,
+            number_in(row, "size", path),
+        )
+        for row in read_rows(path, columns_of(BlockRow))
+    )
+    return blocks_of(rows, f"'{path}'")
+
+
+def blocks_of(rows: Iterable[BlockRow], where: str = "errors by block") -> dict[Key, BlockErrors]:
+    """Arrange rows by part, candidate, test set and metric.
+
+    Parameters
+    ----------
+    where
+        What an error names: the file that the rows are from.
+
+    Raises
+    ------
+    DataError
+        A block of a seed occurs twice or is missing, a size is not a number of samples, or the
+        size of a block differs between seeds.
     """
     cells: dict[Key, dict[tuple[str, str], tuple[float, float]]] = {}
-    for row in read_rows(path, columns_of(BlockRow)):
-        key = Key(row["part"], row["candidate"], row["test_set"], row["metric"])
-        cell = (row["seed"], row["block"])
+    for row in rows:
+        key = Key(row.part, row.candidate, row.test_set, row.metric)
+        cell = (str(row.seed), row.block)
         of_key = cells.setdefault(key, {})
         if cell in of_key:
-            raise DataError(f"'{path}': {_named(key, *cell)} occurs twice; write one row for it")
-        size = number_in(row, "size", path)
-        if not (np.isfinite(size) and size >= 0):
+            raise DataError(f"{where}: {_named(key, *cell)} occurs twice; write one row for it")
+        if not (np.isfinite(row.size) and row.size >= 0):
             raise DataError(
-                f"'{path}': {_named(key, *cell)} has size {row['size']}; write its samples"
+                f"{where}: {_named(key, *cell)} has size {row.size:g}; write its samples"
             )
-        value = number_in(row, "value", path) if row["value"] else np.nan
-        of_key[cell] = (value, size)
-    return {key: _arranged(key, of_key, path) for key, of_key in cells.items()}
+        of_key[cell] = (row.value, row.size)
+    return {key: _arranged(key, of_key, where) for key, of_key in cells.items()}
 
 
 def read_training(path: Path) -> dict[str, Training]:
@@ -95,6 +122,14 @@ def read_training(path: Path) -> dict[str, Training]:
     return trained
 
 
+def training_of(rows: Iterable[TrainingRow]) -> dict[str, Training]:
+    """Candidate -> how far it was trained."""
+    return {
+        row.candidate: Training(row.epochs, row.epochs_paper, row.training, row.reason)
+        for row in rows
+    }
+
+
 def _named(key: Key, seed: str, block: str) -> str:
     return (
         f"block {block!r} of seed {seed} of {key.candidate!r} "
@@ -103,7 +138,7 @@ def _named(key: Key, seed: str, block: str) -> str:
 
 
 def _arranged(
-    key: Key, cells: Mapping[tuple[str, str], tuple[float, float]], path: Path
+    key: Key, cells: Mapping[tuple[str, str], tuple[float, float]], where: str
 ) -> BlockErrors:
     seeds = tuple(dict.fromkeys(seed for seed, _ in cells))
     blocks = tuple(dict.fromkeys(block for _, block in cells))
@@ -111,7 +146,7 @@ def _arranged(
         for block in blocks:
             if (seed, block) not in cells:
                 raise DataError(
-                    f"'{path}': {_named(key, seed, block)} is missing; "
+                    f"{where}: {_named(key, seed, block)} is missing; "
                     "write inf as its value where the estimator diverged"
                 )
     table = np.array([[cells[seed, block] for block in blocks] for seed in seeds])
@@ -119,7 +154,7 @@ def _arranged(
     if not np.allclose(sizes, sizes[0], rtol=1e-6):
         position = int(np.flatnonzero((~np.isclose(sizes, sizes[0], rtol=1e-6)).any(axis=0))[0])
         raise DataError(
-            f"'{path}': {_named(key, seeds[0], blocks[position])} has another size than with "
+            f"{where}: {_named(key, seeds[0], blocks[position])} has another size than with "
             "other seeds; the seeds must be scored on the same samples"
         )
     return BlockErrors(seeds, blocks, table[:, :, 0], sizes[0])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -67,6 +67,39 @@ def block_rows(
         blocks, values.tolist(), np.broadcast_to(sizes, len(blocks)).tolist(), strict=True
     )
     return [BlockRow(*head, *of_block) for of_block in of_blocks]
+
+
+def seed_rows(
+    row: BlockRow,
+    seeds: Iterable[int],
+    blocks: Sequence[str],
+    values: FloatArray,
+    sizes: FloatArray | float = 1,
+) -> list[BlockRow]:
+    """Rows of all seeds, a row for each block and seed.
+
+    Parameters
+    ----------
+    row
+        As of `block_rows`; its seed is replaced as well.
+    seeds
+        S of them.
+    blocks
+        Names of the blocks, B of them.
+    values
+        Sum of the loss, or a measured value, (S, B). A block of which no seed has a value (NaN)
+        gets the size 0.
+    sizes
+        Samples in each block, (B,).
+    """
+    is_absent = np.isnan(values).all(axis=0)
+    sizes = np.where(is_absent, 0, np.broadcast_to(sizes, len(blocks)))
+    values = np.where(is_absent, 0.0, values)
+    return [
+        own
+        for seed, of_seed in zip(seeds, values, strict=True)
+        for own in block_rows(replace(row, seed=seed), blocks, of_seed, sizes)
+    ]
 
 
 def columns_of(row_type: type[Any]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from vehest.data.text_files import read_yaml
 
 ADDED_SOURCE = "Not in the paper"  # `source` of comparisons that the paper does not make
 BASELINES = ("zero", "static_map")
+CLAIMS_FOLDER = Path(__file__).parents[1]  # a folder each paper
 
 Kind = Literal["order", "equal", "limit", "measured"]
 Origin = Literal["real", "simulated", "computed"]
@@ -112,6 +113,19 @@ class Paper:
     claims: list[Claim]
     tables: list[Table]
 
+    def metrics(self) -> list[tuple[str, str, str]]:
+        """Part, test set and metric of every error that claims or tables name."""
+        keys = [
+            (part, claim.test_set, claim.metric)
+            for claim in self.claims
+            if claim.metric
+            for part in (claim.part, claim.other_part or claim.part)
+        ]
+        keys += [
+            (table.part, table.test_set, row.metric) for table in self.tables for row in table.rows
+        ]
+        return list(dict.fromkeys(keys))
+
 
 _NEEDED: Mapping[Kind, Sequence[str]] = {
     "order": ("candidate", "other", "direction", "part", "test_set", "metric"),
@@ -126,6 +140,11 @@ _USELESS: Mapping[Kind, Sequence[str]] = {
     "measured": ("metric",),
 }
 _ID = re.compile(r"[a-z0-9_]+")
+
+
+def claims_of(name: str) -> Paper:
+    """Claims and tables of one of the papers that are re-created here."""
+    return read_paper(CLAIMS_FOLDER / name / "claims.yaml")
 
 
 def read_paper(path: Path) -> Paper:

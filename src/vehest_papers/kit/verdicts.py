@@ -205,6 +205,14 @@ def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]
     return contrast, _exponential(contrast, CONFIDENCE)
 
 
+def ratio_of(pair: Pair) -> Figure:
+    """Ratio of the pooled errors with its 95 % interval; without one where there are too few blocks."""
+    if pair.is_testable:
+        return _exponential(pair.size(), CONFIDENCE)
+    ratio = pair.first.mean(axis=0).sum() / pair.second.mean(axis=0).sum()
+    return Figure(float(ratio) ** pair.exponent, math.nan, math.nan)
+
+
 def judge_paper(
     paper: Paper, blocks: Mapping[Key, BlockErrors] | None, training: Mapping[str, Training]
 ) -> dict[str, Judgement]:
@@ -559,7 +567,10 @@ class Measured:
 
 
 def _measure(claim: Claim, errors: BlockErrors) -> Measured:
-    """Mean over blocks and seeds of a claim's measured values; a geometric one where ``other`` makes them ratios."""
+    """Mean over blocks and seeds of a claim's measured values; a geometric one where ``other`` makes them ratios.
+
+    Of values with a single block the seeds take the place of blocks.
+    """
     assert claim.limit is not None
     scored = errors.sizes > 0
     values = errors.sums[:, scored] / errors.sizes[scored]
@@ -567,11 +578,13 @@ def _measure(claim: Claim, errors: BlockErrors) -> Measured:
     values = values[:, _finite_columns(values)]
     n_seeds, n_blocks = values.shape
     is_ratio = claim.other is not None and claim.limit > 0 and bool((values > 0).all())
-    if n_blocks < LEAST_BLOCKS:
+    # what is measured of the trained weights alone has one block: its trainings are what varies
+    units = values.T if n_blocks == 1 else values
+    if units.shape[1] < LEAST_BLOCKS:
         mean = float(values.mean()) if values.size else math.nan
         figure = Figure(mean, math.nan, math.nan)
         return Measured(None, is_ratio, figure, n_blocks, n_seeds, n_diverged)
-    contrast = mean_contrast(np.log(values) if is_ratio else values)
+    contrast = mean_contrast(np.log(units) if is_ratio else units)
     figure = Figure(contrast.value, *contrast.interval())
     if is_ratio:
         figure = _exponential(contrast, CONFIDENCE)

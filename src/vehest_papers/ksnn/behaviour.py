@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from vehest_papers.kit.reading import recordings_of
 from vehest_papers.kit.spectra import mean_bias
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
-from vehest_papers.ksnn.schemes import Scheme, segments_on
+from vehest_papers.ksnn.schemes import Scheme
 
 WINDOWS = (
     5,
@@ -39,7 +39,60 @@ WINDOWS = (
 )  # samples after the start at v = 0 at which errors are read
 STRIDE = 4  # every so many samples of a test drive end windows
 MOST_SEEDS = 3  # seeds of a candidate that are run again here
+ENOUGH = "30"
+LONGER = "60"  # samples of a window: the paper's 1.5 s, and twice that
+AT_LOW_YAW_RATE = (
+    paper.ZERO,
+    paper.STATIC_MAP,
+    paper.LUENBERGER,
+    paper.GRU,
+    paper.LSTM,
+    *paper.STRUCTURED,
+)
+STARTED = (paper.NONLINEAR, paper.LINEAR, paper.LSTM)
+BIASED = (paper.LSTM, *paper.STRUCTURED)
 HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
+
+
+@dataclass(frozen=True, eq=False)
+class Behaviour:
+    """What candidates of a scheme do on the other car, beside their errors on the whole test set."""
+
+    observer: Luenberger | None
+    share: float  # of samples at which |ω| lies below the observer's threshold; NaN where there is no observer
+    low_yaw_rate: SegmentErrors  # categories, where |ω| lies below it
+    after_start: Mapping[str, SegmentErrors]  # category -> its networks by the length of the window
+    corrected: SegmentErrors  # categories, the mean bias of a_y taken off
+    biases: Mapping[str, float]  # as `mean_biases` gives them
+
+    @classmethod
+    def of(cls, scheme: Scheme) -> Behaviour:
+        """Run the networks of a scheme again."""
+        observer = luenberger_of(scheme)
+        test = scheme.other
+        labels = scheme.labels.get(test)
+        recordings = [span.recording for span in scheme.part.split.tests[test]]
+        low: dict[str, list[Segments]] = {}
+        share = math.nan
+        if observer is not None:
+            low, share = at_low_yaw_rate(scheme, observer.threshold, AT_LOW_YAW_RATE, test)
+        biases = mean_biases(scheme)
+        corrected = {name: without_biases(scheme, name, biases, test) for name in BIASED}
+        return cls(
+            observer,
+            share,
+            SegmentErrors(low, labels, _seeds(scheme, low), recordings),
+            {
+                name: SegmentErrors(after_start(scheme, name, test), None, None, recordings)
+                for name in STARTED
+            },
+            SegmentErrors(corrected, labels, _seeds(scheme, corrected), recordings),
+            biases,
+        )
+
+
+def _seeds(scheme: Scheme, categories: Iterable[str]) -> dict[str, list[int]]:
+    return {name: [model.seed for model in scheme.models(name)] for name in categories}
 
 
 def luenberger_of(scheme: Scheme) -> Luenberger | None:
@@ -53,8 +106,11 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
 
 def at_low_yaw_rate(
     scheme: Scheme, threshold: float, categories: Sequence[str], test: str
-) -> tuple[SegmentErrors, float]:
-    """SegmentErrors where |ω| lies below the observer's threshold [rad/s], and the share of such samples."""
+) -> tuple[dict[str, list[Segments]], float]:
+    """Segments of each category where |ω| lies below the observer's threshold [rad/s], and the share of such samples.
+
+    None where the observer is reset never or (almost) always.
+    """
     part = scheme.part
     rate = scheme.part.protocol.rate_hz
     recordings = [
@@ -66,26 +122,24 @@ def at_low_yaw_rate(
     segments: dict[str, list[Segments]] = {}
     share = math.nan
     for category in categories:
-        for model in scheme.models(category)[: 2 * MOST_SEEDS]:
+        for model in scheme.models(category):
             scored = part.scored(model, test)
             masks: list[FloatArray] = [
                 (np.abs(own) < threshold).astype(float) for own in yaw_rates(scored, recordings)
             ]
             share = float(np.concatenate(masks).mean())
             segments.setdefault(category, []).append(masked_segments(scored, masks, rate))
-    return SegmentErrors(
-        segments if 0.0 < share < HIGHEST_SHARE else {}, f"{test} at little yaw rate"
-    ), share
+    return segments if 0.0 < share < HIGHEST_SHARE else {}, share
 
 
 def _reference(scheme: Scheme, span: Span) -> Recording:
     return read_recording(scheme.part.references[span.dataset, span.recording])
 
 
-def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
-    """Errors of a network by the length of its window: how far it has come so long after it started at v = 0, û = u_m.
+def after_start(scheme: Scheme, category: str, test: str) -> dict[str, list[Segments]]:
+    """Segments of a network by the length of its window: how far it has come so long after it started at v = 0, û = u_m.
 
-    All windows end at the same samples. Candidates are called by the length, in samples.
+    All windows end at the same samples. Keys are the lengths, in samples.
     """
     segments: dict[str, list[Segments]] = {}
     spans = scheme.part.split.tests[test]
@@ -97,7 +151,7 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
             not isinstance(estimator, WindowedEstimator)
             or abs(estimator.settings.rate_hz - recordings[0].rate_hz) > 1e-9
         ):
-            return SegmentErrors({}, test)
+            return {}
         for length in WINDOWS:
             parts = [
                 own
@@ -108,7 +162,7 @@ def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
                 segments.setdefault(str(length), []).append(
                     segments_of(parts, recordings[0].rate_hz / STRIDE)
                 )
-    return SegmentErrors(segments, f"{test} after the start", same_models=True)
+    return segments
 
 
 def _with_window(
@@ -136,38 +190,37 @@ def _with_window(
     )
 
 
-def without_biases(
-    scheme: Scheme, categories: Sequence[str], test: str
-) -> tuple[SegmentErrors, dict[str, float]]:
-    """Errors with the measured a_y and with each car's mean bias taken off (Section IX-A), and the biases of both cars [m/s²].
-
-    The mean of v̇ - (a_y - ωu_m) over a car's training set, which takes the reference, is added to its a_y. Nothing is trained again: a
-    network that can hold an offset (with biases, GRU, LSTM) has learnt that of its own car, so that the other's a_y is given the own car's.
-
-    Args:
-        scheme: a comparison whose validation range is a set of the car that ``test`` is of.
-        test: the other car's test set.
-
-    Returns:
-        Candidates ``CATEGORY, as measured`` and ``CATEGORY, corrected``; biases by ``own`` and ``other``.
-    """
+def mean_biases(scheme: Scheme) -> dict[str, float]:
+    """Mean of v̇ - (a_y - ωu_m) over the training set of the ``own`` car and over the validation set, of the ``other`` [m/s²]."""
     part = scheme.part
-    biases = {
+    return {
         "own": mean_bias(recordings_of(part, part.split.train)),
         "other": mean_bias(recordings_of(part, part.split.validation)),
     }
-    segments: dict[str, list[Segments]] = {}
-    for category in categories:
-        for model in scheme.models(category)[:MOST_SEEDS]:
-            segments.setdefault(f"{category}, as measured", []).append(segments_on(model, test))
-            segments.setdefault(f"{category}, corrected", []).append(
-                _corrected(scheme, model, biases, test)
-            )
-    return SegmentErrors(segments, f"{test} with and without biases", same_models=True), biases
+
+
+def without_biases(
+    scheme: Scheme, category: str, biases: Mapping[str, float], test: str
+) -> list[Segments]:
+    """Segments of each seed of a category with the mean bias taken off a_y (Section IX-A), which takes the reference.
+
+    Nothing is trained again: a network that can hold an offset (with biases, GRU, LSTM) has learnt that of its own car, so that
+    the other's a_y is given the own car's.
+
+    Parameters
+    ----------
+    scheme
+        A comparison whose validation range is a set of the car that ``test`` is of.
+    biases
+        As `mean_biases` gives them.
+    test
+        The other car's test set.
+    """
+    return [_corrected(scheme, model, biases, test) for model in scheme.models(category)]
 
 
 def _corrected(
-    scheme: Scheme, model: EvaluatedModel, biases: dict[str, float], test: str
+    scheme: Scheme, model: EvaluatedModel, biases: Mapping[str, float], test: str
 ) -> Segments:
     part = scheme.part
     estimator = load_model(model.model_folder)

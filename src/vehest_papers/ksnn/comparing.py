@@ -1,117 +1,120 @@
-"""Errors of candidates on a test set, resampled together."""
+"""Errors of candidates on a test set by block and seed, all on the same blocks."""
 
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.evaluation.blocks import Segments, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import Scored
-from vehest.report.style import fixed
-from vehest_papers.kit.reading import with_interval
-from vehest_papers.kit.sampled import SampledErrors, resampled
-from vehest_papers.kit.statements import Change, Measured
+from vehest_papers.kit.block_errors import BlockErrors
+from vehest_papers.kit.block_rows import names_of_blocks
+from vehest_papers.kit.verdict_table import figure_in_words
+from vehest_papers.kit.verdicts import Figure, value_of
 
-N_RESAMPLES = 2000
 METRICS = ("fvu", "rmse_vy", "rmse_sideslip")
+MISSING_FIGURE = Figure(math.nan, math.nan, math.nan)
 
 
-class SegmentErrors(SampledErrors):
-    """Candidates on one test set, all on the same blocks and resamples.
+class SegmentErrors:
+    """Candidates on one test set.
 
-    Args:
-        segments: candidate -> sums over short segments of each of its seeds, all over the same samples; candidates with an error that is
-            not finite are left out.
-        name: of the test set; the resamples of tests of different names are independent.
-        same_models: whether candidates are the same networks, in the same order, under other conditions: their seeds are drawn together.
+    Parameters
+    ----------
+    segments
+        Candidate -> sums over short segments of each of its seeds, all over the same samples.
+    labels
+        Number of each segment's block, (K,); left out: the longest blocks that any seed's errors ask for.
+    seeds
+        Candidate -> its seeds, by which rows of blocks.csv are called; left out: counted.
+    recordings
+        Name of the recording of each piece; left out: numbers.
     """
 
     def __init__(
-        self, segments: Mapping[str, Sequence[Segments]], name: str, *, same_models: bool = False
+        self,
+        segments: Mapping[str, Sequence[Segments]],
+        labels: NDArray[np.int64] | None = None,
+        seeds: Mapping[str, Sequence[int]] | None = None,
+        recordings: Sequence[str] | None = None,
     ) -> None:
-        sums = ("squared_error_vy", "squared_error_sideslip")
-        finite = {
-            own: all(math.isfinite(getattr(part, name).sum()) for part in parts for name in sums)
-            for own, parts in segments.items()
-        }
-        self.segments = {own: parts for own, parts in segments.items() if parts and finite[own]}
-        super().__init__(self.segments, paired=same_models)
-        self.measured: dict[tuple[str, str], Measured] = {}
-        self.n_blocks = 0
-        if self.segments:
-            self._resample(name)
+        self.segments = {name: parts for name, parts in segments.items() if parts}
+        self.seeds = seeds or {name: range(len(parts)) for name, parts in self.segments.items()}
+        every = [part for parts in self.segments.values() for part in parts]
+        self.labels = common_labels(every) if labels is None and every else labels
+        self.names: list[str] = []
+        if self.labels is not None and every:
+            pieces = every[0].piece.astype(int).tolist()
+            names = [str(piece) if recordings is None else recordings[piece] for piece in pieces]
+            self.names = names_of_blocks(self.labels, names, every[0].start)
 
-    def _resample(self, name: str) -> None:
-        first = next(iter(self.segments.values()))[0]
-        counted = np.maximum(first.samples, 1.0)
-        labels = block_labels(
-            first,
-            np.stack(
-                [
-                    part.squared_error_vy / counted
-                    for parts in self.segments.values()
-                    for part in parts
-                ]
-            ),
+    def __contains__(self, candidate: object) -> bool:
+        """Whether it is there and all of its errors are finite."""
+        return candidate in self.segments and all(
+            math.isfinite(part.squared_error_vy.sum() + part.squared_error_sideslip.sum())
+            for part in self.segments[str(candidate)]
         )
-        sizes = block_sums(first.samples, labels)
-        self.n_blocks = len(sizes)
-        generator = np.random.default_rng(zlib.crc32(name.encode()))
-        of_seeds = int(generator.integers(2**31))
-        counts = resampled(self.n_blocks, N_RESAMPLES if self.n_blocks > 1 else 0, generator)
-        total = np.maximum(counts @ sizes, 1.0)
-        moving = np.maximum(counts @ block_sums(first.sideslip_samples, labels), 1.0)
-        mean, square = (
-            counts @ block_sums(getattr(first, own), labels) / total
-            for own in ("vy_ref", "squared_vy_ref")
-        )
-        variance = square - np.square(mean)
-        for candidate, parts in self.segments.items():
-            vy, error, sideslip = (
-                counts
-                @ block_sums(np.stack([getattr(part, own) for part in parts]), labels).T
-                / number[:, None]
-                for own, number in (
-                    ("squared_error_vy", total),
-                    ("error_vy", total),
-                    ("squared_error_sideslip", moving),
-                )
-            )
-            fvu = (vy - np.square(error)) / np.maximum(variance, 1e-12)[:, None]
-            for metric, values in zip(METRICS, (fvu, vy, sideslip), strict=True):
-                drawing = np.random.default_rng(of_seeds) if self.paired else generator
-                self.measured[candidate, metric] = self.figure(
-                    values, len(sizes), drawing, root=metric != "fvu"
-                )
 
-    def get(self, candidate: str, metric: str) -> Measured | None:
-        """A figure; none where the candidate is not there."""
-        return self.measured.get((candidate, metric))
+    def block_errors(self, candidate: str, metric: str) -> BlockErrors:
+        """Errors by seed and block, as blocks.csv has them.
 
-    def change(self, first: str, second: str, metric: str) -> Change | None:
-        """From the second to the first; none where either is not there."""
-        own = self.get(first, metric)
-        other = self.get(second, metric)
-        return Change.of(own, other) if own is not None and other is not None else None
+        Parameters
+        ----------
+        metric
+            ``fvu``, ``rmse_sideslip``, or one that begins with ``rmse_vy``.
+        """
+        assert self.labels is not None
+        labels = self.labels
+        parts = self.segments[candidate]
+
+        def summed(name: str) -> FloatArray:
+            return block_sums(np.stack([getattr(part, name) for part in parts]), labels)
+
+        samples = summed("samples")[0]
+        if metric == "rmse_sideslip":
+            sums, sizes = summed("squared_error_sideslip"), summed("sideslip_samples")[0]
+        elif metric == "fvu":
+            sums = _about_mean(summed("squared_error_vy"), summed("error_vy"), samples)
+            sizes = _about_mean(summed("squared_vy_ref"), summed("vy_ref"), samples)[0]
+        else:
+            sums, sizes = summed("squared_error_vy"), samples
+        seeds = tuple(str(seed) for seed in self.seeds[candidate])
+        return BlockErrors(seeds, tuple(self.names), sums, sizes)
+
+    def figure(self, candidate: str, metric: str) -> Figure:
+        """An error over all seeds with its 95 % interval; NaN where the candidate is not there or not finite."""
+        if candidate not in self:
+            return MISSING_FIGURE
+        return value_of(self.block_errors(candidate, metric), metric)[1]
 
     def value(self, candidate: str, metric: str) -> float:
-        """A figure alone; NaN where the candidate is not there."""
-        own = self.get(candidate, metric)
-        return own.value if own is not None else math.nan
+        """An error alone."""
+        return self.figure(candidate, metric).value
 
     def in_words(self, candidate: str, metric: str) -> str:
-        """A figure with its interval: ``0.132 [0.110, 0.158]``."""
-        own = self.get(candidate, metric)
-        if own is None:
-            return "–"
-        low, high = own.interval
-        return with_interval(own.value, low, high, 3) if math.isfinite(low) else fixed(own.value, 3)
+        """An error with its interval: ``0.132 [0.110, 0.158]``."""
+        return figure_in_words(self.figure(candidate, metric))
+
+
+def common_labels(every: Sequence[Segments]) -> NDArray[np.int64]:
+    """Number of each segment's block, (K,): the longest blocks that the finite errors of any of them ask for."""
+    counted = np.maximum(every[0].samples, 1.0)
+    losses = np.stack([part.squared_error_vy / counted for part in every])
+    finite = losses[np.isfinite(losses).all(axis=1)]
+    return block_labels(every[0], finite if len(finite) else np.zeros_like(losses[:1]))
+
+
+def _about_mean(squares: FloatArray, sums: FloatArray, samples: FloatArray) -> FloatArray:
+    """Sums of squares about the mean over all blocks, (S, B)."""
+    mean = sums.sum(axis=1, keepdims=True) / samples.sum()
+    about: FloatArray = np.maximum(squares - 2.0 * mean * sums + mean**2 * samples, 0.0)
+    return about
 
 
 def masked_segments(

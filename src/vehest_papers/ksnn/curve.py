@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +61,7 @@ def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
                     )
     lines = {category_of(*name): name for name in sorted(structures)}
     errors = {
-        word: SegmentErrors(own, f"{getattr(whole, word)} by minutes")
+        word: SegmentErrors(own, whole.labels.get(getattr(whole, word)))
         for word, own in segments.items()
     }
     return Curve(errors, [*amounts, everything], lines)
@@ -100,13 +101,13 @@ def curve_figure(curve: Curve) -> Figure:
                 points = [
                     (float(minutes), own)
                     for minutes in curve.minutes
-                    if (own := errors.get(f"{category}@{minutes}", "fvu")) is not None
+                    if math.isfinite((own := errors.figure(f"{category}@{minutes}", "fvu")).value)
                 ]
                 if not points or category in (paper.ZERO, paper.KINEMATIC):
                     continue
                 line = line_of(*name) if category != paper.STATIC_MAP else MAP_LINE
                 values = [own.value for _, own in points]
-                ends = [own.interval for _, own in points]
+                ends = [(own.low, own.high) for _, own in points]
                 bars = np.abs(np.array(ends) - np.array(values)[:, None]).T
                 looks: dict[str, Any] = {
                     "color": line.colour,

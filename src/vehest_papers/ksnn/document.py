@@ -1,7 +1,8 @@
-"""The report: what came of every statement of the paper on the first page, what it rests on, then everything else in appendices."""
+"""The report: what came of the paper's claims on the first page, then everything else in appendices."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import pandas as pd
@@ -11,18 +12,29 @@ from vehest.report.document import PATENT_NOTE, REPORT, Block, Document, Table, 
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.kit import methods
-from vehest_papers.kit.claims import Claim, claims_table
+from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
+from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.statements import Statement, decided
-from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables
-from vehest_papers.ksnn.causes import CAUSES, causes_table, headline
+from vehest_papers.kit.verdict_table import claims_table
+from vehest_papers.ksnn import (
+    analyses,
+    behaviour_tables,
+    block_errors,
+    cost,
+    paper,
+    scatter,
+    tables,
+)
+from vehest_papers.ksnn.behaviour import Behaviour
+from vehest_papers.ksnn.causes import CAUSES, causes_table
 from vehest_papers.ksnn.curve import Curve, curve_figure, curve_of, curve_table
-from vehest_papers.ksnn.schemes import SET_TITLES, Scheme
+from vehest_papers.ksnn.schemes import SET_TITLES, Scheme, with_common_blocks
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
 """Part -> the paper's table, test set of the car that is learnt on, test set of the other."""
 OTHER_CARS = ("devbot_ferrari", "ferrari_devbot")
 SMALL = ("f1tenth", "dart", "roboracer")
+WINDOW = 30  # steps of a network for an estimate
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -38,7 +50,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             raise DataError(
                 f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2"
             )
-    parts = {name: scheme_of(artefacts, name) for name in artefacts.parts}
+    parts = with_common_blocks({name: scheme_of(artefacts, name) for name in artefacts.parts})
     schemes = [parts[name] for name in SCHEMES]
     ablations = {
         cause: own
@@ -49,7 +61,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")}
     )
     pairs = _pairs(parts)
-    entries, found = _entries(schemes, parts, curve, pairs)
+    behaviours = {scheme.name: Behaviour.of(scheme) for scheme in schemes}
+    claimed = claims_of("ksnn")
+    rows = block_errors.error_rows(claimed, parts, behaviours)
+    rows += block_errors.measured_rows(claimed, parts)
+    trained = block_errors.training_rows(claimed, parts)
+    kinds = {re.sub(r"_[a-z]$", "", name): own.kind for name, own in parts.items()}
     figure_6 = (
         f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
         f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
@@ -61,8 +78,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     )
     blocks: list[Block] = [
         *_asked(artefacts),
-        headline(schemes, ablations),
-        claims_table(decided(entries), _note(schemes)),
+        claims_table(claimed, rows, trained, kinds),
         "## On the own car, on the other and on a third",
         scatter.two_tests(schemes, figure_6),
         tables.across_cars(schemes, "overview", overview, without=(paper.KINEMATIC,)),
@@ -71,13 +87,14 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks += ["## Which difference between the cars matters", causes_table(schemes, ablations)]
     if curve is not None:
         blocks += ["## With fewer minutes", curve_figure(curve)]
-    blocks += _appendices(artefacts, parts, schemes, curve, found)
+    blocks += _appendices(artefacts, parts, schemes, curve, behaviours)
     data = {
         f"candidates_{name}": tables.candidates(
             parts[name].runs, list(parts[name].part.split.tests)
         )
         for name in SCHEMES
     }
+    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     if pairs:
         data["small_cars_all"] = tables.across_cars(pairs, "small_cars_all", "").frame
     return {REPORT: Document(artefacts.title, blocks, data)}
@@ -107,51 +124,6 @@ def _pairs(parts: Mapping[str, Scheme]) -> list[Scheme]:
     return [own for name, own in parts.items() if set(name.split("_")) <= set(SMALL)]
 
 
-def _entries(
-    schemes: Sequence[Scheme],
-    parts: Mapping[str, Scheme],
-    curve: Curve | None,
-    pairs: Sequence[Scheme],
-) -> tuple[list[Statement | Claim], list[Table]]:
-    """All statements in the paper's order, and the tables behind those on how estimators behave."""
-    low, low_table = claims_of_models.at_low_yaw_rates(schemes)
-    converged, start_table = claims_of_models.on_convergence(schemes)
-    biases, bias_table = claims_of_models.on_biases(schemes)
-    parameters, parameter_table = claims_of_models.on_parameters(schemes)
-    window = 30
-    costs = cost.cost_rows(schemes[0], (paper.ZERO, paper.STATIC_MAP, *paper.CATEGORIES), window)
-    steering = [
-        (parts[f"steering_{number}"], parts[f"no_steering_{number}"])
-        for number in "12"
-        if f"steering_{number}" in parts and f"no_steering_{number}" in parts
-    ]
-    entries: list[Statement | Claim] = [
-        *claims.on_accuracy(schemes),
-        *claims.on_sideslip(parts.get("ferrari_drive")),
-    ]
-    entries += [
-        claims_of_models.on_noise(schemes),
-        *claims_of_models.on_spectra(schemes),
-        claims_of_models.on_cost(costs, schemes[0].kind),
-    ]
-    if "one_vehicle" in parts:
-        entries += claims.on_regularisation(parts["scheme_2"], parts["one_vehicle"])
-    entries.append(claims_of_models.tuned(schemes))
-    for word, errors in curve.errors.items() if curve is not None else ():
-        assert curve is not None
-        entries.append(claims.on_minutes(errors, curve.minutes[0], schemes[-1], f"{word} car"))
-    entries += [low, *claims.on_steering(steering), converged, biases, *parameters]
-    entries.append(claims.on_pairs(pairs))
-    made = [
-        low_table,
-        start_table,
-        bias_table,
-        parameter_table,
-        cost.cost_table(costs, window) if len(costs) else None,
-    ]
-    return entries, [table for table in made if table is not None]
-
-
 def _asked(artefacts: StudyArtefacts) -> list[Block]:
     kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
     schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
@@ -167,23 +139,15 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
     return [f"{words}{methods.absent_parts(artefacts)} {artefacts.about}".strip()]
 
 
-def _note(schemes: Sequence[Scheme]) -> str:
-    seeds = max(len(scheme.models(category)) for scheme in schemes for category in scheme.chosen)
-    return (
-        f"Changes are relative, from the second to the first. Of each category the structure that validation chooses, over all its seeds "
-        f"(up to {seeds}); S1, S2: schemes. Own car: learnt on; other: stopped on."
-    )
-
-
 def _appendices(
     artefacts: StudyArtefacts,
     parts: Mapping[str, Scheme],
     schemes: Sequence[Scheme],
     curve: Curve | None,
-    found: Sequence[Table],
+    behaviours: Mapping[str, Behaviour],
 ) -> list[Block]:
     runs = {name: own.runs for name, own in parts.items()}
-    blocks: list[Block] = ["## Appendix: statements on how estimators behave", *found]
+    blocks: list[Block] = ["## Appendix: how estimators behave", *_behaviour(schemes, behaviours)]
     if curve is not None:
         blocks.append(curve_table(curve))
     blocks += ["## Appendix: the paper's tables"]
@@ -235,6 +199,19 @@ def _appendices(
     return blocks
 
 
+def _behaviour(schemes: Sequence[Scheme], behaviours: Mapping[str, Behaviour]) -> list[Table]:
+    """Low yaw rates, starts, biases, learnt parameters and cost."""
+    costs = cost.cost_rows(schemes[0], (paper.ZERO, paper.STATIC_MAP, *paper.CATEGORIES), WINDOW)
+    tables_of = (
+        behaviour_tables.low_yaw_rate_table(schemes, behaviours),
+        behaviour_tables.after_start_table(schemes, behaviours),
+        behaviour_tables.biases_table(schemes, behaviours),
+        behaviour_tables.parameters_table(schemes),
+        cost.cost_table(costs, WINDOW) if len(costs) else None,
+    )
+    return [table for table in tables_of if table is not None]
+
+
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     fits = sum(len(part.models) for part in artefacts.parts.values())
     lines = [
@@ -246,8 +223,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "
         "is of the other car. Test data choose nothing.",
         _averaging(artefacts),
-        "Intervals: paired block bootstrap over stretches of the drives and over seeds, on a logarithmic axis; Holm's correction within "
-        "each statement. Spectra: segments of 25.6 s in the place of blocks.",
+        "Intervals are over blocks of the drives and seeds, as `docs/scorecard.md` describes; spectra have segments of 25.6 s as blocks.",
         *methods.facts_of(artefacts.parts.values()),
     ]
     caption = "What was used for what (the first two rows are Table II of the paper)."

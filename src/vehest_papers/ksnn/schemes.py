@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from vehest.data.splits import Span
 from vehest.evaluation.blocks import Segments, read_segments
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import by_name
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.statements import Change, Measured
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
-from vehest_papers.ksnn.comparing import SegmentErrors
+from vehest_papers.ksnn.comparing import SegmentErrors, common_labels
 from vehest_papers.ksnn.paper import Published
 
+CANDIDATES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP}  # name in blocks.csv -> category
+STEERING = ("GRU with steering angle", "GRU without steering angle")  # each in parts of its own
 THIRD = "j1"  # test set of a car that no network learns or stops on, where there is one
 SET_TITLES = {"c2": "C-2", "f2": "F-2", THIRD: "third car"}
 
 
-@lru_cache(maxsize=600)
+@lru_cache(maxsize=2000)
 def _read(path: Path) -> dict[str, Segments]:
     return read_segments(path)
 
@@ -46,6 +50,9 @@ class Scheme:
     published: Mapping[str, Published] = field(
         default_factory=dict
     )  # the paper's table of this scheme; empty where it has none
+    labels: Mapping[str, NDArray[np.int64]] = field(
+        default_factory=dict
+    )  # test set -> block of each segment; empty: by the errors of this part alone
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -64,14 +71,28 @@ class Scheme:
 
     def models(self, category: str) -> list[EvaluatedModel]:
         """All seeds of the structure that validation chooses of a category; none where it is not there."""
-        run = self.chosen.get(category)
-        if run is None:
-            return []
-        return [
-            model
-            for model in self.part.models
-            if (model.estimator, model.variant) == (run["estimator"], run["variant"])
-        ]
+        return self.models_of(self.name_of(category))
+
+    def models_of(self, name: str) -> list[EvaluatedModel]:
+        """All seeds of a structure, named as `name_of` names them."""
+        return [model for model in self.part.models if "/".join(model.name) == name]
+
+    def key_of(self, candidate: str) -> str:
+        """Name in `errors` of a candidate of claims.yaml; empty where it is not there.
+
+        A category stands for the structure that validation chooses, ``CATEGORY, STRUCTURE`` for that structure.
+        """
+        if candidate in CANDIDATES:
+            return self.name_of(CANDIDATES[candidate])
+        if candidate in STEERING:
+            names = dict.fromkeys("/".join(model.name) for model in self.part.models)
+            return next((name for name in names if name.startswith("velocity_gru/")), "")
+        if candidate in self.chosen:
+            return self.name_of(candidate)
+        for run in self.runs.to_dict("records"):
+            if candidate == f"{run['category']}, {run['structure']}":
+                return f"{run['estimator']}/{run['variant']}"
+        return ""
 
     def model(self, category: str) -> EvaluatedModel | None:
         """The model of the run that validation chooses."""
@@ -93,30 +114,25 @@ class Scheme:
         """Of all structures on a test set, named as `name_of` names them."""
         if test not in self._errors:
             groups = by_name(self.part.models)
-            segments = {
-                "/".join(name): [segments_on(model, test) for model in models]
-                for name, models in groups.items()
-            }
-            self._errors[test] = SegmentErrors(segments, test)
+            recordings = [span.recording for span in self.part.split.tests[test]]
+            self._errors[test] = SegmentErrors(
+                {
+                    "/".join(name): [segments_on(model, test) for model in models]
+                    for name, models in groups.items()
+                },
+                self.labels.get(test),
+                {
+                    "/".join(name): [model.seed for model in models]
+                    for name, models in groups.items()
+                },
+                recordings,
+            )
         return self._errors[test]
 
     def name_of(self, category: str) -> str:
         """Name in `errors` of the structure that validation chooses of a category."""
         run = self.chosen.get(category)
         return "" if run is None else f"{run['estimator']}/{run['variant']}"
-
-    def measured(self, category: str, test: str, metric: str) -> Measured | None:
-        """A figure over all seeds of the structure that validation chooses."""
-        return self.errors(test).get(self.name_of(category), metric)
-
-    def change(self, first: str, second: str, test: str, metric: str) -> Change | None:
-        """From one category to another on a test set."""
-        return self.errors(test).change(self.name_of(first), self.name_of(second), metric)
-
-    def other_over_own(self, name: str) -> Change | None:
-        """How many times a structure's FVU on the own car is left on the other one."""
-        other, own = (self.errors(test).get(name, "fvu") for test in (self.other, self.own))
-        return Change.of(other, own) if other is not None and own is not None else None
 
     def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:
         """Name in `errors` -> category, of all structures of these categories."""
@@ -128,3 +144,23 @@ class Scheme:
             f"{row['estimator']}/{row['variant']}": str(row["category"])
             for row in rows.to_dict("records")
         }
+
+
+def with_common_blocks(schemes: Mapping[str, Scheme]) -> dict[str, Scheme]:
+    """The same parts, those that share a test range on the same blocks, so that candidates of two parts can be compared."""
+    groups: dict[tuple[Span, ...], list[tuple[str, str]]] = {}
+    for name, scheme in schemes.items():
+        for test, spans in scheme.part.split.tests.items():
+            groups.setdefault(tuple(spans), []).append((name, test))
+    labels: dict[str, dict[str, NDArray[np.int64]]] = {name: {} for name in schemes}
+    for members in groups.values():
+        of_group = common_labels(
+            [
+                segments_on(model, test)
+                for name, test in members
+                for model in schemes[name].part.models
+            ]
+        )
+        for name, test in members:
+            labels[name][test] = of_group
+    return {name: replace(scheme, labels=labels[name]) for name, scheme in schemes.items()}

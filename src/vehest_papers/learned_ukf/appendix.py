@@ -1,9 +1,10 @@
-"""The appendices: orders, errors by state, consistency, slip angles, budgets, trials, departures, and what was used for what."""
+"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the ranges of the recordings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import pandas as pd
 
@@ -14,43 +15,20 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
-from vehest_papers.learned_ukf.candidates import SETS
-from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.errors import Losses
+from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.filtering import loaded
-from vehest_papers.learned_ukf.order import differences, order_in_words, pairs_table
 from vehest_papers.learned_ukf.trials import trials_table
 
 
 def appendix_of_part(
-    title: str,
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    errors: Mapping[str, Losses],
     where: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Orders of all pairs, errors by state, consistency, slip angles and budgets of a main part."""
+    """Errors by state, consistency, slip angles and budgets of the main part."""
     kind = words_of_kinds(part).upper()
-    blocks: list[Block] = [f"## Appendix: the paper's order\n\n{title}, {kind}."]
-    for test, tyre in SETS.items():
-        published = {candidate: own.mse for candidate, own in paper.TABLES[test].items()}
-        pairs = differences(
-            errors[test].squared, errors[test].sequence, published, part.protocol.rate_hz
-        )
-        data[f"pairs_{test}_{name}"] = pairs
-        if pairs.empty:
-            continue
-        blocks += [
-            order_in_words(pairs, tables.medians(runs, f"mse_weighted.{test}"), f"on {tyre}"),
-            pairs_table(
-                pairs[pairs["neighbours"]],
-                f"neighbours_{test}_{name}",
-                f"Differences of MSE (weighted) between neighbours in the paper's order, {tyre}; negative where the paper's order holds. "
-                f"All pairs: [CSV](tables/pairs_{test}_{name}.csv). Data: {kind}.",
-            ),
-        ]
     state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
         f"Consistency of the filters: normalised estimation errors squared over vx, vy and yaw rate (NEES) and normalised innovations "
@@ -62,8 +40,7 @@ def appendix_of_part(
         f"training. Data: {kind}."
     )
     return [
-        *blocks,
-        "## Appendix: errors by state, and whether filters know them",
+        "## Appendix: errors by state, and consistency of the filters",
         tables.by_state(runs, list(SETS), f"by_state_{name}", state),
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
         *_slips(part, name, where, data),
@@ -77,7 +54,7 @@ def how_it_was_made(
     main: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
+    """Trials, the protocol, and the ranges of the recordings with their minutes."""
     first = next(iter(main.values()))
     trained = {model.estimator for part in artefacts.parts.values() for model in part.models}
     data["training_settings"] = settings_table(main)
@@ -87,12 +64,8 @@ def how_it_was_made(
         "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
         "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
-        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing but the "
-        "oracle, which learns from them.",
-        "Intervals: block bootstrap over whole sequences and over seeds, paired by sequence, 95 % by Student's t.",
-        _authors_code(),
+        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing.",
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
-        "Every setting of every training: [CSV](tables/training_settings.csv).",
     ]
     blocks: list[Block] = []
     if artefacts.trials:
@@ -103,19 +76,26 @@ def how_it_was_made(
         *blocks,
         methods.how_it_was_made(lines),
         _ranges(artefacts, main),
-        methods.bullets("## Appendix: what departs from the paper", departures(main)),
     ]
 
 
-def _authors_code() -> str:
-    """How the authors' code was measured, on the files that it was run on."""
-    values = " and ".join(
-        f"{fixed(value, 4)} on {SETS[test]}" for test, value in paper.AUTHORS_CODE.items()
-    )
-    return (
-        f"Beside this study stands the authors' public code, run once on the same split: {paper.NNTF_UH}, 1000 epochs one-step and 1000 "
-        f"through the filter, one seed, on a CPU, gave {values}. No interval, so no comparison is made."
-    )
+def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
+    """One row a part, candidate and setting of its training."""
+    rows = [
+        {"part": name, "candidate": candidate, "setting": key, "value": value}
+        for name, part in parts.items()
+        for candidate, models in models_by_candidate(part).items()
+        for key, value in _flat(models[0].training)
+    ]
+    return pd.DataFrame(rows, columns=["part", "candidate", "setting", "value"])
+
+
+def _flat(settings: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{head}{key}.")
+        else:
+            yield f"{head}{key}", value
 
 
 def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Table:

@@ -16,15 +16,17 @@ from vehest.data.store import read_recording
 from vehest.evaluation.metrics import WEIGHTS, Scored, pieces_of, weighted_errors
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
+from vehest_papers.kit.block_errors import blocks_of
 from vehest_papers.kit.block_rows import (
     BASELINE_NAMES,
     BlockRow,
     TrainingRow,
     block_rows,
     checked_training,
+    seed_rows,
 )
 from vehest_papers.kit.reading import metric_values
-from vehest_papers.learned_ukf import paper
+from vehest_papers.learned_ukf import measures, paper
 from vehest_papers.learned_ukf.candidates import models_by_candidate, scored_of
 from vehest_papers.learned_ukf.filtering import MOVING
 from vehest_papers.learned_ukf.prediction import AFTER, BEFORE, Compared
@@ -73,9 +75,9 @@ def losses_of(scored: Scored) -> Iterator[tuple[str, float, int]]:
 
 
 def sequence_names(part: PartArtefacts, test: str) -> list[str]:
-    """Name of each sequence of a test set: its recording and when it begins."""
+    """Name of each sequence of a test set, or of the validation: its recording and when it begins."""
     pieces = pieces_of(
-        part.split.tests[test],
+        part.split.validation if test == VALIDATION else part.split.tests[test],
         lambda span: read_recording(part.references[span.dataset, span.recording]),
         part.protocol,
     )
@@ -157,11 +159,42 @@ def measured_rows(
     names = sequence_names(part, test)
     rows = []
     for (claim, candidate), values in measured.items():
-        for seed, of_seed in zip(seeds, values, strict=True):
-            rows += block_rows(
-                BlockRow(name, candidate, seed, test, claim, "", 0.0, 0), names, of_seed, 1
-            )
+        head = BlockRow(name, candidate, 0, test, claim, "", 0.0, 0)
+        rows += seed_rows(head, seeds, names, values)
     return rows
+
+
+def scratch_rows(name: str, part: PartArtefacts, main: PartArtefacts) -> list[BlockRow]:
+    """Validation losses of trainings from scratch over the highest of the pre-trained ones, by validation sequence."""
+    (candidate,) = models_by_candidate(part)
+    pre_trained = models_by_candidate(main).get(paper.NNTF_UH)
+    if pre_trained is None:
+        return []
+    scratch, others = (
+        np.array(
+            [
+                [
+                    weighted_errors(piece, np.square).mean()
+                    for piece in scored_of(of, model, VALIDATION)
+                ]
+                for model in models
+            ]
+        )
+        for of, models in ((part, part.models), (main, pre_trained))
+    )
+    values = measures.validation_over_worst_pre_trained(scratch, others)
+    measured = {("from_scratch_in_local_minima", candidate): values}
+    seeds = [model.seed for model in part.models]
+    return measured_rows(name, part, VALIDATION, measured, seeds)
+
+
+def rise_rows(name: str, part: PartArtefacts, rows: Sequence[BlockRow]) -> list[BlockRow]:
+    """Rise of the MSE of NNTF_UH on the unseen tyre over that of the others, where all are trained."""
+    values = measures.rise_over_least_rise_of_others(blocks_of(rows), name)
+    if values is None:
+        return []
+    measured = {("nntf_uh_loses_least_on_unseen_tyre", paper.NNTF_UH): values}
+    return measured_rows(name, part, "tyre_d", measured, range(len(values)))
 
 
 def training_rows(parts: Mapping[str, PartArtefacts], main: str) -> list[TrainingRow]:

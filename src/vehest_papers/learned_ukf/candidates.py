@@ -19,14 +19,11 @@ from vehest.evaluation.metrics import (
     accuracy,
     pieces_of,
     scored_range,
-    weighted_errors,
 )
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, Trial
 from vehest_papers.kit import reading
-from vehest_papers.kit.paired import sequence_labels
 from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
-from vehest_papers.learned_ukf.errors import Losses
 
 SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}  # test set -> tyre
 
@@ -142,20 +139,3 @@ def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> Evaluated
     return models_by_candidate(part)[candidate][
         int(np.argmin(np.where(np.isfinite(own), own, np.inf)))
     ]
-
-
-def losses(part: PartArtefacts, test: str) -> Losses:
-    """Weighted squared and absolute errors of every seed at every scored sample, and the sequence that each sample belongs to."""
-    squared: dict[str, FloatArray] = {}
-    absolute: dict[str, FloatArray] = {}
-    lengths = [0]
-    for candidate, models in models_by_candidate(part).items():
-        scored = [scored_of(part, model, test) for model in models]
-        lengths = [len(piece.vy) for piece in scored[0]]
-        squared[candidate] = np.stack(
-            [np.concatenate([weighted_errors(piece, np.square) for piece in own]) for own in scored]
-        )
-        absolute[candidate] = np.stack(
-            [np.concatenate([weighted_errors(piece, np.abs) for piece in own]) for own in scored]
-        )
-    return Losses(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)

@@ -1,17 +1,20 @@
-"""How much of the errors the filters' own bands hold, with and without a likelihood term in their training."""
+"""How much of the errors the filters' bands cover, with and without a likelihood term in their training."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
-from vehest.evaluation.metrics import COVERAGE, Scored
+from vehest.constants import FloatArray
+from vehest.evaluation.metrics import COVERAGE, Scored, weighted_errors
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest_papers.kit.reading import with_interval
-from vehest_papers.learned_ukf.candidates import SETS, losses, scored_of
+from vehest_papers.kit.block_errors import BlockErrors
+from vehest_papers.kit.verdict_table import figure_in_words
+from vehest_papers.kit.verdicts import Figure, value_of
+from vehest_papers.learned_ukf.candidates import SETS, scored_of
 
 
 def coverage_table(
@@ -24,26 +27,21 @@ def coverage_table(
     rows: list[dict[str, object]] = []
     for test, tyre in SETS.items():
         for words, (part, models) in trained.items():
-            errors = losses(part, test)
-            mse = errors.mean(errors.squared[candidate])
+            scored = [scored_of(part, model, test) for model in models]
             row: dict[str, object] = {
                 "tyre": tyre,
                 "training": words,
-                "mse_words": with_interval(mse.value, max(mse.low, 0.0), mse.high, 4),
+                "mse_words": figure_in_words(
+                    _mean([[weighted_errors(piece, np.square) for piece in own] for own in scored])
+                ),
             }
-            scored = [scored_of(part, model, test) for model in models]
             for sigma, expected in COVERAGE.items():
-                inside = np.stack(
-                    [np.concatenate([_within(piece, sigma) for piece in own]) for own in scored]
-                )
-                share = errors.mean(inside)
+                share = _mean([[_within(piece, sigma) for piece in own] for own in scored])
                 row |= {
                     f"inside_{sigma}": share.value,
-                    f"words_{sigma}": with_interval(
-                        share.value, max(share.low, 0.0), min(share.high, 1.0), 3
-                    ),
+                    f"words_{sigma}": figure_in_words(share),
+                    f"expected_{sigma}": expected,
                 }
-                row[f"expected_{sigma}"] = expected
             row["width"] = float(
                 np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own])
             )
@@ -63,6 +61,14 @@ def coverage_table(
         f"Likelihood: a second term in the loss of the training through the filter, not in the paper. Data: {data}."
     )
     return Table(f"coverage_{name}", caption, pd.DataFrame(rows), columns)
+
+
+def _mean(values: Sequence[Sequence[FloatArray]]) -> Figure:
+    """Mean of values by seed, sequence and sample, with its interval over sequences and seeds."""
+    sums = np.array([[own.sum() for own in seed] for seed in values])
+    sizes = np.array([float(len(own)) for own in values[0]])
+    names = [tuple(str(number) for number in range(count)) for count in sums.shape]
+    return value_of(BlockErrors(names[0], names[1], sums, sizes), "mean")[1]
 
 
 def _variance(piece: Scored) -> np.ndarray:

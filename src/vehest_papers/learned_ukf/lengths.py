@@ -13,10 +13,12 @@ from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
-from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.block_errors import BlockErrors, Key
 from vehest_papers.kit.legends import legend_above
-from vehest_papers.kit.reading import lengths_of, with_interval
-from vehest_papers.learned_ukf.additions import Comparison, Subject
+from vehest_papers.kit.reading import lengths_of
+from vehest_papers.kit.verdict_table import figure_in_words
+from vehest_papers.kit.verdicts import value_of
+from vehest_papers.learned_ukf.block_errors import candidate_name
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 
 _SUBSCRIPT_U = re.compile(r"_uh?(_|$)")
@@ -27,11 +29,13 @@ WAYS = {"batch": "constant batch", "samples": "constant samples a batch"}
 class Length:
     """Trainings on sequences of one length."""
 
+    part: str  # of the pipeline
+    candidate: str
+    n_seeds: int
     steps: int  # samples of a sequence
     batch: int  # sequences in a batch
     epochs: int  # through the filter
     sequences: int  # that an epoch goes through
-    subject: Subject  # the candidate, with its losses
 
     @property
     def batches(self) -> int:
@@ -52,10 +56,17 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
         steps = int(training["steps"])
         batch = int(training["batch_size"])
         candidate = next(iter(models_by_candidate(part)))
-        subject = Subject.of(part, candidate, f"{candidate}, {batch} × {steps} samples")
         sequences = sum(length // steps for length in lengths_of(part, part.split.train))
         found.append(
-            Length(steps, batch, int(training["through"]["max_epochs"]), sequences, subject)
+            Length(
+                name,
+                candidate,
+                len(part.models),
+                steps,
+                batch,
+                int(training["through"]["max_epochs"]),
+                sequences,
+            )
         )
     return sorted(found, key=lambda own: (own.steps, own.batch))
 
@@ -68,7 +79,9 @@ def of_way(found: Sequence[Length], way: str) -> list[Length]:
     return [own for own in found if own.steps * own.batch == longest.steps * longest.batch]
 
 
-def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
+def figure_7(
+    found: Sequence[Length], blocks: Mapping[Key, BlockErrors], data: str
+) -> tuple[Figure, Table]:
     """The figure and its table, with 95 % intervals over sequences and seeds."""
     rows = []
     for way, words in WAYS.items():
@@ -84,10 +97,11 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
                 "batches": own.batches,
                 "in_a_row": own.batches * own.steps,
             }
-            for test, errors in own.subject.errors.items():
-                mse = errors.mean(own.subject.squared(test))
+            name = candidate_name(own.part, own.candidate)
+            for test in SETS:
+                _, mse = value_of(blocks[Key(own.part, name, test, "mse_weighted")], "mse_weighted")
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
-                row[f"words.{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
+                row[f"words.{test}"] = figure_in_words(mse)
             rows.append(row)
     frame = pd.DataFrame(rows)
     tests = list(SETS)
@@ -120,9 +134,9 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
             axes.set_ylim(bottom=0.0)
         grid[0].set_ylabel("MSE (weighted)")
         legend_above(figure, grid[0])
-    seeds = sorted({len(own.subject.seeds) for own in found})
+    seeds = sorted({own.n_seeds for own in found})
     caption = (
-        f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].subject.candidate}, "
+        f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].candidate}, "
         f"{listed([str(own) for own in seeds])} seeds, {found[0].epochs} epochs through the filter. An epoch goes once through the drives, "
         f"so a smaller batch takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
@@ -142,37 +156,4 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     columns |= {f"words.{test}": Column(f"MSE (weighted), {SETS[test]}") for test in tests}
     return Figure("figure_7", caption, figure), Table(
         "sequence_length", "What Figure 7 draws.", frame, columns
-    )
-
-
-def length_comparisons(found: Sequence[Length]) -> list[Comparison]:
-    """The longest sequences against the shortest ones, either way."""
-    comparisons = []
-    for way, words in WAYS.items():
-        own = of_way(found, way)
-        if len(own) > 1:
-            short = own[0]
-            long = own[-1]
-            claim = f"sequences of {long.steps} samples below {short.steps}, {words}"
-            comparisons.append(
-                Comparison(long.subject, short.subject, claim, "Figure 7: longer is better")
-            )
-    return comparisons
-
-
-def epoch_claim(found: Sequence[Length]) -> Claim:
-    """That longer sequences take longer an epoch, as far as it can be counted: times are in no published file."""
-    counts = []
-    for way, words in WAYS.items():
-        own = of_way(found, way)
-        counts.append(f"{', '.join(str(one.batches * one.steps) for one in own)} at {words}")
-    steps = ", ".join(str(one.steps) for one in of_way(found, "batch"))
-    ours = f"of {steps} samples: filter steps one after another, an epoch {'; '.join(counts)}"
-    return Claim(
-        "longer training sequences take longer an epoch",
-        "Figure 7",
-        ours,
-        "none",
-        "not testable on this data",
-        "times are not published",
     )

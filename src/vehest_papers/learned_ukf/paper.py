@@ -23,7 +23,6 @@ LSTM = "LSTM"
 ZERO = "zero"
 STATIC_MAP = "static map"
 DATA_SHEET = "data sheet"
-ORACLE = "oracle"
 BASELINES = (ZERO, STATIC_MAP, DATA_SHEET)
 
 CANDIDATES = (

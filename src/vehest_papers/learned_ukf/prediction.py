@@ -11,7 +11,6 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
-from vehest.evaluation.significance import Interval, difference_of_blocks
 from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.through_filter import Drive
@@ -44,26 +43,6 @@ class Compared:
     swaps: Mapping[
         tuple[int, int], FloatArray
     ]  # (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF
-
-    def states(
-        self, task: str, lower: Mapping[str, bool]
-    ) -> dict[str, tuple[Interval, float, bool]]:
-        """State -> difference NNTF_U - NNTF of mean squares, the error of NNTF, and whether the paper has it lower."""
-        before, after = getattr(self, task)
-        found = {}
-        for state, expected in lower.items():
-            k = MOVING.index(state)
-            found[state] = (
-                over_sequences(after[..., k], before[..., k]),
-                float(before[..., k].mean()),
-                expected,
-            )
-        return found
-
-
-def over_sequences(first: FloatArray, second: FloatArray) -> Interval:
-    """Difference of means over seeds and sequences of one length, (S, B), both resampled."""
-    return difference_of_blocks(first, second, np.ones(first.shape[1]), n_resamples=4000).mean
 
 
 def compared(

@@ -10,12 +10,14 @@ import pandas as pd
 
 from vehest.evaluation.metrics import COVERAGE
 from vehest.report.document import Column, Table
-from vehest.report.style import fixed
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest_papers.kit.reading import median_and_range, with_interval
+from vehest_papers.kit.block_errors import BlockErrors, Key
+from vehest_papers.kit.reading import median_and_range
+from vehest_papers.kit.verdict_table import figure_in_words
+from vehest_papers.kit.verdicts import value_of
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
-from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.paper import Published
 
 METRICS = {
@@ -28,44 +30,65 @@ METRICS = {
 STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
-def accuracy(errors: Losses, test: str, name: str, caption: str) -> Table:
+def accuracy(
+    blocks: Mapping[Key, BlockErrors], part: str, test: str, name: str, caption: str
+) -> Table:
     """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds."""
     published = paper.TABLES[test]
     rows = []
-    for candidate, squared in errors.squared.items():
-        absolute = errors.absolute[candidate]
-        values = {"mse": errors.mean(squared), "mae": errors.mean(absolute)}
+    for candidate in candidates_in(blocks, part, test):
         row: dict[str, object] = {"candidate": candidate}
-        for short in METRICS:
+        for short, (metric, _) in METRICS.items():
+            errors = blocks[Key(part, candidate, test, metric)]
+            figure = value_of(errors, metric)[1]
             row[f"paper_{short}"] = _figure(published.get(candidate), short)
-        for short, own in values.items():
-            row |= {short: own.value, f"{short}_low": own.low, f"{short}_high": own.high}
-            row[f"ours_{short}"] = with_interval(own.value, max(own.low, 0.0), own.high, 4)
-        row["ours_ae99"] = float(np.percentile(absolute, 99.0, axis=1).mean())
-        rows.append(row | {"n_seeds": len(squared)})
+            row |= {short: figure.value, f"{short}_low": figure.low, f"{short}_high": figure.high}
+            row[f"ours_{short}"] = figure_in_words(figure)
+            row["n_seeds"] = len(errors.seeds)
+        rows.append(row)
     columns = {"candidate": Column("method")}
     for short, (_, header) in METRICS.items():
         columns[f"paper_{short}"] = Column(f"{header}, paper", decimals=4)
-        columns[f"ours_{short}"] = Column(f"{header}, ours", decimals=3)
+        columns[f"ours_{short}"] = Column(f"{header}, ours")
     columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def overview(errors: Mapping[str, Losses], kind: str) -> Table:
-    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, beside the paper's."""
+def candidates_in(blocks: Mapping[Key, BlockErrors], part: str, test: str) -> list[str]:
+    """Candidates with errors on a test set, in the order of Table II."""
+    return [
+        key.candidate
+        for key in blocks
+        if (key.part, key.test_set, key.metric) == (part, test, "mae_weighted")
+    ]
+
+
+def mse_text(blocks: Mapping[Key, BlockErrors], part: str, candidate: str, test: str) -> str:
+    """Weighted MSE with its interval; a dash where the candidate is not trained."""
+    errors = blocks.get(Key(part, candidate, test, "mse_weighted"))
+    return MISSING if errors is None else figure_in_words(value_of(errors, "mse_weighted")[1])
+
+
+def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
+    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, and the paper's."""
     rows = []
-    for candidate in next(iter(errors.values())).squared:
+    for candidate in candidates_in(blocks, part, next(iter(SETS))):
         row: dict[str, object] = {"candidate": candidate}
-        for test, own in errors.items():
-            known = paper.TABLES[test].get(candidate)
-            mse = own.mean(own.squared[candidate])
-            row |= {f"paper_{test}": known.mse if known else math.nan, f"ours_{test}": mse.value}
-            row |= {f"low_{test}": mse.low, f"high_{test}": mse.high}
-            row[f"words_{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
-            row["n_seeds"] = len(own.squared[candidate])
+        for test in SETS:
+            published = paper.TABLES[test].get(candidate)
+            errors = blocks[Key(part, candidate, test, "mse_weighted")]
+            mse = value_of(errors, "mse_weighted")[1]
+            row |= {
+                f"paper_{test}": published.mse if published else math.nan,
+                f"ours_{test}": mse.value,
+                f"low_{test}": mse.low,
+                f"high_{test}": mse.high,
+                f"words_{test}": figure_in_words(mse),
+                "n_seeds": len(errors.seeds),
+            }
         rows.append(row)
     columns = {"candidate": Column("method")}
-    for test in errors:
+    for test in SETS:
         columns[f"paper_{test}"] = Column(
             f"paper, {'tyre A' if test == 'tyre_a' else 'tyre C'}", decimals=4
         )
@@ -73,7 +96,7 @@ def overview(errors: Mapping[str, Losses], kind: str) -> Table:
     columns["n_seeds"] = Column("seeds", decimals=0)
     caption = (
         f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over sequences and seeds. Baselines take vx "
-        f"from the rims and the yaw rate from the gyroscope; {paper.ORACLE}: {paper.NNTF_UH} trained on the test itself."
+        "from the rims and the yaw rate from the gyroscope."
     )
     return Table("overview", caption, pd.DataFrame(rows), columns)
 
@@ -178,14 +201,6 @@ def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> 
         "skipped_steps": Column("skipped steps, all seeds", decimals=0),
     }
     return Table(name, caption, pd.DataFrame(rows), columns)
-
-
-def medians(runs: pd.DataFrame, column: str) -> dict[str, float]:
-    """Candidate -> median over seeds."""
-    return {
-        candidate: float(np.median(of_candidate(runs, candidate, column)))
-        for candidate in dict.fromkeys(runs["candidate"])
-    }
 
 
 def _figure(published: Published | None, short: str) -> float:

@@ -33,7 +33,8 @@ DATASETS = [
     "sim_heavy",
 ]
 CARS = {
-    "bmw_320i_low": "sim_quickstart",
+    "bmw_320i_low": "sim_small",
+    "ferrari_250_lm": "sim_quickstart",
     "f1tenth": "sim_tyre_sets",
     "heavy_truck": "sim_heavy",
     "bmw_545i": "sim_bmw",

@@ -18,6 +18,7 @@ from vehest.alignment.proposals.columns import (
     largest,
     si_factor,
     slow_of,
+    without_axes,
 )
 from vehest.alignment.proposals.fitting import (
     CLEAR,
@@ -57,11 +58,14 @@ STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
 FITTING_SPEED = (0.97, 1.08)
+FITTING_SPEED_ALONE = (0.92, 1.08)  # where d(vy)/dt is not known
 MISREAD = (
     0.9,
     1.35,
 )  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
 WHEELS_AGREE = 0.02
+WORLD_AGREEING = 0.98  # correlation of a velocity with the derivative of a position
+WORLD_CROSSING = 0.05  # of the position's other axis over it, so that the car turned
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
 RATES = (
     5.0,
@@ -82,6 +86,7 @@ RATES = (
 )
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
+COURSE_SPEED = 0.2  # of the top speed, below which a course over positions is noise
 SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 USUAL = {  # 99th percentile of the motion's channels, SI
@@ -95,6 +100,16 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "sideslip_ref": (0.002, 0.8),
 }
 UNCONFIRMED = "no other column agrees with it"
+SINGLE_EVIDENCE = (
+    "one piece of evidence is not enough: neither unit, name nor another column agrees"
+)
+AGREEING = {
+    "vx": {"ax"},
+    "yaw_rate": {"steer", "handwheel", *REFERENCES},
+    "ay": {*REFERENCES},
+}
+"""Channel -> those whose relation confirms it."""
+NEEDS_EVIDENCE = ("vx", "yaw_rate", "ay")  # channels of two pieces of evidence, or none
 BY_NAME_ALONE = (
     "motor_current",
     "brake_pressure_front",
@@ -129,6 +144,10 @@ def propose(
     speeds = [one for one in found if "vx" in one.hints and one.unit and one.measures("vx")]
     stands = bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
     turning = [] if stands else find_turning(found)
+    if not (turning or stands):
+        by_motion = without_axes(found)
+        turning = find_turning(by_motion)
+        found = by_motion if turning else found
     guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
     if guessed is not None:
         return replace(propose(columns, guessed, is_vbo=is_vbo), rate_hz=guessed)
@@ -146,8 +165,9 @@ def propose(
         notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
+    proposals = _world_axis_asked(proposals, found, rate)
     if search is not None:
-        proposals, more = _speedometer(proposals, search.turning, wheels)
+        proposals, more = _speedometer(proposals, search, wheels, found)
         notes += more
     clues = () if known is None else _clues(found, wheels, known, is_vbo)
     proposals = _as_most_count(
@@ -185,29 +205,66 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
     return replace(proposals, channels=tuple(kept), notes=tuple(notes))
 
 
+def _world_axis_asked(
+    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
+) -> Proposals:
+    """The velocities asked where one is the derivative of a position along an axis of the world."""
+    speed = proposals.by_channel.get("vx")
+    positions = [
+        next(one.slow for one in columns if role in one.hints)
+        for role in ("position_x", "position_y")
+        if any(role in one.hints for one in columns)
+    ]
+    if speed is None or speed.asked or len(positions) < 2:
+        return proposals
+    along, across = (np.gradient(samples) for samples in positions)
+    by_name = {one.name: one for one in columns}
+    slow = by_name[speed.column].slow if speed.column in by_name else along
+    crossing = float(np.std(across)) > WORLD_CROSSING * float(np.std(along))
+    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
+    of_path = abs(correlation(slow, np.hypot(along, across)))
+    if not (crossing and of_axis > WORLD_AGREEING and of_axis > of_path):
+        return proposals
+    doubt = "it is the derivative of a position: of an axis of the world, not of the car?"
+    return replace(
+        proposals,
+        channels=tuple(
+            replace(one, asked=one.asked or doubt, is_weak=True)
+            if one.channel in ("vx", "vy_ref")
+            else one
+            for one in proposals.channels
+        ),
+    )
+
+
 def _speedometer(
-    proposals: Proposals, turning: Turning, wheels: Wheels
+    proposals: Proposals, search: Search, wheels: Wheels, columns: Sequence[Candidate]
 ) -> tuple[Proposals, list[str]]:
-    """The speed asked where ay over the yaw rate and the wheels agree that it misreads; a note where ay alone says so."""
+    """The speed asked where ay over the yaw rate and the wheels agree that it misreads.
+
+    A note where ay alone says so: by d(vy)/dt + vx·yaw_rate where a reference gives vy. Without
+    one, d(vy)/dt makes up some per cent, so that only more than these count.
+    """
     own = proposals.by_channel.get("vx")
-    is_right = FITTING_SPEED[0] <= turning.scale <= FITTING_SPEED[1]
-    if (
-        "ay" not in turning.columns
-        or own is None
-        or is_right
-        or not MISREAD[0] < turning.scale < MISREAD[1]
-    ):
+    turning = search.turning
+    if "ay" not in turning.columns or own is None:
+        return proposals, []
+    expected, usual = _expected_ay(proposals, search.known, columns)
+    ay = slow_of(search.known["ay"], search.known.rate_hz)
+    scale = float(np.std(ay) / np.std(expected))
+    agreeing = abs(correlation(ay, expected))
+    if not MISREAD[0] < scale < MISREAD[1] or usual[0] <= scale <= usual[1]:
         return proposals, []
     by_wheels = wheels_over_speed(
         wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx")
     )
     if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
-        excess = _excess(
-            turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation)
-        )  # by regression either way
-        other = "little" if turning.scale < 1.0 else "much, as in a body that rolls"
+        bounds = scale / agreeing, scale * agreeing  # by regression either way
+        if any(usual[0] <= bound <= usual[1] for bound in bounds):
+            return proposals, []
+        other = "little" if scale < 1.0 else "much, as in a body that rolls"
         return proposals, [
-            f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
+            f"'{own.column}' reads {_excess(*bounds)} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"
         ]
     scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
     doubt = (
@@ -218,6 +275,22 @@ def _speedometer(
     return replace(
         proposals, channels=tuple(changed if one is own else one for one in proposals.channels)
     ), []
+
+
+def _expected_ay(
+    proposals: Proposals, known: Motion, columns: Sequence[Candidate]
+) -> tuple[FloatArray, tuple[float, float]]:
+    """ay by the motion, (S,), and the range of ay over it by which the speed is right."""
+    for name in REFERENCES:
+        reference = proposals.by_channel.get(name)
+        if reference is None:
+            continue
+        samples = next(one.values for one in columns if one.name == reference.column)
+        factor = reference.sign * si_factor(reference.unit, name)
+        channels = {**known.channels, name: np.where(known.moving, samples * factor, 0.0)}
+        motion = replace(known, channels=channels, velocity=name)
+        return slow_of(motion.turning + motion.sliding, known.rate_hz), FITTING_SPEED
+    return slow_of(known.turning, known.rate_hz), FITTING_SPEED_ALONE
 
 
 def _excess(*scales: float) -> str:
@@ -309,7 +382,8 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         )
         found |= {one.channel: one for one in made}
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
-    return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
+    proposals = Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
+    return proposals.with_tilt_signs()
 
 
 def _named_channels(
@@ -375,6 +449,7 @@ def _by_name(column: Candidate, channel: str) -> Proposal:
         (evidence,),
         f"unit and sign: {UNCONFIRMED}",
         others=UNITS[channel],
+        is_weak=channel in NEEDS_EVIDENCE,
     )
 
 
@@ -419,23 +494,27 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:
-    """The three of turning asked where no name, unit or other column speaks for them: yaw_rate ≈ steer·vx / wheelbase looks alike."""
-    named = any(
-        one.unit or channel in one.hints
-        for channel, one in turning.columns.items()
-        if channel != "vx"
-    )
-    confirmed = any(
-        channel in found and not found[channel].asked for channel in ("ax", *REFERENCES)
-    )
-    if named or confirmed or "ay" not in turning.columns:
-        return found
-    doubt = "no name and no other column speaks for it: yaw rate and acceleration could be steering and yaw rate"
-    three = {one.name for one in turning.columns.values()}
-    return {
-        name: replace(one, asked=one.asked or doubt) if one.column in three else one
-        for name, one in found.items()
-    }
+    """Speed, yaw rate and lateral acceleration asked where one piece of evidence is all.
+
+    Pieces are the relation ay ≈ vx·yaw_rate, another column that agrees, the unit of the header
+    and the name. yaw_rate ≈ steer·vx / wheelbase and a lateral velocity follow a turn alike.
+    """
+    is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR
+    sure = {name for name, one in found.items() if not one.asked}
+    roles = {column.name: channel for channel, column in turning.columns.items()}
+    changed = {}
+    for name, one in found.items():
+        channel = roles.get(one.column)
+        if channel is None:
+            continue
+        column = turning.columns[channel]
+        others = column.name != one.column or any("agrees" in text for text in one.evidence[1:])
+        confirming = AGREEING[channel] | (AGREEING["vx"] if is_related else set())
+        pieces = [is_related, bool(sure & confirming), others]
+        pieces += [bool(column.unit), channel in column.hints]
+        if sum(pieces) < 2:
+            changed[name] = replace(one, asked=one.asked or SINGLE_EVIDENCE, is_weak=True)
+    return {**found, **changed}
 
 
 def _left_and_right(
@@ -514,11 +593,14 @@ def _clues(
         * (-1.0 if is_vbo else 1.0)
         * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
     )
+    rate = slow_of(known["yaw_rate"], known.rate_hz)
+    speed = slow_of(np.abs(known.vx), known.rate_hz)
     steps = np.gradient(east), np.gradient(latitude)
-    turned = -np.gradient(np.unwrap(np.arctan2(*steps)))
-    usual = (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
+    course = np.arctan2(*steps)
+    turned = np.angle(np.exp(-1j * np.gradient(np.unwrap(course))))
+    moving = speed > COURSE_SPEED * float(speed.max())  # noise of positions turns a slow course
+    usual = moving & (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)
     if usual.sum() > FEWEST:
-        rate = slow_of(known["yaw_rate"], known.rate_hz)
         yield (
             "the course over latitude and longitude runs against yaw_rate, sign {}",
             correlation(turned[usual], rate[usual]),

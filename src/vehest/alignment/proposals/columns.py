@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from vehest.alignment.proposals.names import hints, is_of_bus, is_reference
+from vehest.alignment.proposals.names import WEAK, bare, hints, is_of_bus, is_reference
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
@@ -23,6 +23,7 @@ MOST_MISSING = 0.5  # of a column's samples, which a line then bridges
 STRAY = 20.0  # times the spread of nearly all samples; beyond lies no sample of a motion
 MOST_STRAY = 0.002
 LONG = 1000  # samples
+HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -114,6 +115,26 @@ def candidates(
         )
         found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), roles, device=device))
     return found
+
+
+def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
+    """Columns whose names do not decide axes: all of a family x, y and z may be along any.
+
+    A log may count y up, or name the axes otherwise. The letters stay a weak hint.
+    """
+    families: dict[str, list[Candidate]] = {}
+    for column in columns:
+        words = bare(column.name)
+        if words[-1:] in tuple("xyz"):
+            families.setdefault(words[:-1].strip(), []).append(column)
+    changed = {}
+    for family in families.values():
+        roles = {role for column in family for role in column.hints}
+        for column in family if len(family) == 3 else ():
+            named = dict.fromkeys(column.hints, HINT_OF_LETTER)
+            others = {"yaw_rate", "ax", "ay", "vx", "vy_ref"} & roles
+            changed[column.name] = replace(column, hints={**dict.fromkeys(others, WEAK), **named})
+    return [changed.get(column.name, column) for column in columns]
 
 
 def _stray(values: FloatArray) -> NDArray[np.bool_]:

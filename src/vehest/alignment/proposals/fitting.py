@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -29,6 +29,7 @@ OF_REFERENCE = 2.5
 BESIDE_BUS = 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
+CRAWL_SHARE = 0.05  # of the top speed, below which a sideslip angle has no meaning
 HARDLY = "the motion hardly decides it"
 SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
 REFERENCES = ("vy_ref", "sideslip_ref")
@@ -219,11 +220,16 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     ):
         text += f", and {'a wheelbase' if channel == 'steer' else 'wheelbase times ratio'} of {length:.3g} m by slow corners"
     alternatives = tuple(" ".join(other) for other in others)
-    return Offer(
-        score,
-        column,
-        Proposal(column.name, channel, unit, sign, (*evidence, text), asked, others=alternatives),
+    ay = search.known.channels.get("ay", search.known.turning)
+    of_ay = abs(correlation(column.slow, slow_of(ay, search.known.rate_hz)))
+    is_weak = not (hint or column.unit) and of_ay >= best.strength
+    if is_weak:
+        asked = f"no name or unit says so, and it follows ay ({of_ay:.2f}) as well"
+    evidence = (*evidence, text)
+    proposal = Proposal(
+        column.name, channel, unit, sign, evidence, asked, others=alternatives, is_weak=is_weak
     )
+    return Offer(score, column, proposal)
 
 
 def _as_lateral(search: Search, column: Candidate) -> Offer | None:
@@ -310,6 +316,8 @@ def agreement(
 ) -> Agreement:
     """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
     samples = (column.values - offset) * si_factor(unit, channel)
+    if channel == "sideslip_ref":
+        samples = np.where(np.abs(known.vx) < CRAWL_SHARE * largest(known.vx), 0.0, samples)
     velocity = channel if channel in REFERENCES else ""
     with np.errstate(all="ignore"):
         relations = relations_of(

@@ -12,7 +12,7 @@ _STRONG = {  # over the name without blanks
     "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
     r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
-    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
+    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|crosstrack|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
     "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|"
@@ -21,7 +21,7 @@ _STRONG = {  # over the name without blanks
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle|accel?forward",
     "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
-    "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
+    "vy_ref": r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
     "heading": r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
@@ -29,7 +29,7 @@ _STRONG = {  # over the name without blanks
     "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
-    "vx": r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
+    "vx": r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
     r"velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
@@ -55,6 +55,10 @@ _REFERENCE = re.compile(
 _BUS = re.compile(
     r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d"
 )
+_WORLD_AXIS = re.compile(
+    r"\b(east|north|down|ost|nord|ned|enu|ecef)(ward)?\b|(east|north|ecef)|"
+    r"\b(v|vel|velocity|speed|spd|acc|acceleration)( ?[en]| d| up)$"
+)  # of a quantity along an axis of the world, which no channel is
 _STEERING_RATE = re.compile(
     r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta"
 )
@@ -90,7 +94,7 @@ _QUANTITIES = {
     **dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"),
     **dict.fromkeys(("m/s²", "g"), "acc"),
 }
-_WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2)$")
+_WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2|radps|rads|degps|degs|dps)$")
 _PLAIN = str.maketrans(
     {
         "ä": "ae",
@@ -149,6 +153,8 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
         if re.search(own, texts, re.MULTILINE) or role in words.split()
     }
     strong = {role for role, strength in found.items() if strength == STRONG}
+    if _WORLD_AXIS.search(words):
+        return {"other": STRONG}
     is_other = "other" in strong and not strong & {
         "yaw_rate",
         "ay",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,11 +22,11 @@ LATERAL = frozenset(
         "vy_ref",
         "sideslip_ref",
         "yaw_rate_ref",
-        "roll",
-        "roll_rate",
     }
 )
 """Channels whose sign depends on which way is left."""
+TILT = {"roll": "ax", "roll_rate": "ax", "pitch": "ay", "pitch_rate": "ay"}
+"""Channel of a rotation -> the acceleration along its axis."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Proposal:
     offset: float = 0.0  # value of the column at zero, in its own unit
     others: tuple[str, ...] = ()  # channels or units that would do as well
     delay: float = 0.0  # by which it is late, as far as it is known [s]
+    is_weak: bool = (
+        False  # whether one piece of evidence is all: left out unless an answer takes it
+    )
 
     @property
     def in_words(self) -> str:
@@ -100,8 +104,36 @@ class Proposals:
         )
 
     def mirrored(self) -> Proposals:
-        """The same for a car seen in a mirror, which reverses the signs of `LATERAL` channels."""
+        """The same for a car seen in a mirror: signs of `LATERAL` channels and of pitch reversed."""
         turned = (
-            replace(one, sign=-one.sign) if one.channel in LATERAL else one for one in self.channels
+            replace(one, sign=-one.sign)
+            if one.channel in LATERAL or TILT.get(one.channel) == "ay"
+            else one
+            for one in self.channels
         )
         return replace(self, channels=tuple(turned))
+
+    def with_tilt_signs(self) -> Proposals:
+        """The same with the signs of roll and pitch by the axes that other channels reveal.
+
+        Roll counts about the axis of ax, pitch about that of ay; asked unless ax, ay and the yaw
+        rate are along the axes of one right-handed set, as forward-left-up or forward-right-down.
+        """
+        signs = {name: one.sign for name, one in self.by_channel.items()}
+        axes = [signs.get("ax", signs.get("vx")), signs.get("ay"), signs.get("yaw_rate")]
+        axis_signs = [sign for sign in axes if sign is not None]
+        is_right_handed = len(axis_signs) == len(axes) and math.prod(axis_signs) == 1
+        doubt = (
+            ""
+            if is_right_handed
+            else "sign: ax, ay and yaw_rate reveal no right-handed set of axes"
+        )
+        changed = [
+            replace(
+                one, sign=signs.get(TILT[one.channel], 1), asked=one.asked or doubt
+            ).with_evidence("sign by the axes of ax, ay and yaw_rate")
+            if one.channel in TILT
+            else one
+            for one in self.channels
+        ]
+        return replace(self, channels=tuple(changed))

@@ -32,7 +32,14 @@ MOST_KEPT = 8
 LEAST_SCORE = 6.0
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a clear name decides."""
+NO_RATE_OR_ACCELERATION = (
+    *("vx", "heading", "roll", "pitch"),
+    *("latitude", "longitude", "position_x", "position_y"),
+)
+"""Roles of speeds, angles and positions, none of which is a yaw rate or an acceleration."""
 UNNAMED = 3.0  # of score, for a column that no name speaks for where one speaks for another
+EXACT = 0.9995  # correlation beyond which ay was computed of vx·yaw_rate, and not measured
+COMPUTED = 6.0  # of score, for that, where another column is named as ay
 NAMELESS = 0.5  # rank of a column whose name suggests nothing
 STANDING = 0.02  # of the top speed; below, the car may stand
 SAME = 0.97  # correlation of one quantity measured twice
@@ -143,7 +150,12 @@ def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     own = [
         one
         for one in columns
-        if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)
+        if channel in one.hints
+        or STRONG
+        not in {
+            one.hints.get(role)
+            for role in (*FOLLOWING, *(NO_RATE_OR_ACCELERATION if channel != "vx" else ()))
+        }
     ]
     own = [
         one
@@ -225,6 +237,8 @@ def _scored(
         score -= 2.0
     score += -5.0 if against or mismatch >= FAR else 3.0 if mismatch < CLOSE else 1.0
     score -= UNNAMED * (not is_evident(named["ay"], left))
+    others = any("ay" in one.hints for one in columns if one is not named["ay"])
+    score -= COMPUTED * (abs(agreeing) > EXACT and others)
     return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
 
 

@@ -72,7 +72,7 @@ class SequenceSettings(Group):
     )
     mirrored: float = setting(
         0.0,
-        "share of training sequences that are seen in a mirror, left for right; papers: none",
+        "share of training sequences that are mirrored, left for right; papers: none",
         least=0.0,
         most=1.0,
     )
@@ -167,10 +167,10 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     network: VelocityNetwork
     inputs: tuple[str, ...] = setting(
         ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"),
-        "measured channels that the network sees",
+        "measured channels that the network reads",
     )
     outputs: tuple[str, ...] = setting(
-        ("vx", "vy", "yaw_rate"), "what it estimates, each learnt from its _ref channel"
+        ("vx", "vy", "yaw_rate"), "what it estimates, each trained on its _ref channel"
     )
     n_states: int = setting(64, "size of the hidden state", least=1, most=MAX_WIDTH)
     dropout: float = setting(

@@ -44,7 +44,7 @@ class WindowedEstimator(Network):
     fits_seeds_together = True
     horizon_steps = 1  # a window predicts the velocity one sample after it
     rate_hz: float = rate(20.0)
-    window: int = setting(30, "samples that it sees", least=1, most=MAX_WIDTH)
+    window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
         """A network that knows the ranges of the training recordings: means and deviations if it is a `StandardisedNetwork`."""

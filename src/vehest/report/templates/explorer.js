@@ -29,9 +29,9 @@ async function unpack(content) {
 }
 
 function element(tag, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.append(...children);
-  return made;
+  const node = Object.assign(document.createElement(tag), properties);
+  node.append(...children);
+  return node;
 }
 
 // A line breaks where there is no value: between two recordings.
@@ -55,7 +55,7 @@ class Explorer {
     this.n = content.length;
     this.time = Float64Array.from({ length: this.n }, (_, k) => content.start + k * content.step);
     this.whole = [this.time[0], this.time[this.n - 1]];
-    this.view = [...this.whole];
+    this.view = [...content.zoom];
     const { vx, vy } = columns;
     this.sideslip = vy.map((value, k) => Math.atan2(value, vx[k]) * DEGREES);
     this.candidates = content.candidates.map((own, i) => {
@@ -77,11 +77,11 @@ class Explorer {
     new ResizeObserver(() => this.resize()).observe(this.panels);
   }
 
-  // What stands on the page
+  // The parts of the page: controls, legend and panels, then errors over chosen rows and the course
 
   build() {
     this.table = element("tbody");
-    const head = ["", "estimator (chosen seed)", "RMSE(β) [deg]", "", "RMSE(v) [m/s]", "band, map"];
+    const head = ["", "estimator (chosen seed)", "RMSE(β) [deg]", "", "RMSE(v) [m/s]", "band, course"];
     const kinds = ["", "", "number", "length", "number second", ""];
     const headers = head.map((text, i) => element(text ? "th" : "td", { textContent: text, className: kinds[i], ...(text ? { scope: "col" } : {}) }));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...headers)), this.table);
@@ -89,11 +89,14 @@ class Explorer {
     this.table.append(...this.rows.map((row) => row.line));
     this.said = element("p", { className: "said" });
     this.said.setAttribute("role", "status");
-    const board = element("div", { className: "board" }, this.filters(), element("div", { className: "scroll" }, table), this.said);
+    const scroll = element("div", { className: "scroll", tabIndex: 0, ariaLabel: "errors over the chosen rows" }, table);
+    scroll.setAttribute("role", "region");
+    const board = element("div", { className: "board" }, this.filters(), scroll, this.said);
     const top = element("div", { className: "top" }, board);
     if (this.columns.x) top.append(this.mapPlace());
     this.panels = element("div", { className: "panels" });
-    this.place.append(top, this.controls(), this.panels);
+    this.legend = element("div", { className: "legend" });
+    this.place.append(this.controls(), this.legend, this.panels, top);
   }
 
   rowOf(own) {
@@ -116,7 +119,7 @@ class Explorer {
   }
 
   filters() {
-    const box = element("fieldset", { className: "filters" }, element("legend", { textContent: "Rows that count" }));
+    const box = element("fieldset", { className: "filters" }, element("legend", { textContent: "Errors over chosen samples" }));
     this.bounds = {};
     const range = (name, text, unit) => {
       const group = element("span", { className: "range" }, element("span", { textContent: text }));
@@ -171,7 +174,7 @@ class Explorer {
     add("+", () => scaled(0.5), "zoom in");
     add("\u25c0", () => moved(-0.5), "earlier");
     add("\u25b6", () => moved(0.5), "later");
-    bar.append(element("span", { className: "hint", textContent: "Drag over a stretch to zoom in, double-click for all of it; two fingers on a screen." }));
+    bar.append(element("span", { className: "hint", textContent: "Drag over a segment to zoom in, double-click for the whole range; pinch on a touch screen." }));
     const inputs = element("div", { className: "chips" }, element("span", { textContent: "measured:" }));
     for (const signal of this.inputs) {
       const box = element("input", { type: "checkbox", checked: signal.drawn });
@@ -222,8 +225,8 @@ class Explorer {
     if (sorted) this.table.append(...[...this.rows].sort((a, b) => a.rmse - b.rmse).map((row) => row.line));
     const seconds = (count * this.content.step).toFixed(1);
     this.said.textContent = count
-      ? `${count} of ${known} samples, ${seconds} s${filtered ? "; the intervals of the leaderboard hold for all rows only" : ""}.`
-      : "No sample passes.";
+      ? `${count} of ${known} samples, ${seconds} s${filtered ? "; the intervals of the forest plot are those of all samples" : ""}.`
+      : "No sample is chosen.";
     this.plots.forEach((plot) => plot.redraw(false));
     this.drawMap();
   }
@@ -248,11 +251,11 @@ class Explorer {
     const dark = isDark();
     this.rows.forEach((row) => (row.swatch.style.borderTopColor = dark ? row.own.dark : row.own.colour));
     const drawn = this.candidates.filter((own) => own.drawn).reverse(); // the first lies on top
-    const measured = { label: "reference", colour: colourOf("ink"), width: 1.8 };
+    const reference = { label: "reference", colour: colourOf("reference"), width: 4 }; // below the estimates
     const lines = (quantity) => drawn.map((own) => ({ label: own.label, colour: dark ? own.dark : own.colour, dash: DASHES[own.dash], values: own[quantity], width: 1.2 }));
     const panels = [
-      { title: "v [m/s]", height: 190, lines: [...lines("v"), { ...measured, values: this.columns.vy }], band: this.bandOf("v") },
-      { title: "β [deg]", height: 190, lines: [...lines("sideslip"), { ...measured, values: this.sideslip }], band: this.bandOf("sideslip") },
+      { title: "v [m/s]", height: 190, lines: [{ ...reference, values: this.columns.vy }, ...lines("v")], band: this.bandOf("v") },
+      { title: "β [deg]", height: 190, lines: [{ ...reference, values: this.sideslip }, ...lines("sideslip")], band: this.bandOf("sideslip") },
       { title: "error of β [deg]", height: 150, lines: lines("error") },
       ...this.healthPanel(),
     ];
@@ -260,7 +263,24 @@ class Explorer {
       panels.push({ title: `${label} [${unit}]`, height: 90, lines: [{ label: "", colour: colourOf("soft"), values, width: 1 }] });
     }
     panels.forEach((panel, i) => this.panel(panel, i === panels.length - 1));
+    this.drawLegend(reference, [...drawn].reverse());
     this.drawMap();
+  }
+
+  drawLegend(reference, drawn) {
+    const entry = (label, colour, dash, kind = "") => {
+      const swatch = element("span", { className: `swatch ${kind}` });
+      swatch.style.borderTopColor = swatch.style.backgroundColor = colour;
+      if (!kind) swatch.style.backgroundColor = "transparent";
+      swatch.style.borderTopStyle = { solid: "solid", dotted: "dotted" }[dash] || "dashed";
+      return element("span", {}, swatch, label);
+    };
+    const colour = (candidate) => (isDark() ? candidate.dark : candidate.colour);
+    const entries = [entry(reference.label, reference.colour, "solid")];
+    entries[0].firstChild.style.borderTopWidth = "4px";
+    entries.push(...drawn.map((candidate) => entry(candidate.label, colour(candidate), candidate.dash)));
+    if (this.bandOf("sideslip")) entries.push(entry(`90 % band of ${this.detail.label}`, colour(this.detail), "solid", "band"));
+    this.legend.replaceChildren(...entries);
   }
 
   bandOf(quantity) {
@@ -288,7 +308,7 @@ class Explorer {
       }
       bands.push({ series: [1, 2], fill: band.fill });
     }
-    const gaps = (_plot, _series, _first, _last, found) => found.map(([from, to]) => [from - 1, to + 1]); // where points share a pixel, a line joins its ends
+    const gaps = (_plot, _series, _first, _last, ranges) => ranges.map(([from, to]) => [from - 1, to + 1]); // where points share a pixel, a line joins its ends
     for (const line of lines) {
       series.push({ label: line.label, stroke: line.colour, width: line.width, dash: line.dash, points: { show: false }, gaps });
       data.push(broken(line.values));
@@ -344,9 +364,15 @@ class Explorer {
     };
     const lines = known.map((own) => ({ label: own.label, colour: "transparent", values: own.health, health: true, width: 0 }));
     const y = { values: () => [], grid: { show: false }, ticks: { show: false } };
-    const keys = HEALTH.slice(1).map((word) => element("span", { className: `key ${word}`, textContent: word }));
+    const keys = HEALTH.map((word) => element("span", { className: `key ${word}`, textContent: word }));
+    keys.push(element("span", { textContent: known.length > 1 ? "from top:" : "of" }));
+    for (const candidate of known) {
+      const laneKey = element("span", { className: "lane", textContent: candidate.label });
+      laneKey.style.setProperty("--lane", isDark() ? candidate.dark : candidate.colour);
+      keys.push(laneKey);
+    }
     const options = { draw: [draw], scales: { y: { range: [-1, 3] } }, y, keys };
-    return [{ title: "health of what was measured", height: lane * known.length + 12, lines, options }];
+    return [{ title: "sensor health", height: lane * known.length + 12, lines, options }];
   }
 
   shade(plot) {
@@ -529,7 +555,7 @@ function ruler(ctx, scale, width, height) {
 }
 
 for (const figure of document.querySelectorAll("figure.live")) {
-  if (!window.DecompressionStream) break; // an older browser keeps the figure that stands there
+  if (!window.DecompressionStream) break; // an older browser shows the static figure
   const script = figure.querySelector("script");
   const content = JSON.parse(script.textContent);
   script.remove();

@@ -1,6 +1,6 @@
 "use strict";
 
-// Dark or light: as the reader's system says, until the button is pressed; a browser that keeps nothing for files forgets it.
+// Dark or light: as the reader's system says, until the button is pressed; a browser without storage for files forgets it.
 const darkSystem = window.matchMedia("(prefers-color-scheme: dark)");
 const page = document.documentElement;
 const onTheme = [];
@@ -16,8 +16,8 @@ function isDark() {
     onTheme.forEach((draw) => draw());
   };
   try {
-    const kept = localStorage.getItem("vehest-theme");
-    if (kept === "dark" || kept === "light") page.dataset.theme = kept;
+    const stored = localStorage.getItem("vehest-theme");
+    if (stored === "dark" || stored === "light") page.dataset.theme = stored;
   } catch {}
   button.hidden = false;
   button.addEventListener("click", () => {
@@ -31,8 +31,8 @@ function isDark() {
   show();
 }
 
-// Sections below the fold: closed until their heading is pressed, all open in print.
-for (const node of document.querySelectorAll("#fold ~ *")) {
+// Appendices: one list of sections, closed until their heading is pressed, all open in print.
+for (const node of document.querySelectorAll("#appendices ~ *")) {
   const heading = node.querySelector(":scope > h2");
   if (heading) {
     const [section, summary] = ["details", "summary"].map((name) => document.createElement(name));
@@ -44,15 +44,14 @@ for (const node of document.querySelectorAll("#fold ~ *")) {
 }
 window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((section) => (section.open = true)));
 
-// Contents: headings, and the traces.
+// Contents: the headings above the appendices, whose list is their contents.
 {
   const nav = document.querySelector("nav");
-  [...document.querySelectorAll("h2, figure.live")].forEach((target, i) => {
-    if (!target.id) target.id = `part-${i}`;
+  [...document.querySelectorAll("h2")].filter((heading) => !heading.closest("details")).forEach((heading, i) => {
+    if (!heading.id) heading.id = `part-${i}`;
     const link = document.createElement("a");
-    link.href = `#${target.id}`;
-    link.textContent = target.tagName === "H2" ? target.textContent : "traces, course, filter";
-    link.addEventListener("click", () => target.closest("details")?.setAttribute("open", ""));
+    link.href = `#${heading.id}`;
+    link.textContent = heading.textContent;
     nav.append(link);
   });
   nav.hidden = nav.children.length < 2;
@@ -84,13 +83,13 @@ for (const table of document.querySelectorAll("figure.table table")) {
 for (const button of document.querySelectorAll("button.command")) {
   button.addEventListener("click", async () => {
     const line = button.closest("figure").querySelector("p.command");
-    const [code, said] = line.children;
+    const [code, note] = line.children;
     line.hidden = false;
     code.textContent = button.dataset.command;
-    said.textContent = "";
+    note.textContent = "";
     try {
       await navigator.clipboard.writeText(button.dataset.command);
-      said.textContent = "copied";
+      note.textContent = "copied";
     } catch {
       getSelection().selectAllChildren(code);
     }

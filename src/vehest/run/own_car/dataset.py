@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +19,7 @@ from vehest.alignment.settings import AlignmentSettings
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
+from vehest.data.derived import speed_of_reference
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
@@ -42,9 +42,12 @@ POLICIES = {
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
+CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
+CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
+MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 GAIN_APART = (
     1.15  # factor between the gains of two files, of which each half is beyond the other file's
@@ -114,7 +117,7 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"written twice, or {BRIDGED:g} s and more without a sample"
+        why = f"written twice, names repeated, or {BRIDGED:g} s and more without a sample"
         notes.append(
             f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}"
         )
@@ -126,13 +129,7 @@ def draft(examined: Examined) -> Draft:
             ratio = (found.value, found.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
-    if pause := dataset.get("max_gap"):
-        of_file = Counter(str(one.provenance.get("file")) for one in recordings)
-        notes += [
-            f"'{file}' pauses for more than {pause:g} s and makes {n} recordings"
-            for file, n in of_file.items()
-            if n > 1
-        ]
+    notes += _cuts(dataset, recordings)
     used_ratio = vehicle["steering_ratio"] or (
         ratio[0] if ratio and ratio[1] <= MAX_RATIO_UNCERTAINTY * abs(ratio[0]) else None
     )
@@ -141,7 +138,13 @@ def draft(examined: Examined) -> Draft:
             f"'steer' is left out: the steering ratio by slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
             f"less certain than {MAX_RATIO_UNCERTAINTY:.0%}; --steering-ratio with your car's adds it"
         )
-    made = _transforms(examined, longest, late, speed, used_ratio)
+    crawl_speed = max(map(_crawl_speed, recordings))
+    if crawl_speed:
+        notes.append(
+            f"sideslip has no meaning below {crawl_speed:g} m/s, where it is beyond "
+            f"{np.degrees(MAX_CRAWL_SIDESLIP):.0f}°, and is taken as 0 there"
+        )
+    made = _transforms(examined, longest, late, speed, used_ratio, crawl_speed)
     dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -179,6 +182,35 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     source = open_source(dataset)
     return [source.read(name) for name in source.ids()]
+
+
+def _crawl_speed(recording: Recording) -> float:
+    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout or no speed is known."""
+    name = speed_of_reference(recording)
+    if not {"sideslip_ref", name} <= set(recording.channels):
+        return 0.0
+    speed = np.abs(recording[name])
+    crawl = float(f"{min(CRAWL_SPEED, CRAWL_SHARE * float(np.nanmax(speed))):.2g}")
+    angles = np.abs(recording["sideslip_ref"][speed < crawl])
+    return crawl if (angles > MAX_CRAWL_SIDESLIP).any() else 0.0
+
+
+def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
+    """Notes of files that are cut into several recordings, and why."""
+    pause = dataset.get("max_gap")
+    causes = [f"pauses for more than {pause:g} s"] if pause else []
+    causes += ["has times that go back"] if dataset.get("time_restarts") else []
+    if not causes:
+        return
+    durations: dict[str, list[float]] = {}
+    for recording in recordings:
+        durations.setdefault(str(recording.provenance.get("file")), []).append(recording.duration)
+    for file, seconds in durations.items():
+        if len(seconds) > 1:
+            yield (
+                f"'{file}' {' and '.join(causes)} and makes {len(seconds)} recordings; "
+                f"a command on one recording takes the longest, {max(seconds):.0f} of {sum(seconds):.0f} s"
+            )
 
 
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
@@ -259,7 +291,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset |= log.options
     if log.source != "vbo":
         dataset["time"] = (
-            None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
+            None
+            if log.clock is None
+            else {"column": log.clock.column, "unit": log.clock.unit, **log.clock.repair}
         )
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
     dataset["clock"] = "strict"
@@ -278,14 +312,18 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         )
         if log.clock is not None:
             holes = {
-                stem: [
-                    f"{first + 1}-{last}"
-                    for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))
+                own.file.stem: [
+                    f"{own.file_row(first)}-{own.file_row(last - 1)}"
+                    for first, last in true_runs(gaps[own.file.stem].max(axis=0) > BRIDGED)
                 ]
-                for stem, own in gaps.items()
+                for own in examined.logs
             }
             dropped = {
-                own.file.stem: [*holes[own.file.stem], *_rows_written_twice(own)]
+                own.file.stem: [
+                    *own.repeated_names,
+                    *holes[own.file.stem],
+                    *map(own.file_row, _rows_written_twice(own)),
+                ]
                 for own in examined.logs
             }
             dataset |= (
@@ -333,14 +371,14 @@ def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[st
 
 
 def _rows_written_twice(log: Log) -> list[int]:
-    """From 1."""
+    """Places in the columns, from 0."""
     rows = np.nan_to_num(
         [
             *([] if log.seconds is None else [log.seconds]),
             *(column.values for column in log.columns),
         ]
     )
-    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)) + 1).tolist()
+    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0))).tolist()
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -351,9 +389,11 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
         return not len(known) or (
             log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED)
         )
-    if log.source != "mdf" or own.stamps is None or not len(known):
-        return len(known) < len(own.values)
-    return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= BRIDGED).any())
+    if log.source != "rosbag" or own.stamps is None or not len(known):
+        return not len(known) or (log.source != "mdf" and len(known) < len(own.values))
+    measured = own.stamps[known]
+    ends = own.stamps[[0, -1]] == measured[[0, -1]]
+    return not ends.all() or bool((np.diff(measured)[np.diff(known) > 1] > BRIDGED).any())
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
@@ -402,16 +442,16 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     for one in proposals:
         place = columns[one.column].place
         short = str(place["topic"]).strip("/").replace("/", "_")
-        if short not in topics:
-            rate, gap = _rate_and_gap(columns[one.column])
-            rates.append(rate)
-            max_gap = max(LEAST_GAP, math.ceil(150.0 * gap) / 100.0)
-            topics[short] = {
-                "topic": place["topic"],
-                "type": place["type"],
-                "stamps": place["stamps"],
-                "max_gap": max_gap,
-            }
+        rate, gap = _rate_and_gap(columns[one.column])
+        rates.append(rate)
+        topic = topics.setdefault(
+            short, {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": LEAST_GAP}
+        )
+        topic["max_gap"] = max(topic["max_gap"], math.ceil(150.0 * gap) / 100.0)
+        stamps = columns[one.column].stamps
+        if stamps is not None and (np.diff(stamps) == 0.0).any():  # delivered in batches
+            mean_rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
+            topic |= {"clock": "uniform", "rate_hz": plain_rate(mean_rate, INTERPOLATED_TOLERANCE)}
         entry = _entry(one, {"topic": short, "field": place["field"]})
         channels[one.channel] = entry | (
             {"offset": float(f"{one.offset:.5g}")} if one.offset else {}
@@ -461,6 +501,7 @@ def _transforms(
     late: Mapping[str, Late],
     speed: Sequence[dict[str, Any]],
     ratio: float | None,
+    crawl_speed: float,
 ) -> list[dict[str, Any]]:
     """Transforms that make the channels that estimators want.
 
@@ -487,6 +528,9 @@ def _transforms(
         )
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
+    for entry in made:
+        if entry["name"] == "velocity_from_sideslip" and crawl_speed:
+            entry["min_speed"] = crawl_speed
     if "handwheel" in longest and "steer" not in longest and ratio:
         made.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
     return made

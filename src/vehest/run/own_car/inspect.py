@@ -26,10 +26,9 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
 from vehest.sources.base import source_names
-from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
+from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate
 from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import between_pauses
-from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 
 EVIDENCE_HZ = 50.0
@@ -138,7 +137,8 @@ def inspect(
         names = counted([column.name for column in longest.columns])
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(
-            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}"
+            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}; "
+            "needed are speed, yaw rate and lateral acceleration: name their columns so, with units"
         )
     computed = [
         f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement"

@@ -75,6 +75,15 @@ def ask(
         else:
             left.append(question)
             examined = _answered(examined, question, question.proposed)
+    if left and not examined.proposals.channels:
+        takes = " ".join(
+            f'--answer "{question.key}={question.candidates[0]}"'
+            for question in left
+            if question.candidates and question.proposed == LEAVE_OUT
+        )
+        raise ConfigurationError(
+            f"no column has two pieces of evidence for its channel; add those that are right: {takes}"
+        )
     return examined, tuple(left)
 
 
@@ -111,10 +120,16 @@ def questions_of(examined: Examined) -> Iterator[Question]:
                 *([f"{one.sign:+d}"] if factor or one.sign != 1 else []),
                 *factor,
             ]
-            proposed = LEAVE_OUT if beyond > MOST_BEYOND else " ".join(declared)
+            proposed = " ".join(declared)
+            text = f"column '{one.column}': {one.asked}"
+            if one.is_weak:
+                others = (proposed, *others)
+                text += f'; left out unless --answer "{one.column}={proposed}" takes it'
+            if one.is_weak or beyond > MOST_BEYOND:
+                proposed = LEAVE_OUT
             yield Question(
                 one.column,
-                f"column '{one.column}': {one.asked}",
+                text,
                 proposed,
                 others,
                 one.evidence,
@@ -231,7 +246,13 @@ def _parsed(answer: str, own: Proposal) -> Proposal:
         raise ConfigurationError(f"'{answer}': the sign must be 1 or -1, not '{sign}'")
     factor_of = _number(factor, f"'{answer}': the factor") if factor else own.factor
     return replace(
-        own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked=""
+        own,
+        channel=name,
+        unit=unit,
+        sign=int(sign or own.sign),
+        factor=factor_of,
+        asked="",
+        is_weak=False,
     ).with_evidence("as answered")
 
 

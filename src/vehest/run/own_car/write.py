@@ -26,7 +26,7 @@ from vehest.estimators.registry import (
     estimator_classes,
     estimator_names,
 )
-from vehest.run.config import Config, compose_config
+from vehest.run.config import Config, compose_config, key_of
 from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
 from vehest.run.own_car.inspect import Examined, paths_of
@@ -375,16 +375,24 @@ def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
             if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
         ]
         of_car = f"the car's {' and '.join(unknown)}" if unknown else ""
-        lacks = {name: of_car or _lack(name, words, contents, samples, seconds) for name in names}
-        tried = [name for name in names if not lacks[name]]
-        plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
-        if tried:
-            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], about))
+        by_settings: dict[tuple[str, ...], list[str]] = {}
+        for name in names:
+            lack, settings = (
+                (of_car, ()) if of_car else _lack(name, words, contents, samples, seconds)
+            )
+            if lack:
+                plan.lacking[name] = lack
+            else:
+                by_settings.setdefault(settings, []).append(name)
+        for settings, tried in by_settings.items():
+            changed = {key_of(setting) for setting in settings}
+            others = [word for word in words if key_of(word) not in changed]
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *others, *settings], about))
             plan.estimators.extend(tried)
     known = {name for names in sweeps.values() for name in names}
-    others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
+    remaining = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
     by_default = "none of the families tried by default; --with adds it"
-    plan.lacking.update(dict.fromkeys(others, by_default))
+    plan.lacking.update(dict.fromkeys(remaining, by_default))
     broken = set(estimator_names()) - set(estimator_classes())
     plan.lacking.update(
         dict.fromkeys(broken, "it cannot be loaded; 'vehest data usable' names the reason")
@@ -411,10 +419,12 @@ def _lack(
     contents: Sequence[RecordingSummary],
     samples: int,
     seconds: float,
-) -> str:
+) -> tuple[str, tuple[str, ...]]:
+    """What an estimator lacks, empty if nothing, and the settings with which it lacks no channel."""
     if name not in choices("estimator"):
         config: Config = {"estimator": {"name": name}, "training": {}}
-        return usability(name, config, contents).to_give or _without_settings_file(name)
+        reason = usability(name, config, contents).to_give or _without_settings_file(name)
+        return reason, ()
     first = [
         word if "[" in word else word.split(",")[0]
         for word in words
@@ -423,14 +433,16 @@ def _lack(
     try:
         found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
-        return str(error)
+        return str(error), ()
     needed = samples / (found.rate_hz or math.inf)
     short = (
         [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"]
         if needed > seconds
         else []
     )
-    return ", ".join([*found.missing.in_words(), *short]) or found.to_give
+    missing = [] if found.settings_suffice else found.missing.in_words()
+    settings = found.settings if found.settings_suffice else ()
+    return ", ".join([*missing, *short]) or found.to_give, settings
 
 
 def _pipeline_of(

@@ -47,6 +47,11 @@ class Wanted:
     invalid: frozenset[float] = (
         frozenset()
     )  # values that mean that nothing was measured, in the unit of the DBC
+    reserved: tuple[float, float] = (math.nan, math.nan)  # range of further ones, likewise
+
+    def is_measured(self, value: float) -> bool:
+        """Whether a value, in the unit of the DBC, is a measurement."""
+        return value not in self.invalid and not self.reserved[0] <= value <= self.reserved[1]
 
 
 class CanSource(SignalSource):
@@ -77,8 +82,12 @@ class CanSource(SignalSource):
         for name, declared in self.channels.items():
             message, signal = database.places[declared.column]
             invalid = (declared.invalid,) if isinstance(declared.invalid, int) else declared.invalid
+            declared_invalid = frozenset(message.physical(signal, raw) for raw in invalid)
             found[name] = Wanted(
-                message, signal, frozenset(message.physical(signal, raw) for raw in invalid)
+                message,
+                signal,
+                declared_invalid | message.not_measured(signal),
+                message.reserved(signal),
             )
         return database, found
 
@@ -140,7 +149,8 @@ def channel_values(
         name: values[wanted[name].signal] for name in channels if wanted[name].signal in values
     }
     return {
-        name: math.nan if value in wanted[name].invalid else value for name, value in found.items()
+        name: value if wanted[name].is_measured(value) else math.nan
+        for name, value in found.items()
     }
 
 

@@ -6,6 +6,7 @@ DBC -> lengths of messages and signals, looked at since cantools makes lists as 
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +18,11 @@ from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 from vehest.sources.limited import require_package
+from vehest.sources.not_measured import marks_not_measured
 
 COMPARED = 10_000  # names that a misspelt one is compared with
+RESERVED_BYTE = 0xFB  # of J1939-71: from here on a value in the highest byte is none
+RESERVED_LENGTHS = (8, 12, 16, 24, 32)  # bits
 UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
 _TOO_LONG = re.compile(
     r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})"
@@ -65,6 +69,43 @@ class Message:
             self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False)
         )
 
+    def not_measured(self, signal: str) -> frozenset[float]:
+        """Values, in the unit of the DBC, whose names say that nothing was measured.
+
+        The value 0 is kept where the signal may be 0: a car that stands sends it.
+        """
+        described = self.described.get_signal_by_name(signal)
+        return frozenset(
+            value
+            for raw, name in (described.choices or {}).items()
+            if marks_not_measured(str(name), signal)
+            and ((value := self.physical(signal, raw)) != 0.0 or _is_outside(described, value))
+        )
+
+    def reserved(self, signal: str) -> tuple[float, float]:
+        """Range of the values that J1939-71 reserves for errors and for what is not available.
+
+        Raw values from 0xFB in the highest byte. Without the attribute that names the protocol,
+        an extended frame counts whose DBC declares a maximum below these values. NaN without any.
+        """
+        described = self.described.get_signal_by_name(signal)
+        length = described.length
+        if described.is_signed or described.is_float or length not in RESERVED_LENGTHS:
+            return math.nan, math.nan
+        first = self.physical(signal, RESERVED_BYTE << (length - 8))
+        last = self.physical(signal, (1 << length) - 1)
+        is_j1939 = self.described.protocol == "j1939" or (
+            self.described.is_extended_frame and _is_outside(described, first)
+        )
+        return (min(first, last), max(first, last)) if is_j1939 else (math.nan, math.nan)
+
+
+def _is_outside(described: Any, value: float) -> bool:
+    """Whether a value lies outside of the range that the DBC declares, if it declares one."""
+    low = -math.inf if described.minimum is None else described.minimum
+    high = math.inf if described.maximum is None else described.maximum
+    return bool(low < high and not low <= value <= high)
+
 
 @dataclass(frozen=True)
 class Database:
@@ -83,7 +124,11 @@ def read_dbc(file: Path) -> list[Any]:
     require_package("cantools", "bus", "reading CAN")
     from cantools.database import load_string
 
-    text = file.read_bytes().decode("cp1252", errors="replace")
+    raw = file.read_bytes()
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:  # "°" and umlauts of the usual code page are no UTF-8
+        text = raw.decode("cp1252", errors="replace")
     if found := _TOO_LONG.search(text):
         raise DataError(
             f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}"

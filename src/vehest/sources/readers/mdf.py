@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
+from vehest.sources.not_measured import marks_not_measured
 
 FINISHED = b"MDF     "
 UNFINISHED = b"UnFinMF "
@@ -371,6 +373,8 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> Flo
                 if ranges
                 else conversion.convert(found, as_object=True)
             )
+    if found.dtype.kind == "O":  # numbers with texts among them, as a conversion gives them
+        found = np.array([_measured(value) for value in found], dtype=object)
     if found.dtype.kind in "SU" or (
         found.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in found)
     ):
@@ -380,6 +384,12 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> Flo
     values = np.full(len(raw), np.nan)
     values[valid] = found
     return values
+
+
+def _measured(value: Any) -> Any:
+    """A value of a conversion; NaN for a text that says that nothing was measured."""
+    text = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
+    return math.nan if isinstance(text, str) and marks_not_measured(text) else value
 
 
 def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:

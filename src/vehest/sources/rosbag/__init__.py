@@ -20,6 +20,7 @@ from vehest.data.recording import Recording
 from vehest.sources.clocks import (
     Clock,
     at_ticks,
+    bridged,
     common_span,
     require_clock,
     require_samples,
@@ -161,7 +162,8 @@ class RosbagSource(FileSource):
             )
         times = stamps = stamps[kept]
         values = {field: reading.arrays[f"{name}.{field}"][kept] for field in fields}
-        for field, samples in values.items():
+        for field, measured in values.items():
+            samples = values[field] = bridged(measured, stamps, topic.max_gap)
             require_samples(samples, stamps, topic.max_gap, f"{where}: field '{field}'")
         rate_hz = None
         if topic.clock == "uniform":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.sources.clocks import span_fault
 from vehest.sources.surveys.log import Stamps
-from vehest.sources.table_rows import stretches, timed_runs
+from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
@@ -31,6 +32,11 @@ RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
+FARTHEST_ROW = 100  # rows by which one may stand out of order
+MODULI = (  # of counters, also as fractions of a second, and of seconds of a day and of a GPS week
+    *(2.0**bits * factor for bits in (15, 16, 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
+    *(days * 86_400.0 * factor for days in (1, 7) for factor in (1.0, 1e3, 1e6)),
+)
 REGULAR = 0.8  # share of the steps within half a median step
 GROWING = 0.9  # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
 MOST_RESTARTS = 0.01  # of the rows
@@ -46,19 +52,24 @@ def find_clock(
     best = None
     likely = -1
     step = 0.0
-    for name, values in columns.items():
+    repaired = {}
+    for name, raw in columns.items():
         unit = SPELLINGS.get(units.get(name, "").strip().lower(), "")
         named = bool(NAMED.match(plain_name(name)))
+        may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
+        values, repair = in_order(raw) if may_be_time else (raw, {})
         own = _step(values, named=named)
         counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
         if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
-            best = stamps
+            best = replace(stamps, repair=repair)
+            repaired = {name: values}
             likely = 2 * bool(unit) + named
             step = own
     n_rows = len(next(iter(columns.values())))
     if best is None:
         return None, None, (slice(0, n_rows),), {}
+    columns = {**columns, **repaired}
     values = columns[best.column]
     steps = np.diff(values)
     seconds = (values - values[0]) * UNITS[best.unit]
@@ -70,6 +81,27 @@ def find_clock(
         runs, pause = between_pauses(seconds, step * UNITS[best.unit])
         options = pause | ({"time_restarts": True} if starts.any() else {})
     return best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), options
+
+
+def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
+    """Times, (N,), that go on where a counter wrapped or rows stood out of order, and the options.
+
+    A counter wraps if each of its steps back is that of one modulus. Rows are out of order if
+    sorting makes the times even and moves none of them far; others that go back begin a run.
+    """
+    steps = np.diff(times)
+    if not (np.isfinite(times).all() and 0 < (steps < 0).sum() < 0.5 * len(steps)):
+        return times, {}
+    step = float(np.median(steps))
+    for modulus in MODULI:
+        ahead = steps[steps < 0] + modulus
+        if np.ptp(times) < modulus and (ahead > 0.0).all() and (ahead < LONG_GAP * step).all():
+            return unwrapped(times, modulus), {"wraps_at": modulus}
+    rows = np.argsort(times, kind="stable")
+    ordered = times[rows]
+    even = np.abs(np.diff(ordered) / max(step, 1e-300) - 1.0) < 0.5
+    is_near = np.abs(rows - np.arange(len(rows))).max() <= FARTHEST_ROW
+    return (ordered, {"sort": True}) if is_near and even.mean() >= GROWING else (times, {})
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
@@ -117,16 +149,17 @@ def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     fitting = [
         own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
     ]
-    chosen = unit or next(iter(fitting), "s" if named else "")
+    chosen = unit if unit in fitting or not fitting else fitting[0]
+    chosen = chosen or ("s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
-    how = (
-        f"unit in the header, {rate:.6g} Hz"
-        if unit
-        else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
-    )
-    return Stamps(name, chosen, how, asked=chosen not in fitting)
+    how = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    if unit == chosen:
+        how = f"unit in the header, {rate:.6g} Hz"
+    elif unit:
+        how += f", {1.0 / (step * UNITS[unit]):.6g} Hz in {unit}, as the header says"
+    return Stamps(name, chosen, how, asked=chosen not in fitting or unit not in ("", chosen))
 
 
 def _run_starts(

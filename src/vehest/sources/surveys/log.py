@@ -35,6 +35,7 @@ class Stamps:
     unit: str  # of time: ``s``, ``ms``, ``us`` or ``ns``
     evidence: str  # reasons for it, for people
     asked: bool = False  # whether the unit is ambiguous
+    repair: Mapping[str, Any] = field(default_factory=dict)  # options that put times in order
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,3 +58,11 @@ class Log:
         slice, ...
     ] = ()  # rows of each uninterrupted run, the longest first; one of all where times never restart
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
+    repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
+
+    def file_row(self, place: int) -> int:
+        """Number in the file, from 1, of a row of the columns, from 0."""
+        row = place + 1
+        for repeated in self.repeated_names:
+            row += repeated <= row
+        return row

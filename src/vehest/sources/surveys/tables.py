@@ -24,24 +24,31 @@ import pyarrow.csv as pc
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
-from vehest.data.parquet import DAMAGE, numbers_of, parquet_file, read_numbers
+from vehest.data.parquet import DAMAGE, has_time_unit, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
+from vehest.sources.surveys.unsuited import require_columns_of_signals
 from vehest.sources.tables import (
     TextLayout,
     is_parquet,
+    names_of,
     parse_table,
     read_head,
     require_memory,
     table_stream,
+    with_names,
 )
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
 HEAD = 1 << 18  # bytes that are looked at
 LONGEST_LINE = csv.field_size_limit()
+MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
+MAX_ODD_SHARE = 0.01  # of its numbers
+MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
@@ -50,27 +57,6 @@ WIDE = re.compile(
 )  # letters of Japanese, which accents in Windows-1252 make only one by one
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
-MARKS = frozenset(
-    {
-        "-",
-        "--",
-        "---",
-        "----",
-        "–",
-        "—",
-        "*",
-        "?",
-        "n.a.",
-        "none",
-        "missing",
-        "invalid",
-        "inv",
-        "void",
-        "#value!",
-        "#div/0!",
-    }
-)
-"""What loggers and spreadsheets write where there is no sample, in lower case."""
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
@@ -106,23 +92,31 @@ def survey_table(file: Path) -> Log:
     clocks: dict[str, FloatArray] = {}
     options: dict[str, Any] = {}
     skipped: list[str] = []
+    repeated: tuple[int, ...] = ()
     if is_parquet(file):
         with parquet_file(file) as table:
             units = {
                 field.name: field.type.unit
                 for field in table.schema_arrow
-                if pa.types.is_timestamp(field.type)
+                if has_time_unit(field.type)
             }
             names = [
                 field.name
                 for field in table.schema_arrow
                 if field.name in units or _is_numeric(field.type)
             ]
+            skipped = [
+                f"column '{printable(field.name)}' holds {field.type}"
+                for field in table.schema_arrow
+                if field.name not in names
+            ]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
     else:
         shape = shape_of(file)
-        values, clocks, marks, skipped = _columns(file, shape)
+        cells, repeated = _without_names(_table(file, shape), shape.names)
+        values, clocks, marks, skipped = _columns(file, shape, cells)
+        marks |= set(shape.names) - {""} if repeated else set()
         units = dict(shape.units)
         always = ("delimiter", "decimal")
         usual = asdict(TextLayout())
@@ -162,6 +156,9 @@ def survey_table(file: Path) -> Log:
         for name, times in {**clocks, **named}.items()
         if stamps is None or name != stamps.column
     ]
+    if stamps is not None and stamps.repair.get("sort"):
+        rows = np.argsort({**clocks, **values}[stamps.column], kind="stable")
+        values = {name: samples[rows] for name, samples in values.items()}
     options = {**options, **cuts}
     beside = {stamps.column if stamps else None, cuts.get("runs")}
     columns = [
@@ -173,7 +170,8 @@ def survey_table(file: Path) -> Log:
         stamps is None or stamps.unit != CLOCK
     )
     source = "tabular" if plain else "text_log"
-    return Log(file, source, tuple(columns), options, stamps, seconds, runs, (*skipped, *faults))
+    reasons = (*skipped, *faults)
+    return Log(file, source, tuple(columns), options, stamps, seconds, runs, reasons, repeated)
 
 
 def _fault(name: str, times: FloatArray) -> str:
@@ -214,6 +212,7 @@ def shape_of(file: Path) -> Shape:
         for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]
     ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
+    require_columns_of_signals(file, lines, tables)
     marks = [
         (delimiter, decimal)
         for delimiter in DELIMITERS
@@ -251,26 +250,46 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
         (k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0]
     )
     score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
-    above = [k for k in shares if k < first]
+    first_row = rows[first]
+    above = [
+        k
+        for k, row in rows.items()
+        if k < first and len(names_of(row, first_row)) == n_columns and any(map(str.strip, row))
+    ]
     if not above:
         return Shape(TextLayout(), score=score)
-    below = int(len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(rows[above[-1]]))
-    names = tuple(rows[above[-1] - below])
+    at = _names_at(rows, above)
+    units_at = next((k for k in above if k > at and _are_units(rows[k])), None)
+    names = tuple(names_of(rows[at], first_row))
     units = (
-        {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)}
-        if below
-        else {}
+        {}
+        if units_at is None
+        else {name: cell.strip() for name, cell in zip(names, rows[units_at], strict=False)}
     )
     layout = TextLayout(
-        delimiter, decimal, encoding, skip_rows=above[-1] - below, rows_below_names=below
+        delimiter, decimal, encoding, skip_rows=at, rows_below_names=sum(k > at for k in above)
     )
     return Shape(layout, names, units, score)
 
 
+def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
+    """Line of the names among those above the numbers: over the units, else of most names."""
+    block = [k for k in above if k > above[-1] - MAX_HEADER_LINES]
+    for before, k in pairwise(block):
+        if _are_units(rows[k]):
+            return before
+    n_names = {
+        k: len({cell for cell in rows[k] if cell.strip() and not _is_unit(cell)}) for k in block
+    }
+    return max(block, key=lambda k: (n_names[k] > 0.7 * max(n_names.values()), k))
+
+
 def _share(row: Sequence[str], decimal: str) -> float:
     """Share of cells that are numbers, empty ones left out; 0 where there is none."""
-    filled = [cell for cell in row if cell.strip() and cell.strip().lower() not in MARKS]
-    return sum(_is_number(cell, decimal) for cell in filled) / len(filled) if filled else 0.0
+    filled = [cell for cell in row if cell.strip()]
+    n_numbers = sum(_is_number(cell, decimal) for cell in filled)
+    n_others = sum(not (_is_number(cell, decimal) or marks_not_measured(cell)) for cell in filled)
+    return n_numbers / (n_numbers + n_others) if n_numbers else 0.0
 
 
 def _is_number(cell: str, decimal: str) -> bool:
@@ -316,11 +335,29 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
         return "latin-1", head.decode("latin-1")
 
 
+def _without_names(table: pa.Table, names: Sequence[str]) -> tuple[pa.Table, tuple[int, ...]]:
+    """Cells without rows that repeat the names, as joined files do, and their numbers, from 1."""
+    texts = [
+        (column, name)
+        for column, name in zip(table.columns, names, strict=False)
+        if name and pa.types.is_string(column.type)
+    ][:2]
+    if len(texts) < 2:
+        return table, ()
+    is_name = [
+        np.asarray(compute.fill_null(compute.equal(column, name), False).cast(pa.int8())) > 0
+        for column, name in texts
+    ]
+    repeated = is_name[0] & is_name[1]
+    if not repeated.any():
+        return table, ()
+    return table.filter(pa.array(~repeated)), tuple((np.flatnonzero(repeated) + 1).tolist())
+
+
 def _columns(
-    file: Path, shape: Shape
+    file: Path, shape: Shape, table: pa.Table
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
     """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not read, and why."""
-    table = _table(file, shape)
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     values: dict[str, FloatArray] = {}
     clocks: dict[str, FloatArray] = {}
@@ -331,11 +368,13 @@ def _columns(
             skipped += [f"column '{printable(name)}' is empty"] if name else []
         elif not name:
             skipped.append(f"column {place} has no name")
-        elif (count := shape.names.count(name)) > 1:
-            skipped.append(f"column {place}, one of {count} columns called '{printable(name)}'")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
-            values[name] = numbers[0]
-            marks |= numbers[1]
+            values[name], found, odd = numbers
+            marks |= found
+            skipped += [
+                f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
+                for text, row in odd.items()
+            ]
         elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
             clocks[name] = seconds
         else:
@@ -354,33 +393,33 @@ def _table(file: Path, shape: Shape) -> pa.Table:
     problem = None
     for convert in (inferred, text):
         try:
-            return parse_table(opened, shape.layout, convert)
+            return parse_table(opened, with_names(file, shape.layout), convert)
         except DAMAGE as error:
             problem = printable(first_line(error))
     why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
     raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
-def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str]] | None:
-    """A column as numbers, and the marks in it that stand for a missing sample; None where it holds anything else."""
-    marks: set[str] = set()
-    if pa.types.is_string(column.type):
-        marks = {
-            cell
-            for cell in compute.unique(column).to_pylist()
-            if cell is not None and cell.strip().lower() in MARKS
-        }
-        if marks:
-            column = compute.if_else(
-                compute.is_in(column, pa.array(sorted(marks))), pa.scalar(None, pa.string()), column
-            )
-        column = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
-    elif not _is_numeric(column.type):
+def _numbers(
+    column: pa.ChunkedArray, decimal: str
+) -> tuple[FloatArray, set[str], dict[str, int]] | None:
+    """A column as numbers, marks in it that stand for a missing sample, and odd cells -> their row.
+
+    Few odd cells among numbers count as marks. None where the column holds anything else.
+    """
+    if not pa.types.is_string(column.type):
+        return (numbers_of(column), set(), {}) if _is_numeric(column.type) else None
+    plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
+    is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
+    is_other = compute.fill_null(compute.invert(is_number), False)
+    others = compute.unique(column.filter(is_other)).to_pylist()
+    odd = [text for text in others if text.strip() and not marks_not_measured(text)]
+    rows = {text: compute.index(column, text).as_py() + 1 for text in odd[:MAX_ODD_CELLS]}
+    n_odd = compute.sum(compute.is_in(column, pa.array(odd, pa.string()))).as_py() or 0
+    if len(odd) > MAX_ODD_CELLS or n_odd > MAX_ODD_SHARE * (compute.sum(is_number).as_py() or 0):
         return None
-    try:
-        return numbers_of(column), marks
-    except pa.ArrowException:
-        return None
+    column = compute.if_else(is_other, pa.scalar(None, pa.string()), plain)
+    return numbers_of(column), {text for text in others if text.strip()}, rows
 
 
 def _is_numeric(kind: pa.DataType) -> bool:

@@ -1,4 +1,4 @@
-"""What the drive of a test set can show, as blocks of a report: floors beside the reference, errors by regime, calibrated bands."""
+"""Noise floor and Cramér-Rao bound of a test set, errors by regime and calibrated bands, as blocks of a report."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     drives = drives_of(part.split.tests[test_set], part.reference, part.protocol)
     spread = reference_spread(drives)
     found: list[tuple[str, str, Floor | None]] = [
-        ("v = 0: the reference itself", MISSING, spread),
+        ("zero-sideslip baseline: the reference itself", MISSING, spread),
         ("noise of the reference, at least", MISSING, reference_floor(drives)),
     ]
     for car, what in ((False, "bound, kinematics alone"), (True, "bound, axles known")):
@@ -70,10 +70,11 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
             )
     return Table(
         name,
-        f"What the drive of test set `{test_set}` can show, root mean square over the scored samples: the reference, the white noise in it "
-        f"(slow or smoothed errors are not seen), and the posterior Cramér-Rao bound of causal estimators by what they read. Kinematics "
-        f"alone knows nothing of the car; the other bounds know its axles but for 23 % of the tyres' stiffness and for errors as large as "
-        f"this drive's own. A yardstick under these models: an error below a bound says that an estimator knows more of the car.",
+        f"Noise floor and Cramér-Rao bound of test set `{test_set}`, root mean square over the scored samples: the reference, the white noise "
+        f"in it (slow or smoothed errors are not included), and the posterior Cramér-Rao bound of causal estimators by their inputs. "
+        f"Bounds from kinematics alone use no parameters of the car; the others use its axles, with 23 % uncertainty of the tyres' "
+        f"stiffness and model errors as large as on this drive. An error below a bound shows that an estimator uses more information on "
+        f"the car than the bound's model.",
         pd.DataFrame(rows),
         {
             "what": Column("what"),
@@ -119,8 +120,8 @@ def regime_table(
     }
     return Table(
         name,
-        f"RMSE(β) [deg] by regime, of each the seed chosen on validation; in brackets the share of the samples. Straight: yaw rate within "
-        f"±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
+        f"RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets the share of samples. Straight: yaw rate "
+        f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
         f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {LEAST_SECONDS:g} s are left out.",
         pd.DataFrame(rows),
         {
@@ -172,14 +173,14 @@ def band_blocks(
         return []
     table = Table(
         f"bands_{file}",
-        f"Calibrated 90 % bands of β on test set `{test_set}`: errors inside, with the 95 % interval over blocks of the drive and the 10 "
-        f"and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full width; interval score and CRPS, in which a "
-        f"wide band earns nothing; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how many "
-        f"equal manoeuvres the errors are spread over.",
+        f"Calibrated 90 % bands of β on test set `{test_set}`: coverage, with the 95 % interval over blocks of the drive and the 10 "
+        f"and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full width; interval score and CRPS, which "
+        f"penalise wide bands; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and over how "
+        f"many equal manoeuvres the errors are spread.",
         pd.DataFrame(rows),
         {
             "title": Column("estimator"),
-            SHOWN: Column("inside [%]", decimals=1),
+            SHOWN: Column("coverage [%]", decimals=1),
             "interval": Column("95 % interval [%]"),
             "coverage_90_p10": Column("of manoeuvres, 10 % [%]", decimals=0),
             "coverage_90_p90": Column("90 % [%]", decimals=0),
@@ -192,8 +193,8 @@ def band_blocks(
     )
     figure = Figure(
         f"reliability_{file}",
-        f"Reliability of the bands of β on test set `{test_set}`: errors inside over the nominal level, with 95 % intervals over blocks. "
-        f"On the diagonal bands hold what they say; above it they are too wide.",
+        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, with 95 % intervals over blocks. "
+        f"On the diagonal, coverage is as stated; above it, bands are too wide.",
         reliability_figure(LEVELS, drawn),
     )
     return [table, figure]

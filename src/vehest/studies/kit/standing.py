@@ -8,11 +8,13 @@ from typing import Any
 
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
-from vehest.report.style import MISSING, fixed, listed
+from vehest.report.style import MISSING, decimals_for, fixed, listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name
 
-BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
+BEST = "best"
+NOT_SIGNIFICANT = "not significant"  # a difference, as cells of tables state it
+BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the static map"}
 
 
 def ranking_of(
@@ -41,7 +43,7 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
             and ranking.intervals
             and baseline not in ranking.missing_baselines
         )
-        answers = {True: "yes", False: "no", None: "not told apart"}
+        answers = {True: "yes", False: "no", None: NOT_SIGNIFICANT}
         columns[f"beats_{baseline}"] = (
             answers[ranking.beats(name, baseline)] if compared else MISSING
         )
@@ -60,60 +62,72 @@ def _against_best(ranking: Ranking, name: Name) -> str:
     if not ranking.order:
         return MISSING
     if name == ranking.order[0]:
-        return "lowest"
+        return BEST
     own = ranking.pairs.get((ranking.order[0], name))
     if own is None or own.verdict == "not told apart":
-        return MISSING if own is None else own.verdict
+        return MISSING if own is None else NOT_SIGNIFICANT
     return f"+{fixed(-own.difference, 3)} [{fixed(-own.high, 3)}, {fixed(-own.low, 3)}]"
 
 
-def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) -> str:
-    """Who has the lowest error, and whether that is more than chance: a winner only where it may be called one."""
-    if not ranking.order:
-        return f"On {where} no estimator has a finite sideslip error."
+def figure_of(ranking: Ranking, name: Name) -> str:
+    """RMSE(β) of an estimator over all its seeds with its 95 % interval: ``0.19° [0.16, 0.23]``."""
+    size = ranking.rmse[name]
+    decimals = max(2, decimals_for([size], 2))
+    low, high = ranking.intervals.get(name, (math.nan, math.nan))
+    if not math.isfinite(low):
+        return f"{fixed(size, decimals)}°"
+    return f"{fixed(size, decimals)}° [{fixed(low, decimals)}, {fixed(high, decimals)}]"
+
+
+def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
+    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in Markdown."""
     best = ranking.order[0]
-    figure = f"RMSE(β) over all seeds {fixed(ranking.rmse[best], 3)}°"
-    if best in ranking.intervals:
-        low, high = ranking.intervals[best]
-        figure += f" [{fixed(low, 3)}, {fixed(high, 3)}]"
-    if ranking.winner is not None:
-        return (
-            f"On {where} **{titles[best]}** has the lowest sideslip error, **{figure}**: below every other candidate, "
-            f"v = 0 and the static map, each by more than chance.{_blocks_sentence(ranking)}"
-        )
+    words = f"**Best: {titles[best]}, {figure_of(ranking, best)}.**"
     if ranking.n_blocks < LEAST_BLOCKS:
-        return f"On {where} the lowest error is that of {titles[best]} ({figure}), but the test is too short to tell estimators apart."
-    reasons = _reasons(ranking, titles)
-    return (
-        f"On {where} **no estimator can be called best**: the lowest error is that of {titles[best]} ({figure}), "
-        f"{reasons}.{_blocks_sentence(ranking)}"
-    )
-
-
-def _reasons(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    best = ranking.order[0]
-    reasons = []
-    if best[0] in BASELINES:
-        reasons.append("which is a baseline")
-    level = [titles[name] for name in ranking.not_told_apart]
-    if level:
-        reasons.append(
-            f"which is not told apart from {listed(level) if len(level) <= 6 else f'{len(level)} others'}"
+        return f"{words} The test is too short to compare estimators."
+    equal = [titles[name] for name in ranking.not_told_apart]
+    if not equal:
+        return (
+            f"{words} Every other estimator is significantly worse." if ranking.order[1:] else words
         )
-    for baseline in BASELINES:
-        if baseline in ranking.missing_baselines:
-            reasons.append(f"which was not compared with {BASELINE_TITLES[baseline]}")
-        elif (
-            best[0] not in BASELINES
-            and ranking.beats(best, baseline) is not True
-            and not any(n[0] == baseline for n in ranking.not_told_apart)
-        ):
-            reasons.append(f"which does not beat {BASELINE_TITLES[baseline]}")
-    return " and ".join(reasons) or "by chance or not"
+    if len(equal) == 1:
+        return f"{words} {equal[0]} is not significantly worse."
+    others = equal[1] if len(equal) == 2 else f"{len(equal) - 1} others"
+    return f"{words} {equal[0]} and {others} are not significantly worse."
 
 
-def _blocks_sentence(ranking: Ranking) -> str:
+def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) -> str:
+    """The best estimator, those that are not significantly worse, and whether it beats the baselines."""
+    if not ranking.order:
+        return f"No estimator has a finite sideslip error on {where}."
+    if ranking.n_blocks < LEAST_BLOCKS:
+        return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, where)}"
+    return f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} {basis_sentence(ranking, where)}"
+
+
+def _baselines_sentence(ranking: Ranking) -> str:
+    """Whether the best beats the baselines significantly, after a space; empty where it is one."""
+    best = ranking.order[0]
+    if best[0] in BASELINES:
+        return " It is a baseline."
+    missing = [BASELINE_TITLES[name] for name in ranking.missing_baselines]
+    others = [name for name in BASELINES if name not in ranking.missing_baselines]
+    beaten = [BASELINE_TITLES[name] for name in others if ranking.beats(best, name)]
+    level = [BASELINE_TITLES[name] for name in others if not ranking.beats(best, name)]
+    sentences = [
+        f" It is significantly better than {listed(beaten)}." if beaten else "",
+        f" It is not significantly better than {listed(level)}." if level else "",
+        f" It was not compared with {listed(missing)}." if missing else "",
+    ]
+    return "".join(sentences)
+
+
+def basis_sentence(ranking: Ranking, where: str) -> str:
+    """What the figures are and how they were compared."""
+    figures = f"RMSE(β) over all seeds with its 95 % interval, on {where}"
+    if ranking.n_blocks < LEAST_BLOCKS:
+        return f"{figures}."
     return (
-        f" Paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, corrected by Holm; the "
-        f"squared error of the first is spread as over {ranking.effective_blocks:.0f} equal blocks."
+        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, "
+        f"corrected by Holm. Effective number of blocks, by the squared error of the best: {ranking.effective_blocks:.0f}."
     )

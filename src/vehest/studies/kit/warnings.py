@@ -1,4 +1,4 @@
-"""What a reader has to know before trusting a comparison: tests without sideslip, trainings cut short, ranges of another kind."""
+"""Warnings of a comparison: tests without sideslip, trainings that ended early, test ranges of another kind."""
 
 from __future__ import annotations
 
@@ -15,13 +15,9 @@ from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
-LITTLE_SIDESLIP = (
-    0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
-)
+LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly distinguishes estimators
 CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
-SILENT = (
-    0.7  # bound over the reference itself, above which a drive says less of v than was known before
-)
+SILENT = 0.7  # bound over the reference itself, above which a drive adds no information on v
 DIFFERENT = (
     1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 )
@@ -58,9 +54,9 @@ def _standing(artefacts: PartArtefacts) -> list[str]:
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
-    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs that say little of it; none if it can.
+    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs with little information on it; none if it can.
 
-    An error that is lower than the bound shows that the car itself tells what the bound does not know of.
+    An error below the bound shows that an estimator uses information that the bound does not.
     """
     level = _level(artefacts, artefacts.split.tests[test_set])
     found = []
@@ -72,7 +68,7 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     )
     if min(bound, error) > SILENT * level:
         found.append(
-            f"what was measured tells sideslip to no better than {bound:.2g}° (Cramér-Rao), where v = 0 errs by {level:.2g}°"
+            f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the zero-sideslip baseline {level:.2g}°"
         )
     return found
 
@@ -97,13 +93,13 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
         if level < LITTLE_SIDESLIP:
             found.append(
                 f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the time below "
-                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide who is first."
+                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide the order."
             )
     return found
 
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
-    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs say little of v."""
+    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain little information on v."""
     runs = runs_of(artefacts)
     found = list[str]()
     for test_set, spans in artefacts.split.tests.items():
@@ -114,21 +110,21 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
         if error < CLOSE * noise:
             found.append(
                 f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
-                f"who is first may be the reference's doing."
+                f"errors of the reference may decide the order."
             )
         if math.isnan(bound):
             continue
         level = _level(artefacts, spans)
         if min(bound, error) > SILENT * level:
             found.append(
-                f"Test set `{test_set}` is a silent drive: what the estimators read tells sideslip to no better than {bound:.2g}° "
-                f"(Cramér-Rao), and v = 0 errs by {level:.2g}°; it cannot rank estimators."
+                f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their inputs is {bound:.2g}°, and the error of "
+                f"the zero-sideslip baseline {level:.2g}°."
             )
     return found
 
 
 def _kinds(artefacts: PartArtefacts) -> list[str]:
-    """Where a test goes beyond what was learnt from, in lateral acceleration, sideslip or speed."""
+    """Where a test goes beyond the training ranges in lateral acceleration, sideslip or speed."""
     if not artefacts.split.train:
         return []
     learnt = _reference(artefacts, artefacts.split.train)
@@ -152,7 +148,7 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
             )
         if short:
             found.append(
-                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than what was learnt."
+                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than the training."
             )
         kinds = [artefacts.kinds_of(own) for own in (spans, artefacts.split.train)]
         if kinds[0] != kinds[1]:

@@ -1,0 +1,283 @@
+"""Reads estimates of v or β from tables of any tool, and from those of `vehest estimate`.
+
+table, columns that the user names -> column, unit and sign -> clock, shifted -> `Estimate`
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vehest.alignment.checks import checks_of_recording, merged_findings
+from vehest.data.errors import ConfigurationError, DataError, listed, printable, suggestion
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.store import is_stored_estimate, read_estimate
+from vehest.data.units import factor_to_si
+from vehest.run.printing import complain, counted, note
+from vehest.run.reference_checks import CHECKS_OF_SIGNS_AND_UNITS
+from vehest.run.time_shift import Series, estimate_shift
+from vehest.sources.base import read_single
+from vehest.sources.surveys.tables import shape_of, unit_in_name
+from vehest.sources.tables import TextLayout, column_names, is_parquet
+from vehest.sources.unit_spellings import plain_unit
+
+CHANNELS_OF_QUANTITIES = {"time": "time", "vy": "vy_ref", "sideslip": "sideslip_ref"}
+"""Quantity that ``--column`` names -> time, or the channel that its column is read as."""
+SPELLINGS = {
+    "time": ("time", "t", "timestamp", "zeit"),
+    "vy_ref": ("vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"),
+    "sideslip_ref": (
+        "sideslip",
+        "beta",
+        "β",
+        "slip",
+        "slipangle",
+        "sideslipangle",
+        "betaest",
+        "betahat",
+    ),
+}
+"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and units aside."""
+OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
+"""Columns that estimates of vehest have, and those of other tools do not."""
+DEFAULT_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
+TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class NamedColumn:
+    """A column that the user names: ``sideslip=-Beta_CarMaker:deg``."""
+
+    channel: str  # ``time``, or the channel that it is read as
+    text: str  # a sign, the name and a unit, as they were given
+
+    def find(self, names: Sequence[str]) -> tuple[str, str, int] | None:
+        """Name, unit (empty if none is stated) and sign of the column in a table; None if the table lacks it."""
+        for sign, text in ((1, self.text), (-1, self.text.removeprefix("-"))):
+            if text in names:
+                return text, "", sign
+            name, _, unit = text.rpartition(":")
+            if name in names:
+                return name, unit, sign
+        return None
+
+
+def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
+    """Columns from ``QUANTITY=COLUMN`` words; raises `ConfigurationError` for an unknown quantity or no column."""
+    columns = []
+    for word in words:
+        quantity, _, text = word.partition("=")
+        if quantity not in CHANNELS_OF_QUANTITIES:
+            meant = suggestion(quantity, CHANNELS_OF_QUANTITIES) or ";"
+            raise ConfigurationError(
+                f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an estimate{meant} "
+                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column sideslip=Beta:deg"
+            )
+        if not text.strip("-"):
+            raise ConfigurationError(f"--column {printable(word)} names no column")
+        columns.append(NamedColumn(CHANNELS_OF_QUANTITIES[quantity], text))
+    return columns
+
+
+def parse_shift(text: str) -> float | None:
+    """Seconds of ``--shift``, None for ``auto``; raises `ConfigurationError` for anything else."""
+    if text == AUTO:
+        return None
+    with suppress(ValueError):
+        if math.isfinite(seconds := float(text)):
+            return seconds
+    raise ConfigurationError(
+        f"--shift must be a number of seconds or auto, not '{printable(text)}'"
+    )
+
+
+def read_estimate_table(
+    file: Path,
+    drive: Recording,
+    columns: Sequence[NamedColumn] = (),
+    shift: float | None = 0.0,
+) -> Estimate:
+    """Read v or β from a table of any tool, or of ``vehest estimate``.
+
+    Columns are found by name, whatever their case; a unit in brackets or at the end of a name
+    counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's u.
+    Prints a warning where unit or sign contradict the recording.
+
+    Parameters
+    ----------
+    file : Path
+        CSV or Parquet. An estimate of ``vehest estimate`` in Parquet is read as it is.
+    drive : Recording
+        That was estimated.
+    columns : sequence of NamedColumn
+        Take precedence over columns that are found by name; those that the table lacks are ignored.
+    shift : float or None
+        Seconds that are added to the times; None: by correlation with the reference.
+
+    Raises
+    ------
+    DataError
+        No time or neither v nor β, an unknown unit, or an ambiguous shift.
+    """
+    if file.suffix == ".parquet" and is_stored_estimate(file):
+        return read_estimate(file)
+    layout = _layout(file)
+    names = column_names(file, layout)
+    if is_parquet(file) and OF_VEHEST.intersection(names):
+        complain(
+            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            "description: another program has written it anew; it is read like another tool's table"
+        )
+    found = _columns_of(file, names, columns)
+    time = found.pop("time", None)
+    channel = next((name for name in ("vy_ref", "sideslip_ref") if name in found), None)
+    if time is None or channel is None:
+        raise DataError(_missing_columns(file, names, time is None))
+    options = {
+        "name": file.stem,
+        "source": "text_log" if layout.rows_below_names else "tabular",
+        "vehicle": "unknown",
+        "clock": "interpolate",
+        "gappy": [channel],
+        "time": {key: time[key] for key in ("column", "unit")},
+        "channels": {channel: found[channel]},
+    }
+    plain = asdict(TextLayout())
+    options |= {name: value for name, value in asdict(layout).items() if value != plain[name]}
+    table = read_single(options, file)
+    table = replace(table, start_time=table.start_time + _seconds(file, table, drive, shift))
+    _warn_of_estimate(file, str(found[channel]["column"]), table, drive)
+    values = table[channel]
+    if channel == "sideslip_ref":
+        values = np.tan(values) * np.interp(table.time, drive.time, drive["vx"])
+    return Estimate(
+        drive.id,
+        file.stem,
+        table.rate_hz,
+        table.start_time,
+        {"vy": values, "sideslip": np.zeros_like(values)},
+    )
+
+
+def names_of_table(file: Path) -> list[str]:
+    """Names of a table's columns; raises `DataError` where it cannot be read."""
+    return column_names(file, _layout(file))
+
+
+def _layout(file: Path) -> TextLayout:
+    """Delimiter, decimal mark, encoding and lines beside the rows of a table of text."""
+    return TextLayout() if is_parquet(file) else shape_of(file).layout
+
+
+def _columns_of(
+    file: Path, names: Sequence[str], columns: Sequence[NamedColumn]
+) -> dict[str, dict[str, str | int]]:
+    """Time and channels of a table with column, unit and sign, as a data set declares them."""
+    found: dict[str, dict[str, str | int]] = {}
+    for named in columns:
+        place = named.find(names)
+        if place is not None:
+            name, stated, sign = place
+            unit = unit_of(named.channel, name, file, stated)
+            found[named.channel] = {"column": name, "unit": unit, "sign": sign}
+    is_chosen = not {"vy_ref", "sideslip_ref"}.isdisjoint(found)
+    for quantity, accepted in SPELLINGS.items():
+        for name in names if quantity == "time" or not is_chosen else ():
+            if quantity not in found and _plain_names(name) & set(accepted):
+                found[quantity] = {"column": name, "unit": unit_of(quantity, name, file)}
+    return found
+
+
+def _plain_names(name: str) -> set[str]:
+    """A column's name without case, blanks, underscores and what is in brackets, with and without the unit that it ends in."""
+    bare = re.sub(r"[\[(].*?[\])]", "", name).strip()
+    forms = {bare, re.sub(r"[_\s]+[^_\s]+$", "", bare) if unit_in_name(bare) else bare}
+    if bare.lower().rpartition("_")[2] in TIME_UNITS:
+        forms.add(bare.rpartition("_")[0])
+    return {re.sub(r"[\s_]", "", form).lower() for form in forms}
+
+
+def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
+    """What a table lacks, the accepted names, and how to name a column."""
+    if is_time:
+        lacks = f"no column time [s] (accepted names: {', '.join(SPELLINGS['time'])}"
+        remedy = "--column time=NAME"
+    else:
+        accepted = ", ".join((*SPELLINGS["vy_ref"], *SPELLINGS["sideslip_ref"]))
+        lacks = f"no column vy [m/s] or sideslip [rad] (accepted names: {accepted}"
+        remedy = "--column sideslip=NAME:deg"
+    return f"'{file}' has {lacks}; it has {printable(counted(names))}); name it, as in {remedy}"
+
+
+def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
+    """The unit that is stated or in a column's name, or the default; raises `DataError` for an unknown one."""
+    written = re.search(r"[\[(](.*?)[\])]", name)
+    text = stated or (written[1] if written else unit_in_name(name))
+    if quantity == "time" and not text and (last := name.lower().rpartition("_")[2]) in TIME_UNITS:
+        text = last if "_" in name else ""
+    if not text:
+        return DEFAULT_UNITS[quantity]
+    unit = TIME_UNITS.get(text) if quantity == "time" else plain_unit(text)
+    if unit is None:
+        known = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
+        raise DataError(
+            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known are {known}); "
+            "convert it, or rename the column"
+        )
+    try:
+        factor_to_si(unit, DEFAULT_UNITS[quantity])
+    except DataError:
+        raise DataError(
+            f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of {quantity.removesuffix('_ref')}; "
+            "name its unit, as in --column sideslip=NAME:deg"
+        ) from None
+    return unit
+
+
+def _seconds(file: Path, table: Recording, drive: Recording, shift: float | None) -> float:
+    """Seconds to add to the times of a table; a shift that was estimated is printed."""
+    if shift is not None:
+        return shift
+    (channel,) = table.channels
+    reference = drive["vy_ref"]
+    if channel == "sideslip_ref":
+        reference = np.arctan2(reference, drive["vx"])
+    try:
+        estimated = estimate_shift(
+            Series(table.time, table[channel]), Series(drive.time, reference)
+        )
+    except DataError as error:
+        raise DataError(f"'{file}': {error}") from None
+    note(
+        f"'{file}': shifted by {estimated.seconds:.3f} s, where it correlates best with the reference "
+        f"({estimated.correlation:.3f}); this compensates for a delay of the estimate as well"
+    )
+    return estimated.seconds
+
+
+def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recording) -> None:
+    """Print a warning where an estimate has another unit or sign than its column says, by the channels of the recording."""
+    (channel,) = table.channels
+    measured = drive.without_references()
+    values = np.interp(measured.time, table.time, table[channel], left=np.nan, right=np.nan)
+    together = replace(
+        measured,
+        channels={**measured.channels, channel: values},
+        gappy=measured.gappy | {channel},
+    )
+    for finding in merged_findings([checks_of_recording(table), checks_of_recording(together)]):
+        concerns = finding.channel == channel or (
+            not finding.channel and channel in finding.message
+        )
+        if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
+            complain(
+                f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
+            )

@@ -1,0 +1,94 @@
+"""Files of text that hold no table with a column a signal: long format, raw frames, quoted rows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from vehest.data.errors import DataError, printable
+
+_CANDUMP = re.compile(r"\s*\(\d+(\.\d+)?\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
+_NAMES_SIGNAL = re.compile(
+    r"(signal|channel|sensor|kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
+    r"topic|tag|key)(_?(name|id))?|\w*_name|name",
+    re.IGNORECASE,
+)
+_NAMES_VALUE = re.compile(r"(\w*_)?(value|val|wert|reading)", re.IGNORECASE)
+_NAMES_FRAME = re.compile(
+    r"((can|arb(itration)?|frame|msg|message)?[_ ]?id(entifier)?(_?hex)?)", re.IGNORECASE
+)
+_NAMES_BYTES = re.compile(
+    r"data([_ ]?(bytes|hex|field))?|payload|(data|byte|d|b)[_ ]?[07]|dlc", re.IGNORECASE
+)
+_BYTES = re.compile(r"(0x)?[0-9A-Fa-f]{2}([ _:-]?[0-9A-Fa-f]{2})*")
+MIN_ROWS_OF_SIGNAL = 5  # of each quantity in long format, on average
+
+
+def require_columns_of_signals(
+    file: Path, lines: Sequence[str], tables: Mapping[str, Mapping[int, list[str]]]
+) -> None:
+    """Refuse, by a `DataError` with the way out, a text whose columns are not signals.
+
+    Parameters
+    ----------
+    file : Path
+        For messages.
+    lines : sequence of str
+        First lines of the file.
+    tables : mapping
+        Delimiter -> number of each line that holds something -> its cells.
+    """
+    filled = [line.strip() for line in lines if line.strip()]
+    if filled and all(map(_CANDUMP.match, filled[:20])):
+        raise DataError(
+            f"'{file}' holds raw frames of a CAN bus as candump writes them; "
+            "declare it with the bus's DBC (docs/sources/can.md), or save its decoded signals"
+        )
+    for delimiter, rows in tables.items():
+        table = [row for row in rows.values() if len(row) > 1]
+        if table:
+            _require_no_frames(file, table)
+            _require_one_row_a_time(file, table)
+        quoted = [row for row in rows.values() if len(row) == 1 and row[0].count(delimiter) > 1]
+        if delimiter in ";\t," and len(quoted) > 0.9 * len(rows) and filled[-1].startswith('"'):
+            raise DataError(
+                f"'{file}' has each row in one pair of quotes; "
+                f"remove them, for example by: sed -i 's/^\"//; s/\"$//' {file.name}"
+            )
+
+
+def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
+    for header, row in pairwise(table[:21]):
+        cells = dict(zip(map(str.strip, header), map(str.strip, row), strict=False))
+        has_id = any(map(_NAMES_FRAME.fullmatch, cells))
+        in_bytes = [cell for name, cell in cells.items() if _NAMES_BYTES.fullmatch(name)]
+        if (
+            has_id
+            and in_bytes
+            and all(_BYTES.fullmatch(cell) or cell.isdigit() for cell in in_bytes)
+        ):
+            raise DataError(
+                f"'{file}' holds raw frames of a CAN bus; decode them by the bus's DBC, or save "
+                "them as .asc, .blf or candump's .log and declare them (docs/sources/can.md)"
+            )
+
+
+def _require_one_row_a_time(file: Path, table: Sequence[Sequence[str]]) -> None:
+    for at, header in enumerate(table[:20]):
+        rows = [row for row in table[at + 1 :] if len(row) == len(header)]
+        of_signal = [k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip())]
+        of_value = [k for k, name in enumerate(header) if _NAMES_VALUE.fullmatch(name.strip())]
+        for k in of_signal:
+            names = [row[k] for row in rows]
+            n_names = len(set(names))
+            is_text = not any(name.strip().lstrip("+-")[:1].isdigit() for name in names)
+            if of_value and is_text and 1 < n_names <= len(rows) / MIN_ROWS_OF_SIGNAL:
+                signal, value = printable(header[k].strip()), printable(header[of_value[0]].strip())
+                raise DataError(
+                    f"'{file}' is in long format, one value a row: '{signal}' names the quantity, "
+                    f"'{value}' holds it; make a column of each, for example by pandas: "
+                    f"table.pivot_table(index='TIME', columns='{signal}', values='{value}')"
+                    ".interpolate().to_csv('wide.csv'), with the name of the column of times"
+                )

@@ -1,0 +1,193 @@
+"""Tables that loggers write with odd headers, cells, times and layouts: read right, or refused with the way out."""
+
+import datetime
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from planted_logs import G, drive, usual, write
+
+from vehest.data.errors import DataError
+from vehest.run.own_car.dataset import draft
+from vehest.run.own_car.inspect import inspect
+from vehest.sources.base import open_source
+from vehest.sources.clock_times import seconds_of_text
+
+
+def read_back(file):
+    """The data set's draft, and the recording that its source reads by it."""
+    made = draft(inspect("my_car", [file]))
+    return made, open_source(made.dataset).read(file.stem)
+
+
+def assert_yaw_rate_is(recording, table):
+    np.testing.assert_allclose(recording["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+
+
+def lines_of(table):
+    return table.round(5).to_csv(index=False).splitlines()
+
+
+def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
+    d = drive()
+    names = "t,speed,lateral_acc,speed,y_acc,z_rate"
+    head = [
+        "A lap timer",
+        "Format,3",
+        "",
+        names,
+        "s,m/s,G,m/s,G,deg/s",
+        ",100: gps,calc,calc,101,102",
+    ]
+    product = d["vx"] * d["r"] / G  # computed, and not measured
+    columns = (d["t"], d["vx"], product, d["vx"] + 0.01, d["ay"] / G, np.degrees(d["r"]))
+    rows = [",".join(f"{value:.5f}" for value in row) for row in zip(*columns, strict=True)]
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join([*head, *rows]), encoding="utf-8")
+    made, recording = read_back(file)
+    channels = {name: entry["column"] for name, entry in made.dataset["channels"].items()}
+    assert {channels.pop("vx"), channels.pop("vx_ref")} == {"speed #2", "speed #4"}
+    assert channels == {"yaw_rate": "z_rate", "ay": "y_acc"}
+    np.testing.assert_allclose(recording["ay"], d["ay"], atol=1e-4)
+    assert recording.rate_hz == 50.0
+
+
+@pytest.mark.parametrize("of_names", [True, False], ids=["names", "rows"])
+def test_a_delimiter_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names):
+    table = usual(drive())
+    lines = lines_of(table)
+    lines = (
+        [lines[0] + ",", *lines[1:]] if of_names else [lines[0], *(row + "," for row in lines[1:])]
+    )
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    assert_yaw_rate_is(read_back(file)[1], table)
+
+
+@pytest.mark.parametrize("cell", ["1.#INF", "-1.#IND", "#VALUE!", "SNA", "not available", "bad!"])
+def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
+    table = usual(drive()).round(5)
+    lines = [line.split(",") for line in lines_of(table)]
+    lines[701][2] = cell
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join(map(",".join, lines)), encoding="utf-8")
+    made, recording = read_back(file)
+    assert made.dataset.get("missing", [cell]) == [cell]
+    table.loc[700, "Gyro"] = 0.5 * (table.loc[699, "Gyro"] + table.loc[701, "Gyro"])
+    assert_yaw_rate_is(recording, table)
+    named = [note for note in made.notes if "'bad!' in data row 701 of column 'Gyro'" in note]
+    assert len(named) == (cell == "bad!")
+
+
+def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
+    table = usual(drive())
+    lines = lines_of(table)
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join([*lines[:500], lines[0], *lines[500:]]), encoding="utf-8")
+    made, recording = read_back(file)
+    assert made.dataset["drop_rows"] == {"lap": [500]}
+    assert_yaw_rate_is(recording, table)
+
+
+def test_a_unit_of_time_that_the_steps_contradict_is_asked_with_the_one_that_fits(tmp_path):
+    table = usual(drive()).rename(columns={"Time [s]": "tow(msec)"})
+    clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
+    assert (clock.column, clock.unit, clock.asked) == ("tow(msec)", "s", True)
+    assert "50 Hz if in s, 50000 Hz in ms, as the header says" in clock.evidence
+
+
+def clock_texts(written):
+    start = datetime.datetime(2025, 5, 31, 23, 59, 0)
+    return [written(start + datetime.timedelta(milliseconds=20 * k)) for k in range(6000)]
+
+
+TIMES = {
+    "12 hours": lambda at: at.strftime("%m/%d/%Y %I:%M:%S.%f %p"),
+    "day first": lambda at: at.strftime("%d/%m/%Y %H:%M:%S.%f"),
+    "milliseconds by a colon": lambda at: at.strftime("%H:%M:%S:") + at.strftime("%f")[:3],
+    "timedelta": lambda at: f"{at.day % 31} days {at:%H:%M:%S.%f}",
+}
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_times_of_a_clock_in_other_forms_go_on_past_midnight(tmp_path, name):
+    table = usual(drive())
+    table["Time [s]"] = clock_texts(TIMES[name])
+    made, recording = read_back(write(tmp_path / "lap.csv", table))
+    assert (made.dataset["time"]["unit"], recording.rate_hz) == ("clock", 50.0)
+    assert_yaw_rate_is(recording, table)
+
+
+def test_text_that_is_no_time_is_none():
+    for text in ("12:61 h", "31/31/2025 10:00:00", "first 10:00:00"):
+        assert seconds_of_text(pa.chunked_array([[text, text]])) is None
+
+
+def test_durations_of_parquet_are_times_and_columns_that_are_not_read_are_named(tmp_path):
+    table = usual(drive())
+    stored = table.assign(ok=True, note="x")
+    stored["Time [s]"] = pd.to_timedelta(table["Time [s]"], unit="s")
+    file = tmp_path / "lap.parquet"
+    pq.write_table(pa.Table.from_pandas(stored), file)
+    made, recording = read_back(file)
+    assert made.dataset["time"] == {"column": "Time [s]", "unit": "ns"}
+    assert_yaw_rate_is(recording, table)
+    assert [note for note in made.notes if note.startswith("not read: column 'ok' holds bool")]
+
+
+def long_format():
+    rows = ((k, name, k % 7) for k in range(200) for name in ("speed", "accy_can"))
+    return "time,lap,telemetry_name,telemetry_value\n" + "".join(
+        f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows
+    )
+
+
+UNSUITED = {
+    "long format": (long_format(), "'telemetry_name' names the quantity, 'telemetry_value' holds"),
+    "raw frames": (
+        "Time,ID,DLC,Data\n" + "".join(f"{k},1A{k % 9},2,00 {k % 256:02X}\n" for k in range(99)),
+        "raw frames of a CAN bus; decode them by the bus's DBC",
+    ),
+    "candump": (
+        "".join(f"(1436509052.{k:06d}) can0 1A{k % 9}#2A36{k % 256:02X}\n" for k in range(99)),
+        "raw frames of a CAN bus as candump writes them",
+    ),
+    "quoted rows": (
+        "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
+        "each row in one pair of quotes; remove them",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSUITED)
+def test_a_file_without_a_column_a_signal_is_named_with_the_way_out(tmp_path, name):
+    text, said = UNSUITED[name]
+    file = tmp_path / "lap.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError) as refused:
+        inspect("my_car", [file])
+    assert said in str(refused.value)
+
+
+def test_a_column_of_names_beside_columns_of_signals_is_no_long_format(tmp_path):
+    table = usual(drive()).assign(name="lap", value=np.arange(6000) % 50)
+    assert inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel["ay"]
+
+
+def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_path):
+    d = drive()
+    ramp = np.clip((d["t"] - 5.0) / 10.0, 0.0, 1.0)
+    random = np.random.default_rng(0)
+    d |= {name: ramp * d[name] for name in ("vx", "r", "vy")}
+    d["ay"] = np.gradient(d["vy"], d["t"]) + d["vx"] * d["r"] + 0.05 * random.standard_normal(6000)
+    crawls = d["vx"] < 0.6
+    d["sideslip"] = np.where(
+        crawls, random.uniform(-np.pi, np.pi, 6000), np.arctan2(d["vy"], np.maximum(d["vx"], 0.1))
+    )
+    made, recording = read_back(write(tmp_path / "lap.csv", usual(d)))
+    assert {"name": "velocity_from_sideslip", "min_speed": 1.0} in made.dataset["transforms"]
+    slow = recording["vx"] < 1.0
+    assert np.abs(recording["vy_ref"][slow]).max() == 0.0
+    np.testing.assert_allclose(recording["vy_ref"][~slow], d["vy"][~slow], atol=1e-2)

@@ -1,0 +1,101 @@
+"""README and the guides show commands on docs/examples/lap.csv with their output; here they run in an empty folder as printed."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from place import run_vehest
+
+pytestmark = pytest.mark.apart
+
+ROOT = Path(__file__).resolve().parents[1]
+LOG = ROOT / "docs" / "examples" / "lap.csv"
+SHOWN = re.compile(
+    r"^```sh\n(?P<commands>.*?)^```$(?:\n\n[^`#|]*?)?\n\n?```(?:text|output)\n(?P<output>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+NEEDS = "vehest new my_car lap.csv --yes --wheelbase 2.4"
+"""Writes the data set that the other commands name."""
+
+CASES = [
+    ("README.md", ".venv/bin/vehest new"),
+    ("README.md", ".venv/bin/vehest estimate"),
+    ("docs/own_car.md", "vehest new"),
+    ("docs/own_car.md", "vehest data check my_car"),
+    ("docs/own_recording.md", "vehest data check lap.csv"),
+    ("docs/own_recording.md", "vehest estimate lap.csv"),
+]
+
+
+def shown(page, start):
+    """The command of a page that begins so, and the lines of its output."""
+    for match in SHOWN.finditer((ROOT / page).read_text(encoding="utf-8")):
+        command = match["commands"].splitlines()[-1]
+        if command.startswith(start):
+            return command, match["output"].splitlines()
+    raise AssertionError(f"{page} shows no command that begins with '{start}' with its output")
+
+
+@pytest.fixture
+def folder(elsewhere):
+    """An empty folder with the example log."""
+    (elsewhere / "docs" / "examples").mkdir(parents=True)
+    shutil.copy(LOG, elsewhere / "docs" / "examples")
+    shutil.copy(LOG, elsewhere)
+    return elsewhere
+
+
+def run(command, capsys):
+    words = shlex.split(command.removeprefix(".venv/bin/"))
+    code, out, err = run_vehest(capsys, *words[1:])
+    assert code == 0, err
+    return [line.rstrip() for line in (err + out).splitlines()]
+
+
+@pytest.mark.parametrize(("page", "start"), CASES)
+def test_shown_output_is_what_the_command_prints(page, start, folder, capsys):
+    command, lines = shown(page, start)
+    if "vehest new" not in command:
+        run(NEEDS, capsys)
+    printed = run(command, capsys)
+    missing = [line for line in lines if line.strip() != "…" and line.rstrip() not in printed]
+    assert not missing, "\n".join(printed)
+    if not any(line.strip() == "…" for line in lines):
+        assert len(lines) == len(printed)
+
+
+def test_python_lines_of_the_readme_run(folder, capsys):
+    run(NEEDS, capsys)
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert len([line for line in block.splitlines() if line]) == 6
+    exec(compile(block, "README.md", "exec", dont_inherit=True), {"__name__": "readme"})
+    assert (folder / "out.parquet").is_file()
+
+
+def test_bibtex_of_the_readme_is_the_citation_file():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    fields = dict(re.findall(r"^  (\w+) += \{+(.*?)\}+,?$", text, re.MULTILINE))
+    assert fields == {
+        "author": citation["authors"][0]["name"],
+        "title": citation["title"],
+        "version": citation["version"],
+        "license": citation["license"],
+    }
+
+
+def test_readme_names_every_family_and_the_format_of_every_source():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    formats = text.split("## Formats")[1].split("\n## ")[0]
+    for source in re.findall(r"\(docs/sources/(\w+)\.md\)", formats):
+        tests = [*ROOT.glob(f"tests/sources/test_sources_{source}*.py")]
+        assert tests or source == "text_log"  # tests/proposals/test_proposals.py reads these
+    names = {file.stem for file in (ROOT / "conf" / "estimator").glob("*.yaml")}
+    estimators = text.split("## Estimators")[1].split("\n## ")[0]
+    assert names == set(re.findall(r"`(\w+)`", estimators))
+    assert f"up to {len(names)} estimators" in text
