@@ -179,7 +179,7 @@ def test_training_is_read_and_its_words_are_checked(tmp_path):
     path.write_text(header + "a,100,1000,insufficient,doubling improves by 5 %\n")
     assert read_training(path)["a"].state == "insufficient"
     path.write_text(header + "a,100,1000,enough,\n")
-    with pytest.raises(DataError, match="training 'enough', which is not one of: insufficient"):
+    with pytest.raises(DataError, match="training 'enough', which is not one of: not trained"):
         read_training(path)
     with pytest.raises(MissingError):
         read_training(tmp_path / "none.csv")

@@ -222,7 +222,7 @@ def test_regularisation_is_compared_on_the_same_structures_and_blocks(tmp_path):
         assert found[claim].verdict == "reproduced", (claim, found[claim])
     higher = found["lstm_without_regularisation_higher_other"]
     assert higher.size.value == pytest.approx(0.84 / 0.483, rel=0.05)
-    assert higher.verdict == "met by a trivial baseline", "the planted static map has 0.6"
+    assert higher.verdict == "reproduced", "a weakness is not checked against baselines"
     assert found["lstm_without_regularisation_lower_own"].size.value == pytest.approx(
         0.042 / 0.098, rel=0.05
     )

@@ -737,7 +737,7 @@ def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
         return replace(part, metrics=metrics)
 
     parts = {"real": part, "doubled": only(with_validation(0.8), "NNTF_UH")}
-    rows = {row.candidate: row for row in block_errors.training_rows(parts, "real")}
+    rows = {row.candidate: row for row in block_errors.training_rows(parts, "real", {})}
     assert rows["NNTF_UH"].training == "insufficient"
     assert "-20.0 %, 2 seeds" in rows["NNTF_UH"].reason
     assert rows["NNTF_UH*"].training == "insufficient", "the same networks"

@@ -235,7 +235,7 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
     assert shown["recordings"][0]["rate_hz"] == 100.0
     out, _ = place.done("data", "check", "mine")
-    assert "follows ay - vx·yaw_rate" in out
+    assert "d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation" in out
     assert "yaw_rate" in place("data", "channels")[1]
     assert "one: simulated" in place("data", "show", "mine")[1]
     frame = pd.DataFrame(

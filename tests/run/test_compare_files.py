@@ -93,8 +93,8 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
 @pytest.mark.parametrize(
     ("spoil", "warning"),
     [
-        (lambda vy: 3.6 * vy, "vy_ref is in km/h; set its unit"),
-        (lambda vy: -vy, "sign reversed"),
+        (lambda vy: 3.6 * vy, "vy_ref is in km/h but read as m/s"),
+        (lambda vy: -vy, "signs are inconsistent"),
         (np.zeros_like, "constant at 0 m/s throughout"),
         (lambda vy: vy, ""),
     ],

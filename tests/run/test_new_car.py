@@ -190,6 +190,7 @@ def test_run_takes_what_was_written(log):
     assert set(planned) >= {
         "static_map",
         "data_sheet",
+        "prior_map",
         "self_calibrating",
         "ksnn",
         "luenberger",

@@ -168,10 +168,10 @@ def test_a_step_of_a_window_network_is_the_batch_estimate_one_sample_later():
     batch = vehest.estimate(model, recording)
     stepper = vehest.online(model)
     steps = [
-        stepper.step({name: channels[name][k] for name in model.channels})
+        stepper.step(**{name: channels[name][k] for name in model.channels})
         for k in range(len(table))
     ]
-    vy = np.array([step["vy"] for step in steps])
+    vy = np.array([step.vy for step in steps])
     sideslip = np.array([step["sideslip"] for step in steps])
     assert stepper.horizon_steps == 1
     assert np.array_equal(vy[:-1], batch["vy"][1:], equal_nan=True)

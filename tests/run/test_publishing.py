@@ -209,6 +209,7 @@ def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(c
                 "state": "stale",
                 "changes": changes,
                 "note": "",
+                "n_not_trained": 0,
                 "failure": "it is not in 'results/stale.yaml'",
                 "may_be_stale": "",
             }

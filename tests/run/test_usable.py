@@ -360,7 +360,7 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
         "tracking=none",
         code=3,
         says=(
-            "recording 'lap1' and 1 more lack what estimator 'luenberger' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)",
+            "recording 'lap1' and 1 more lack channels that estimator 'luenberger' requires: ax (transforms: [{name: acceleration_from_speed}] of vx)",
             "vy_ref (transforms: [{name: velocity_from_sideslip}] of sideslip_ref and vx)",
             "'vehest data usable logged'",
         ),
@@ -392,7 +392,7 @@ def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_show
     reasons = {name.split("-")[0]: reason for name, reason in told["failed"].items()}
     assert set(reasons) == {"ksnn", "kalman"}
     assert (
-        "lack what estimator 'ksnn' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)"
+        "lack channels that estimator 'ksnn' requires: ax (transforms: [{name: acceleration_from_speed}] of vx)"
         in reasons["ksnn"]
     )
     assert "steer (not in the log)" in reasons["kalman"]

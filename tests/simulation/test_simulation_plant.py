@@ -575,7 +575,7 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
 
 
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
-    function = compiled._Kept(compiled._advance)
+    function = compiled._CachedFunction(compiled._advance)
     called = Event()
     assert function.lock is not None
     monkeypatch.setattr(function, "dispatcher", called.set)

@@ -87,7 +87,7 @@ def test_the_ferrari_has_one_lost_sample_of_steer_and_the_bias_of_ay_of_the_pape
     [finding] = [finding for finding in checks_of_recording(ferrari) if finding.level != "note"]
     assert (finding.check, finding.channel) == ("spike", "steer")
     assert "1 spike of" in finding.message
-    assert "at 671.67 s" in finding.message
+    assert "at t = 671.67 s" in finding.message
     derived = (ferrari["vy_ref"][2:] - ferrari["vy_ref"][:-2]) * 50.0
     residual = derived - (ferrari["ay"] - ferrari["yaw_rate"] * ferrari["vx"])[1:-1]
     assert residual.mean() == pytest.approx(

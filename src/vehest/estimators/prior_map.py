@@ -9,7 +9,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import UNSET, setting
-from vehest.estimators.base import rate
+from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 from vehest.estimators.self_calibrating import SCALED, TYPICAL_REAR, TYPICAL_WHEELBASE
 
@@ -23,6 +23,13 @@ class PriorMap(Recursive):
 
     name = "prior_map"
     title = "Prior map"
+    trials = (
+        Trial(
+            1.2,
+            "baseline: steady cornering of a typical car; nothing is learnt",
+            "estimator.wheelbase={wheelbase}",
+        ),
+    )
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"
