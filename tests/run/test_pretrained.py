@@ -165,15 +165,15 @@ def test_a_step_of_a_window_network_is_the_batch_estimate_one_sample_later():
     }
     recording = Recording("lap", "unknown", 20.0, 0.0, channels, "simulated")
     model = vehest.load_model("pretrained")
-    batch = vehest.estimate(model, recording)
+    batch = vehest.estimate(recording, model)
     stepper = vehest.online(model)
     steps = [
         stepper.step(**{name: channels[name][k] for name in model.channels})
         for k in range(len(table))
     ]
     vy = np.array([step.vy for step in steps])
-    sideslip = np.array([step["sideslip"] for step in steps])
-    assert stepper.horizon_steps == 1
+    sideslip = np.array([step.sideslip for step in steps])
+    assert stepper.stepper.horizon_steps == 1
     assert np.array_equal(vy[:-1], batch["vy"][1:], equal_nan=True)
     same_row = np.nanmax(np.abs(vy - batch["vy"]))
     assert round(float(same_row), 2) == 0.34  # m/s
