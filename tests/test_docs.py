@@ -190,7 +190,11 @@ def taken_apart(line):
     """Command, arguments and overrides; none where only a command is named. Unknown commands and options fail."""
     words = shlex.split(line, comments=True)[1:]
     command = typer.main.get_command(app)
-    options = {option: parameter for parameter in command.params for option in parameter.opts}
+    options = {
+        option: parameter
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
     if words[0].startswith("-"):
         assert words[0] in {*options, "-h", "--help"}, f"vehest has no option {words[0]}"
         return None
@@ -205,7 +209,7 @@ def taken_apart(line):
     options = {
         option: parameter
         for parameter in command.params
-        for option in parameter.opts
+        for option in (*parameter.opts, *parameter.secondary_opts)
         if parameter.param_type_name == "option"
     }
     fixed = [
