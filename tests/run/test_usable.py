@@ -360,7 +360,8 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
         "tracking=none",
         code=3,
         says=(
-            "recording 'lap1' and 1 more lack channels that estimator 'luenberger' requires: ax (transforms: [{name: acceleration_from_speed}] of vx)",
+            "recording 'lap1' and 1 more lack channels that estimator 'luenberger' requires: "
+            "ax (transforms: [{name: acceleration_from_speed}] of vx)",
             "vy_ref (transforms: [{name: velocity_from_sideslip}] of sideslip_ref and vx)",
             "'vehest data usable logged'",
         ),

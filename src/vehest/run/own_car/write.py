@@ -65,7 +65,8 @@ MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where ther
 DATASET_COMMENTS = {
     "kind": "real | simulated, as which tables and reports list the recordings",
     "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
-    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) and steering_ratio, if known; every command uses them",
+    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) and "
+    "steering_ratio, if known; every command uses them",
     "time": "unit: s, ms, us or ns; null: no time column",
     "clock": "strict | interpolate (across gaps and jitter) | uniform",
     "bridge": "longest gap that is interpolated linearly [s]",
