@@ -12,7 +12,7 @@ from chromium import WIDTHS, axe_violations, browser, complaints, opened
 ROOT = Path(__file__).resolve().parents[1]
 SHOWN = (
     "docs/index.html",
-    "docs/api.html",
+    "docs/from_python.html",
     "docs/estimators.html",
     "docs/estimators/ksnn.html",
     "results/ferrari_drive/report.html",
