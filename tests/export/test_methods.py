@@ -221,6 +221,40 @@ def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest
     )
 
 
+def rows_at_low_speed(estimator):
+    """A car that stands, moves off, rolls below the minimum speed, reverses and starts anew there."""
+    generator = np.random.default_rng(2)
+    time = np.arange(0.0, 40.0, 1.0 / estimator.rate_hz)
+    speed = np.interp(time, [0.0, 3.0, 10.0, 16.0, 24.0, 32.0, 40.0], [0, 0, 9, 2, 2, -4, 12])
+    speed[speed > 8.0] = 8.0
+    yaw_rate = 0.4 * np.sin(0.7 * time) * np.clip(speed, -1.0, 1.0)
+    channels = {
+        "yaw_rate": yaw_rate,
+        "vx": speed,
+        "ay": 0.95 * speed * yaw_rate + 0.1,
+        "ax": np.gradient(speed, time),
+    }
+    rows = np.stack([channels[name] for name in estimator.channels], axis=1)
+    rows += 0.02 * generator.standard_normal(rows.shape)
+    rows[time > 39.0, 1] = estimator.minimum_speed  # exactly the speed below which it rolls
+    rows[np.searchsorted(time, 20.0), 1] = np.nan  # it starts anew below the minimum speed
+    return rows
+
+
+@pytest.mark.parametrize(
+    "config",
+    [own for family, own in VARIANTS if family == "self_calibrating"],
+    ids=lambda own: "-".join(own) or "default",
+)
+@each_precision
+def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
+    config, precision, largest, tmp_path
+):
+    estimator = estimator_class("self_calibrating").from_config(config)
+    rows = rows_at_low_speed(estimator)
+    check(built(estimator, precision, tmp_path), estimator, rows, largest)
+
+
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
 @pytest.mark.parametrize(
     "variant",
