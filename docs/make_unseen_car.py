@@ -45,6 +45,7 @@ VERSION = "1"
 """Raised when the numbers of its tables move."""
 ROOT = Path(__file__).resolve().parents[1]
 CHOICES = "conf/estimator/self_calibrating.yaml"
+CODE_OF_CHOICES = ("src/vehest/estimators", "src/vehest/inference", "src/vehest/run")
 TARGET = ROOT / "results" / "unseen_car"
 RATE = 20.0
 BLOCK = round(10.0 * RATE)  # samples of a block of the bootstrap
@@ -499,9 +500,9 @@ def chosen_since(before: str, now: str) -> list[str]:
 
 def open_cars(cars: Sequence[str], note: str) -> None:
     """Append what is scored to openings.csv, with a note; raises SystemExit where the choices are not committed."""
-    if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators", "src/vehest/run"):
+    if git("status", "--porcelain", "--", CHOICES, *CODE_OF_CHOICES):
         raise SystemExit(
-            f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars"
+            f"{CHOICES} or {', '.join(CODE_OF_CHOICES)} have changes that are not committed; commit them, then open the cars"
         )
     file = TARGET / "openings.csv"
     commit = git("rev-parse", "HEAD")
