@@ -47,8 +47,8 @@ class SelfCalibrating(Recursive):
     v' = (1 - κ) ay - β_y - ω u,   u' = ax - β_x + ω v,   u measured,
     0 = v - b ω + C u φ(a_r) + s e,   a_r = (1 - κ)(ay - β_y) - b ω',   φ(a) = a_m (1 - (1 - |a|/a_m)^p)/p sign(a),   a_m² = a_max² - ax²
 
-    with offsets β, roll leakage κ, distance b and compliance C of the rear axle, and its correlated error e. Filters differ in a_max,
-    one takes φ from the network, and count by the likelihood of their innovations. Their mean, the network that comes with vehest and
+    with offsets β, roll leakage κ, distance b and compliance C of the rear axle, and its correlated error e. Filters differ in a_max
+    and count by the likelihood of their innovations. Their mean, the network that comes with vehest and
     v = ω (b - C u²) with the priors of b and C count by how well each explains v' and u' on the drive so far, which needs no reference.
     """
 

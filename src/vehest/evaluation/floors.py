@@ -322,7 +322,7 @@ def cramer_rao_floor(
     Raises
     ------
     ValueError
-        Vx or yaw_rate is not among the inputs, or one of them is none of `INPUTS`.
+        ``vx`` or ``yaw_rate`` is not among the inputs, or an input is none of `INPUTS`.
     """
     if not {"vx", "yaw_rate"} <= set(inputs) <= set(INPUTS):
         raise ValueError(

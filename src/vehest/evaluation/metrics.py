@@ -627,7 +627,7 @@ def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
     Parameters
     ----------
     nis : FloatArray
-        EᵀS⁻¹e of each update, shape (K,).
+        eᵀS⁻¹e of each update, shape (K,).
     dof : FloatArray
         Numbers measured at each, shape (K,); samples with none do not count.
 

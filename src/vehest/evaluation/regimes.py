@@ -1,10 +1,11 @@
 """Errors by regime: straight ahead or turning, by lateral acceleration, in transients or steady;
 each a ``subset`` of the metrics.
 
-| regime | samples | | `straight`, `turning` | yaw rate within ±0.05 rad/s, and the rest | |
-`ay_0_2`, `ay_2_4`, `ay_4_6`, `ay_6_` | size of the lateral acceleration from so many to so many
-m/s² | | `transient`, `steady` | yaw rate changes faster than 0.1 rad/s² or lateral acceleration
-faster than 2 m/s³, and the rest |
+| regime | samples |
+| `straight`, `turning` | yaw rate within ±0.05 rad/s, and the rest |
+| `ay_0_2`, `ay_2_4`, `ay_4_6`, `ay_6_` | |lateral acceleration| between these values [m/s²] |
+| `transient` | yaw rate changes faster than 0.1 rad/s² or lateral acceleration than 2 m/s³ |
+| `steady` | the rest |
 
 The two limits of transients are the same at 20 m/s, where a_y ≈ u ω changes by 2 m/s³ with 0.1
 rad/s². They were set before any error was looked at. Rates of change are slopes of lines fitted by

@@ -384,8 +384,8 @@ def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values adjusted for their number: those below 0.05 hold together with an error of at most 5
-    %.
+    """p-values adjusted for their number: those below 0.05 hold together with an error of at
+    most 5 %.
 
     Source: Holm, Scandinavian Journal of Statistics 6 (2), 1979.
     """

@@ -1,3 +1,1 @@
-"""Generic filters: batched, differentiable, and compiled where speed is the point; they know no
-car.
-"""
+"""Generic filters, independent of cars: batched, differentiable, and compiled for speed."""

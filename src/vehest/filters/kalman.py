@@ -35,7 +35,7 @@ def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray
     Parameters
     ----------
     model : LinearModel[FloatArray]
-        That `kalman_scan` was given, its transitions with a dimension for time.
+        The model that `kalman_scan` received, its transitions with a dimension for time.
     filtered : Filtered[FloatArray]
         What it returned.
 

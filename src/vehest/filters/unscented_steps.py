@@ -16,10 +16,10 @@ The adjoint of each function is beside it (``_bar``: gradient of the loss with r
 It receives the values that its function received and adds to gradients unless it says otherwise.
 
 Layout: sequences are the last dimension, so that one vector instruction works on several of them:
-means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), expected measurements (2n + 1, m,
-B). A function works on the sequences from ``first`` to ``end``, as many at once as a vector of
-`vehest.lanes` has elements. Vectors are read beyond ``end`` and never written there, hence arrays
-are followed by room for one vector (`room`).
+means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), expected measurements
+(2n + 1, m, B). A function works on the sequences from ``first`` to ``end``, as many at once as a
+vector of `vehest.lanes` has elements. Vectors are read beyond ``end`` and never written there,
+hence arrays are followed by room for one vector (`room`).
 
 Common arguments: ``rules`` = (row [spread γ, centre_mean, centre_covariance, outer_weight] of a
 `SigmaRule`, smallest possible value of each state, margin of a repair, whether covariances are
@@ -326,8 +326,7 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
 
 @compiled
 def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, first, end):  # type: ignore[no-untyped-def]
-    """Mark measurements that the gate refuses: NaN in ``y`` (m, B), true in ``is_gated_out`` (m,
-    B).
+    """Mark measurements that the gate refuses: NaN in ``y``, true in ``is_gated_out``, (m, B) each.
 
     ``refused`` (B, m) counts how long each has been refused; see `Gate`.
 
@@ -530,9 +529,12 @@ def update_adjoint(  # type: ignore[no-untyped-def]
 ):
     """Adjoint of `update_of`; writes gradients of x, P, points, expected measurements, R and y.
 
-    With M = (P̄⁺ + P̄⁺ᵀ)/2, e = y - ŷ, s = S⁻¹ e and p = Kᵀ x̄⁺: ē = ȳ = p, C̄ = x̄⁺ sᵀ - 2 M K, S̄
-    = -(p sᵀ + s pᵀ)/2 + Kᵀ M K, P̄ = M, R̄ = S̄; d̄_s = v_s C̄ e_s, ē_s = v_s (C̄ᵀ d_s + 2 S̄ e_s),
-    and both pass to X_s, x and h(X_s) through their means.
+    With M = (P̄⁺ + P̄⁺ᵀ)/2, e = y - ŷ, s = S⁻¹ e and p = Kᵀ x̄⁺:
+
+        ē = ȳ = p,  C̄ = x̄⁺ sᵀ - 2 M K,  S̄ = R̄ = -(p sᵀ + s pᵀ)/2 + Kᵀ M K,  P̄ = M
+        d̄_s = v_s C̄ e_s,  ē_s = v_s (C̄ᵀ d_s + 2 S̄ e_s)
+
+    Both d̄_s and ē_s pass to X_s, x and h(X_s) through their means.
     """
     (rule, lower, _, _) = rules
     (innovation, innovation_covariance, gain, centre) = update_results

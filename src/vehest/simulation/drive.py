@@ -96,8 +96,9 @@ def simulate_drive(
     Raises
     ------
     ConfigurationError
-        A value that makes no sense, or a car that cannot do the manoeuvre. Raises
-        `SimulationError`: the car rolled over, or a state is not finite.
+        A value that makes no sense, or a car that cannot do the manoeuvre.
+    SimulationError
+        The car rolled over, or a state is not finite.
     """
     plant = MultiBodyPlant(vehicle)
     with naming(id, seed):

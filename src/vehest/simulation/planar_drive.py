@@ -96,7 +96,9 @@ def drive_freely(
     Raises
     ------
     ConfigurationError
-        Where rate or step make no sense, `SimulationError` where a state is not finite.
+        Rate or step make no sense.
+    SimulationError
+        A state is not finite.
     """
     per_command = steps_per_tick(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = steps_per_tick(rate_hz, plant.step, "sampling")

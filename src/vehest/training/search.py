@@ -78,8 +78,7 @@ def nelder_mead_over_grid(
     DataError
         The cost is finite nowhere.
 
-    Source:
-        Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
+    Source: Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
     """
     scale = np.array([high - low for low, high in box])
     bounds = [(low / width, high / width) for (low, high), width in zip(box, scale, strict=True)]

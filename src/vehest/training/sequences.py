@@ -211,8 +211,8 @@ def train_phases(
     ConfigurationError
         Phases of equal names, or nothing to learn in one.
 
-    Source:
-        Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
+    Source: Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski
+    et al. 2024 train in such phases.
     """
     if len({phase.name for phase in phases}) != len(phases):
         raise ConfigurationError(

@@ -90,10 +90,10 @@ def train_members(
     DataError
         A member diverged in its first epoch and with every smaller step size.
     ConfigurationError
-        a network does not return one number a window.
+        A network does not return one number a window.
 
-    Source:
-        Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015, Section 7.2 for the averaging of the weights.
+    Source: Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015, Section 7.2 for the averaging
+    of the weights.
     """
     run = _Run(networks, seeds, train, validation, settings, context)
     run.resume()

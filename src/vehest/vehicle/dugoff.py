@@ -46,7 +46,7 @@ class LoadedCar:
     Raises
     ------
     ValueError
-        a number outside of `vehest.vehicle.parameters.RANGES`.
+        A number outside of `vehest.vehicle.parameters.RANGES`.
 
     Source: Bertipaglia et al. 2024, Eq. 2.
     """

@@ -30,8 +30,9 @@ class LateralModel(NamedTuple):
     D: FloatArray  # (...)
 
     def in_steps(self, step: float) -> LateralModel:
-        """Forward Euler, x⁺ = (I + τA) x + τB δ; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr²
-        Cr)/(J u) stay below about 2.
+        """Forward Euler, x⁺ = (I + τA) x + τB δ.
+
+        It is stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2.
         """
         return self._replace(A=np.eye(2) + step * self.A, B=step * self.B)
 

@@ -10,7 +10,6 @@ x̄⁺ + Δt J₄ᵀ k̄₄ and so on, x̄ = x̄⁺ + Σ J_iᵀ k̄_i, with J_i 
 Order of sums: sums may be reordered (``fastmath``); gradients of parameters are added over points
 in order, stage by stage.
 
-
 Points lie side by side in columns, so that what is computed of each runs along rows; columns are as
 many as fill whole vectors, and those beyond the points repeat the last one and have no gradient. A
 network sees a point a row, its units side by side: its matrix products are as fast for a few points

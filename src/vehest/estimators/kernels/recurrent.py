@@ -6,14 +6,14 @@ with input, forget and output gates i, f, o, candidate g and cell c:
     r, z = σ(W x + U h + b),  n = tanh(W_n x + b_n + r (U_n h)),  h⁺ = n + z (h - n)
     i, f, o = σ(W x + U h + b),  g = tanh(W_g x + U_g h + b_g),  c⁺ = f c + i g,  h⁺ = o tanh c⁺
 
-Read-out: v = (wᵀ h + b) scale + mean after the last sample. Adjoint of a step, with ā of a gate's
-argument: h̄ = Σ_gates Uᵀ ā + z h̄⁺ (GRU), c̄ = f c̄⁺ (LSTM); σ' = σ (1 - σ), tanh' = 1 - tanh²; W̄
-= Σ ā xᵀ, Ū = Σ ā hᵀ, b̄ = Σ ā over all steps.
+Read-out: v = (wᵀ h + b) scale + mean after the last sample. Adjoint of a step, with ā the gradient
+of a gate's argument, σ' = σ (1 - σ) and tanh' = 1 - tanh², and sums of W̄, Ū, b̄ over all steps:
+
+    h̄ = Σ_gates Uᵀ ā + z h̄⁺ (GRU),  c̄ = f c̄⁺ (LSTM),  W̄ = Σ ā xᵀ,  Ū = Σ ā hᵀ,  b̄ = Σ ā
 
 Order of sums: bias, measurements, then states in order of their index; gradients over samples in
 order of time (`_sum`), and over lanes at the end of a batch. The readable definitions in torch are
 `torch.nn.GRU` and `torch.nn.LSTM` (`vehest.estimators.networks.recurrent`).
-
 
 Parameters of a member are those of `RecurrentNetwork` in their order: weights of inputs (G, H, C),
 of states (G, H, H), biases (G, H), and weight (H,) and offset of the read-out. Windows lie side by

@@ -9,10 +9,9 @@ over samples in order.
 
     inputs, parameters --outputs_of--> outputs      table, rows, parameters --losses_of--> loss and gradient of each member
 
-Members are computed one by one.
-
-A member's layers fit the processor's cache where those of all members together do not. A mask is
-not stored: what it hides is zero in the hidden layer, which is all that the adjoint asks for.
+Members are computed one by one, since the layers of one member fit the processor's cache and those
+of all members together do not. A mask is not stored: what it hides is zero in the hidden layer,
+which is all that the adjoint asks for.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ def speed_profile(
     ----------
     curvature : FloatArray
         (N,) [1/m], at samples ``spacing`` [m] apart.
-    used
+    used_grip : FloatArray
         (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving
         ``car.driving_share``.
     bank, grade : FloatArray | float, default 0.0

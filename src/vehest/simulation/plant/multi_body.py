@@ -12,9 +12,9 @@ stops, a differential, anti-lock brakes. Longitudinal forces pitch the body as i
 were the body's. Drag, and gravity along and across a road that is not level, come in as external
 accelerations (drive.py); wheel loads stay those of a level road.
 
-The published tyre has shifts that change sign with camber, so that its force jumps there by about 4
-% of the wheel load. With them the integration converges to first order where that happens, and on a
-straight the lateral acceleration has small steps; the vehicles of conf/vehicle go without those
+The published tyre has shifts that change sign with camber, so that its force jumps there by about
+4 % of the wheel load. With them the integration converges to first order where that happens, and on
+a straight the lateral acceleration has small steps; the vehicles of conf/vehicle go without those
 shifts where their files state it.
 """
 
