@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from vehest.estimators.registry import estimator_class
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE
 from vehest.trust.health import BEYOND_SPEED, NO_ESTIMATE, NUMBERS, TOO_WIDE, reason_in_words
-from vehest.trust.verdict import isolate_rows, verdict_rows, widen_rows
+from vehest.trust.verdict import Monitor, isolate_rows, verdict_rows, widen_rows
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 
 CHANNELS = ("yaw_rate", "vx", "ay")
@@ -142,6 +143,26 @@ def test_the_verdict_names_what_guard_and_watch_know():
     ]
     assert reason[3] == BEYOND_SPEED * 10_000
     assert reason[4] == NO_ESTIMATE * 10_000
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "adapts"),
+    [
+        ("rational_ekf", {}, True),
+        ("rational_ekf", {"tyres": "linear"}, True),
+        ("rational_ekf", {"tyres": "rational_friction"}, True),
+        ("rational_ekf", {"tyres": "rational"}, False),
+        ("kalman", {}, False),
+        ("kalman", {"offsets": {"ay": 0.3}}, True),
+        ("learned_ukf", {}, True),
+        ("self_calibrating", {}, True),
+        ("luenberger", {}, False),
+    ],
+)
+def test_filters_with_parameters_as_states_adapt_and_do_not_start_anew(name, config, adapts):
+    monitor = Monitor(estimator_class(name).from_config(config), None)
+    assert monitor.adapts == adapts
+    assert monitor.starts_anew != adapts
 
 
 def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_degrees():
