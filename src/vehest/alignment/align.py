@@ -63,9 +63,8 @@ UNITS: dict[str, str] = {
 READ_AS = {"rad": (180.0 / math.pi, "deg"), "s": (1e3, "ms")}
 """SI unit -> factor and unit in tables for people; files and JSON hold SI units."""
 
-UNDERSTEER_CHANGE = (
-    3e-4  # rad s²/m of the understeer gradient, by which real cars depart from a constant one
-)
+# rad s²/m of the understeer gradient, by which real cars depart from a constant one
+UNDERSTEER_CHANGE = 3e-4
 LINKAGE_CHANGE = 0.06
 """Standard deviation of the ratio from linkage, wheelbase and gain of the yaw rate, as a share of it.
 

@@ -13,15 +13,14 @@ from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
-MIN_REPORTED_DELAY_SECONDS = 0.015  # s, of a delay
+MIN_REPORTED_DELAY_SECONDS = 0.015
 MIN_PHASE_SHARE = 0.9  # share of the phase that a low-pass must explain
 MIN_TIME_CONSTANT_SECONDS = 0.1  # s; a shorter one is a delay in the band where cars move
 MAX_YAW_RESPONSE_SECONDS = 0.3  # s; of the yaw rate to the steering angle
 MIN_CHANGES = 20
 MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
-MAX_SINGLE_STEP_SHARE = (
-    0.5  # share of changes by one quantum from which on a channel is quantised, not held
-)
+# share of changes by one quantum from which on a channel is quantised, not held
+MAX_SINGLE_STEP_SHARE = 0.5
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:

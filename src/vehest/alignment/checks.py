@@ -35,10 +35,10 @@ __all__ = ["Finding", "checks_of_recording"]
 
 MAX_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
-MIN_STUCK_SAMPLES = 3  # seconds, samples
+MIN_STUCK_SAMPLES = 3
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
-USUAL_QUANTILES = (0.005, 0.995)  # quantiles
+USUAL_QUANTILES = (0.005, 0.995)  # of a channel's samples
 SPIKE_EXCESS = 1.0  # of the usual range, beyond it
 SPIKE_SECONDS = 0.25
 USUAL_STEP_QUANTILE = 0.995  # quantile of the steps between samples
@@ -54,8 +54,10 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
+# a car slower than this [m/s] that turns faster than this [rad/s] may go backwards: the signs of ay
+# and steering tell
 MAX_REVERSE_SPEED = 8.0
-MIN_TURN = 0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
+MIN_REVERSE_YAW_RATE = 0.03
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
@@ -430,11 +432,10 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             np.convolve(recording[name], second / len(second), "same")
             for name in ("yaw_rate", "ay", angle)
         )
-        turns = np.abs(rate) > MIN_TURN
+        turns = np.abs(rate) > MIN_REVERSE_YAW_RATE
         against = turns & (ay * rate < 0.0) & (turned * rate < 0.0)
-        is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(
-            turns
-        )  # else a channel's sign is wrong
+        # in most turns it would be the sign of a channel that is wrong
+        is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(turns)
         backwards = against & (recording["vx"] < MAX_REVERSE_SPEED) & is_part
     runs = true_runs(backwards & (recording["vx"] > REVERSE_SPEED))
     runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]

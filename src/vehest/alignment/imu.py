@@ -36,9 +36,8 @@ IMU_CHANNELS = ("ax", "ay", "yaw_rate")
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
 TILT_GAIN = 0.1  # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g
-TILT_LIKENESS = (
-    0.3  # assumed correlation of the remaining tilt of body and road with the effect of a parameter
-)
+# assumed correlation of the remaining tilt of body and road with the effect of a parameter
+TILT_LIKENESS = 0.3
 
 ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
 
@@ -61,9 +60,8 @@ TILT_PRIOR = {
     "tilt_lag_x": TILT_LAG_GAIN,
     "tilt_lag_y": TILT_LAG_GAIN,
 }
-NOTHING = dict.fromkeys(
-    [*IMU_PARAMETERS, *TILT_PRIOR], 0.0
-)  # all parameters of a sensor that is aligned
+# all parameters of a sensor that is aligned
+NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
 
 
 @dataclass(frozen=True, eq=False)

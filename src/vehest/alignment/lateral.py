@@ -21,9 +21,8 @@ from vehest.alignment.spectra import (
 from vehest.constants import FloatArray
 
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
-MAX_GAIN_RATIO = (
-    2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
-)
+# of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
+MAX_GAIN_RATIO = 2.5
 MIN_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
 N_SHIFTS = 6
 SHIFT_TOLERANCE_SECONDS = 1e-3  # s

@@ -13,9 +13,8 @@ from vehest.alignment.spectra import MAX_GROUPS, Measured, jackknife
 from vehest.constants import GRAVITY, FloatArray
 
 MIN_NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
-MAX_NOTED_OFFSET = (
-    0.5  # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
-)
+# m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
+MAX_NOTED_OFFSET = 0.5
 MAX_GYRO_OFFSET = 0.05  # rad/s
 BLOCK_SECONDS = 2.0
 MIN_BLOCKS = 6

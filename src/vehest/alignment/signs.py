@@ -42,10 +42,11 @@ ALTERNATIVE_UNITS = {
     "sideslip_ref": (DEGREES_PER_RADIAN, "deg", "rad"),
 }
 """Channel -> factor by which its values are too large in a wrong unit, that unit, and the SI unit."""
+# units that stop an ingest: no estimator survives them
 UNSAFE = {
     "yaw_rate": "deg/s",
     "sideslip_ref": "deg",
-}  # units that stop an ingest: no estimator survives them
+}
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,13 @@ from vehest.sources.can import CanSource, ChannelSignal
 from vehest.sources.can.database import Database, read_dbc
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
+# options of a data set that say nothing of a bus; nor does the rate
 FOR_RECORDINGS = (
     "gappy",
     "transforms",
     "reference_point",
     "raster",
-)  # options of a data set that say nothing of a bus; nor does the rate
+)
 
 
 @dataclass(frozen=True)

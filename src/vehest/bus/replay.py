@@ -36,9 +36,8 @@ from vehest.trust.contract import GuardedStepper
 SURVEY_SECONDS = 20.0
 LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
-SWITCH_SECONDS = (
-    2e-4  # that another thread of Python may go on when the receiver has something to do
-)
+# that another thread of Python may go on when the receiver has something to do
+SWITCH_SECONDS = 2e-4
 
 
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:

@@ -20,14 +20,15 @@ from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9
-SMALL = 64 * 2**20
-MOST_EXPANSION = 250  # bytes; times its packed size that a larger archive may unpack to
+ALLOWED_BYTES = 64 * 2**20  # to which any archive may unpack
+MOST_EXPANSION = 250  # times its packed size, to which a larger one may
 MOST_FILES = 10_000
+# without LZMA, which takes as much memory as an entry asks for, up to 4 GiB
 METHODS = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
     zipfile.ZIP_BZIP2,
-)  # LZMA takes as much memory as an entry asks for, up to 4 GiB
+)
 
 _UNSOUND = (
     zipfile.BadZipFile,
@@ -60,7 +61,7 @@ class _Archive(io.FileIO):
 
 def unpacked_limit(packed: int, most_bytes: int = MOST_BYTES) -> int:
     """What ``packed`` bytes may unpack to on disk [bytes]."""
-    return min(most_bytes, max(SMALL, MOST_EXPANSION * packed))
+    return min(most_bytes, max(ALLOWED_BYTES, MOST_EXPANSION * packed))
 
 
 @contextmanager

@@ -26,15 +26,12 @@ LATEST_TIME = 1e11  # s; beyond it a double tells no two samples of 1e5 Hz apart
 GAP = 1.5  # median steps
 MOST_JITTER = 0.01  # of a step
 MOST_CLOCK_DRIFT = 0.5  # steps
-MOST_STRETCH = (
-    0.1  # of a step, over a whole recording, by which a plain rate may differ from the one found
-)
-MOST_DRIFT = (
-    0.01  # of a step, over a whole recording, that may come from the resolution of the stamps
-)
-INTERPOLATED_TOLERANCE = (
-    5e-3  # an interpolated clock may run at any rate: take a plain one this near
-)
+# of a step, over a whole recording, by which a plain rate may differ from the one found
+MOST_STRETCH = 0.1
+# of a step, over a whole recording, that may come from the resolution of the stamps
+MOST_DRIFT = 0.01
+# an interpolated clock may run at any rate: take a plain one this near
+INTERPOLATED_TOLERANCE = 5e-3
 SLACK = 1e-6  # of a step; times that are nearer are the same
 SORT = "repair, remove or sort the rows"
 BRIDGE = "cut the range out or set dataset.clock=interpolate"

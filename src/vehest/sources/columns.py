@@ -18,9 +18,8 @@ from vehest.data.units import factor_to_si
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
-ColumnName = Annotated[
-    str, BeforeValidator(lambda name: str(name) if type(name) is int else name)
-]  # YAML reads 3 as a number
+# YAML reads 3 as a number
+ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 Positive = Annotated[float, Field(gt=0)]
 Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 

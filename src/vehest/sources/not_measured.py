@@ -10,11 +10,12 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
+# of integers, which a scale of a power of ten brings to 327.67 or 65.535
 _ENDS_OF_RANGE = frozenset(
     sign * (2**bits - below)
     for bits in (15, 16, 23, 24, 31, 32)
     for sign, below in ((1, 1), (1, 0), (-1, 1), (-1, 0))
-)  # of integers, which a scale of a power of ten brings to 327.67 or 65.535
+)
 _NINES = frozenset(sign * (10**digits - 1) for digits in range(3, 10) for sign in (1, -1))
 MIN_HUGE = 1e15  # beyond it a number of a log is a code such as 1e20 or 3.4e38
 MIN_CODES = 2  # samples; one alone may be a spike

@@ -18,9 +18,9 @@ REMEDY = "correct download.url or put the file into the data set's folder by han
 TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
 ATTEMPTS = 5  # in a row that bring nothing new
 PAUSE = 1.0  # s, before the second of them; then twice as long each
-CHANGED = frozenset(
-    {206, 416}
-)  # statuses of an answer to a range that is of another version of the file
+# statuses of an answer to a range that is of another version of the file
+CHANGED = frozenset({206, 416})
+# statuses that the next attempt may not meet
 PASSING = CHANGED | {
     408,
     425,
@@ -29,11 +29,10 @@ PASSING = CHANGED | {
     502,
     503,
     504,
-}  # statuses that the next attempt may not meet
+}
 
-Progress = Callable[
-    [str, int, int | None], None
-]  # file, bytes received, bytes in all where the server states them
+# file, bytes received, bytes in all where the server states them
+Progress = Callable[[str, int, int | None], None]
 
 
 class ResumingDownloader:

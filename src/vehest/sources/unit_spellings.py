@@ -58,12 +58,13 @@ _SPELLINGS = {
         ("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"
     ),
 }
+# where upper and lower case differ in meaning
 _CASES = {
     "kN": "kN",
     "kn": "knots",
     "Mpa": "MPa",
     "mPa": "another unit",
-}  # where upper and lower case differ in meaning
+}
 
 
 def plain_unit(text: str) -> str | None:

@@ -33,22 +33,24 @@ from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
+# units that the format has without saying so
 UNITS = {
     "velocity": "km/h",
     "vert-vel": "km/h",
     "Longacc": "g",
     "Latacc": "g",
-}  # units that the format has without saying so
+}
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
-FASTEST_STILL = 5.0
-LEAST_TURN = 0.05  # m/s, rad/s: below, slip at two wheels says nothing
-MIN_TURNING_SAMPLES = 100  # samples that turn
-LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
+# slower or straighter, slip angles at two wheels do not reveal where they hold
+MIN_TURNING_SPEED = 5.0  # m/s
+MIN_TURNING_YAW_RATE = 0.05  # rad/s
+MIN_TURNING_SAMPLES = 100
+# of the slip angles' difference that the yaw rate makes between the axles
+MIN_DIFFERENCE_SHARE = 0.25
 SLIP_CHECK = "slip_offsets"
-SLIP_AT_A_POINT = re.compile(
-    r"Slip_(COG|[FR][LR])"
-)  # Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
+# Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
+SLIP_AT_A_POINT = re.compile(r"Slip_(COG|[FR][LR])")
 OFFSETS = re.compile(
     r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}"
 )
@@ -228,7 +230,7 @@ def require_slip_offsets(log: Log, location: str) -> None:
     front, rear, yaw_rate, speed = (log.columns[name] for name in required)
     yaw_rate = np.radians(yaw_rate)
     speed = speed / KMH
-    turns = (speed > FASTEST_STILL) & (np.abs(yaw_rate) > LEAST_TURN)
+    turns = (speed > MIN_TURNING_SPEED) & (np.abs(yaw_rate) > MIN_TURNING_YAW_RATE)
     if turns.sum() < MIN_TURNING_SAMPLES:
         return
     axle_distance = abs(log.offsets["FL"][1] - log.offsets["RL"][1])
@@ -236,7 +238,7 @@ def require_slip_offsets(log: Log, location: str) -> None:
         np.sqrt(np.mean(np.square(np.degrees(axle_distance * yaw_rate[turns] / speed[turns]))))
     )
     measured = float(np.sqrt(np.mean(np.square(front[turns] - rear[turns]))))
-    if measured < LEAST_DIFFERENCE * expected:
+    if measured < MIN_DIFFERENCE_SHARE * expected:
         raise DataError(
             f"{location}: slip at the front and the rear left wheel differs by {measured:.2g}° "
             f"(rms) where the yaw rate makes {expected:.2g}°: "

@@ -24,9 +24,12 @@ CLEAR_CORRELATION = 0.6  # correlation that decides where nothing else comes nea
 CLEAR_LATERAL_CORRELATION = 0.45  # of relations with derivatives of noisy channels
 MIN_STRENGTH = 0.3
 RIVAL_MARGIN = 2.0  # score within which another column comes near
-MAX_AX_MISMATCH = 1.1  # logarithm of the scale of an acceleration over d(vx)/dt, within which pitch, grade and slip explain it
+# logarithm of the gain of an acceleration to d(vx)/dt, within which pitch, grade and slip explain it
+MAX_AX_MISMATCH = 1.1
+# of score, for a reference's column as a channel that the car measures itself; more where its bus
+# has a column of that name
 REFERENCE_PENALTY = 2.5
-REFERENCE_PENALTY_WITH_BUS = 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
+REFERENCE_PENALTY_WITH_BUS = 8.0
 MIN_SECOND_SCORE = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 MAX_CENTRE_SHARE = 0.1  # of a command's range, by which straight ahead may lie beside nil
 CRAWL_SHARE = 0.05  # of the top speed, below which a sideslip angle has no meaning
@@ -41,14 +44,16 @@ NAMED_LIKE = {
 """Channel -> roles of which the name of its column suggests one."""
 MAX_ANGLES = {"steer": 0.8, "handwheel": 16.0}  # rad
 MAX_STRAIGHT_ANGLE = 0.1  # rad that a road wheel may show there, of an angle
+# wheelbase, and wheelbase times steering ratio, of cars [m]
 POSSIBLE_LENGTHS = {
     "steer": (1.2, 7.0),
     "handwheel": (12.0, 130.0),
-}  # m, wheelbase, and that times the ratio, of cars
+}
+# the same of usual cars [m]; an estimate beyond is an error
 USUAL_LENGTHS = {
     "steer": (1.8, 5.0),
     "handwheel": (25.0, 80.0),
-}  # m, of cars; others are an error of the estimate
+}
 TYPICAL_LENGTHS = {"steer": 2.7, "handwheel": 43.0}  # m
 MIN_MODEL_WHEELBASE = 0.08  # m, wheelbase of the smallest model
 MAX_MODEL_SPEED = 20.0  # m/s

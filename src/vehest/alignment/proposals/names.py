@@ -57,10 +57,11 @@ _BUS = re.compile(
     r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d"
 )
 _WORLD_FRAME = re.compile(r"\b(world|global|map|utm|earth)\b")
+# of a quantity along an axis of the world, which no channel is
 _WORLD_AXIS = re.compile(
     r"\b(east|north|down|ost|nord|ned|enu|ecef)(ward)?\b|(east|north|ecef)|"
     r"\b(v|vel|velocity|speed|spd|acc|acceleration)( ?[en]| d| up)$"
-)  # of a quantity along an axis of the world, which no channel is
+)
 _STEERING_RATE = re.compile(
     r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta"
 )

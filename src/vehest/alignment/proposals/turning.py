@@ -18,15 +18,17 @@ from vehest.constants import FloatArray
 
 MIN_CORRELATION = 0.75
 UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
-CLOSE_MISMATCH = 0.3
-FAR_MISMATCH = 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
-MAX_EVIDENT_MISMATCH = 0.1  # likewise: within, the scale alone indicates an acceleration
+# logarithms of a gain that should be 1
+CLOSE_MISMATCH = 0.3  # within, units explain it
+FAR_MISMATCH = 0.6  # beyond, they do not
+MAX_EVIDENT_MISMATCH = 0.1  # within, the gain alone indicates an acceleration
 MIN_COST_MARGIN = 0.2  # by which the next best units must be worse
+# of the 99th percentile, SI
 RANGES = {
     "vx": (0.5, 110.0),
     "yaw_rate": (0.02, 8.0),
     "ay": (0.3, 60.0),
-}  # of the 99th percentile, SI
+}
 MAX_COLUMNS = 60
 MAX_TURNINGS = 8
 MIN_SCORE = 6.0
@@ -38,17 +40,17 @@ NO_RATE_OR_ACCELERATION = (
 )
 """Roles of speeds, angles and positions, none of which is a yaw rate or an acceleration."""
 UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
-MIN_COMPUTED_CORRELATION = (
-    0.9995  # correlation beyond which ay was computed of vx·yaw_rate, and not measured
-)
+# correlation beyond which ay was computed of vx·yaw_rate, and not measured
+MIN_COMPUTED_CORRELATION = 0.9995
 COMPUTED_PENALTY = 6.0  # of score, for that, where another column is named as ay
 NAMELESS_RANK = 0.5  # rank of a column whose name suggests nothing
 STANDSTILL_SPEED_SHARE = 0.02  # of the top speed; below, the car may stand
 MIN_REPEAT_CORRELATION = 0.97  # correlation of one quantity measured twice
+# of columns that are named alike; wheels slip
 MIN_NAMED_REPEAT_CORRELATION = {
     "vx": 0.7,
     "yaw_rate": 0.9,
-}  # of columns that are named alike; wheels slip
+}
 MIN_AY_REPEAT_CORRELATION = 0.99
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
@@ -348,9 +350,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
                 and not column.unit
                 and abs(agreement) > MIN_NAMED_REPEAT_CORRELATION["vx"]
             ):
-                scaled.append(
-                    column
-                )  # named as a speed, and one but for its scale, as a motor's speed is
+                # named as a speed, and one but for its scale, as a motor's speed is
+                scaled.append(column)
         for repeat in repeats:
             search.free.remove(repeat.column)
         family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
@@ -446,9 +447,8 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     of_car = [repeat for repeat in plain if repeat.column.is_of_bus] or [
         repeat for repeat in plain if not repeat.column.is_reference
     ]
-    of_car = of_car or [
-        repeat for repeat in family if not repeat.column.is_reference
-    ]  # filtered, but the car's
+    if not of_car:  # filtered, but the car's
+        of_car = [repeat for repeat in family if not repeat.column.is_reference]
     references = [repeat for repeat in plain if repeat.column.is_reference] or [
         repeat for repeat in plain if repeat not in of_car
     ]

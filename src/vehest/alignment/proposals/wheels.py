@@ -25,10 +25,11 @@ MIN_TOP_SPEED = 1.0
 AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
 MIN_COST_MARGIN = 0.25
+# a speedometer over the wheels' speed at the rim: none reads too little, many too much
 SPEEDOMETER_GAIN_RANGE = (
     0.98,
     1.08,
-)  # a speedometer over the wheels' speed at the rim: none reads too little, many too much
+)
 
 Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 

@@ -49,11 +49,10 @@ POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
-MIN_GAIN_FACTOR = (
-    1.15  # factor between the gains of two files, of which each half is beyond the other file's
-)
-MIN_TURN_RATE = 0.05
-MIN_TURNING_SECONDS = 5.0  # rad/s, and how long a half of a file turns as fast [s]
+# factor between the gains of two files, of which each half is beyond the other file's
+MIN_GAIN_FACTOR = 1.15
+MIN_TURN_YAW_RATE = 0.05  # rad/s
+MIN_TURNING_SECONDS = 5.0  # for which each half of a file turns as fast
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +268,7 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         rate = recording["yaw_rate"][half]
         is_turning = (
             (speed > 0.2 * float(np.quantile(speed, 0.99)))
-            & (np.abs(rate) > MIN_TURN_RATE)
+            & (np.abs(rate) > MIN_TURN_YAW_RATE)
             & (speed > 0.0)
         )
         if np.count_nonzero(is_turning) < MIN_TURNING_SECONDS * recording.rate_hz:

@@ -37,11 +37,11 @@ MAX_EVIDENCE_SECONDS = 1200.0  # s
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
 MAX_BRIDGED_SECONDS = 1.0  # s without a sample that straight lines bridge
 MAX_LISTED = 5
+# a column is another's difference from row to row: by so many rows from the middle of the log, the
+# share of them with the smaller steps, and the correlation
 MAX_COMPARED_ROWS = 4_000
 USUAL_STEP_QUANTILE = 0.99
-MIN_DIFFERENCE_CORRELATION = (
-    0.999  # rows, share of them, and correlation of a column with another's difference
-)
+MIN_DIFFERENCE_CORRELATION = 0.999
 TABLES = ("tabular", "text_log")
 LAYOUT = {
     "delimiter": ",",
@@ -435,7 +435,7 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
 
 
 def _busiest(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
-    """The rows in which the columns change most, (C, at most ``most``)."""
+    """The rows in which the columns change most, (C, at most ``max_rows``)."""
     if columns.shape[1] <= max_rows:
         return columns
     starts = np.arange(0, columns.shape[1] - minute, minute)

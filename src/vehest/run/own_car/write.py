@@ -34,9 +34,11 @@ from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
 TRAINED_SHARE = 0.7  # of the recordings: training and validation
-MIN_BLOCK_SECONDS = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
+# of a recording's range for validation, a fifth of it; shorter recordings are used whole, if at all
+MIN_BLOCK_SECONDS = 4.0
 MIN_SECONDS = 30.0  # of all recordings, to train at all
 ROLES_OF_THREE = ("train", "validation", "test")
+# of whole recordings, in turn
 ROLES = (
     "train",
     "test",
@@ -48,13 +50,12 @@ ROLES = (
     "train",
     "validation",
     "test",
-)  # of whole recordings, in turn
+)
 MIN_RANKING_SECONDS = 120.0  # s of recordings; below, hardly any comparison separates estimators
 FILTER_CHANNELS = ("vx", "yaw_rate", "ay")  # of the self-calibrating filter, which does without ax
 ASSUMED_WHEELBASE = 2.7  # m, where it is not given
-STIFFNESS = (
-    10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
-)
+# cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
+STIFFNESS = 10.0
 HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
@@ -67,7 +68,7 @@ DATASET_COMMENTS = {
     "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
     "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) and "
     "steering_ratio, if known; every command uses them",
-    "time": "unit: s, ms, us or ns; null: no time column",
+    "time": "unit: s, ms, us, ns, d (days) or clock; null: no time column",
     "clock": "strict | interpolate (across gaps and jitter) | uniform",
     "bridge": "longest gap that is interpolated linearly [s]",
     "channels": "sign: -1 for a column whose positive direction is opposite to ISO 8855 (x forward, y left)",
@@ -179,9 +180,8 @@ def write(
             _pipeline_text(name, plan, TRAINED_SHARE * drafted.seconds / 60.0, drafted.contents),
         ]
     files = dict(zip(paths_of(name), texts, strict=False))
-    stale = [
-        file for file in paths_of(name)[len(files) :] if file.exists()
-    ]  # of an earlier one, which these recordings do not allow
+    # of an earlier data set of this name; these recordings do not allow them
+    stale = [file for file in paths_of(name)[len(files) :] if file.exists()]
     if not dry_run:
         with ExitStack() as stack:
             for file, text in files.items():
@@ -212,7 +212,7 @@ def write(
 
 
 def _long_enough(drafted: Draft) -> list[str]:
-    """Recordings that a split takes; pieces that are too short even whole are left out."""
+    """Recordings that a split uses, divided or whole; shorter ones are left out."""
     return [name for name, duration in drafted.durations.items() if duration >= MIN_BLOCK_SECONDS]
 
 
@@ -306,10 +306,8 @@ def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
         "-o",
         "estimate.parquet",
     ]
-    return [
-        *commands,
-        list2cmdline(words),
-    ]  # double quotes around blanks, which shells of Windows and POSIX read
+    # double quotes around blanks, which shells of Windows and POSIX read
+    return [*commands, list2cmdline(words)]
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -385,9 +383,7 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
         if cut
         else [drafted.durations[recording] for recording in _long_enough(drafted)]
     )
-    seconds = min(
-        shares, default=0.0
-    )  # the shortest of the longest range for training and all those for validation
+    seconds = min(shares, default=0.0)  # of the shortest range for validation
     added_trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
     trials = sorted(
         [

@@ -62,9 +62,8 @@ MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
-WIDE = re.compile(
-    r"[ぁ-ヿ一-鿿]{2}"
-)  # letters of Japanese, which accents in Windows-1252 make only one by one
+# letters of Japanese, which accents in Windows-1252 make only one by one
+WIDE = re.compile(r"[ぁ-ヿ一-鿿]{2}")
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
