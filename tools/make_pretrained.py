@@ -43,9 +43,8 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "results" / "sim_to_real" / "tables" / "overview.csv"
 TARGET = ROOT / "src" / "vehest" / "pretrained"
 FILTER = ROOT / "src" / "vehest" / "pretrained_filter"
-LEAST_SCALE = (
-    1e-4  # m/s and rad: floor of the filter's scale, whose deviation has a floor of its own
-)
+MIN_SCALE = 1e-4
+"""Floor of the scale of the filter's bands [m/s, rad]; its deviation has a floor of its own."""
 FILTER_NOTE = (
     "self-calibrating filter: finds your car's rear axle on the drive, without training on it or on any reference. Inside is a network "
     "that learnt on simulated cars and not on this one. Errors: results/unseen_car; on cars of 1:8 and 1:10 it is many times "
@@ -179,7 +178,7 @@ def scaled_by_variance(bands: Bands, pieces: Sequence[Piece]) -> Bands:
     """Bands whose scale is the filter's deviation itself; a constant beside it, fitted to these drives, made their interval score worse."""
     own = {
         name: replace(
-            getattr(bands, name), weights={"variance": 1.0}, floor=LEAST_SCALE, factors=(1.0,) * 4
+            getattr(bands, name), weights={"variance": 1.0}, floor=MIN_SCALE, factors=(1.0,) * 4
         )
         for name in ("vy", "sideslip")
     }

@@ -181,16 +181,21 @@ def score(
 
     Raises
     ------
+    ConfigurationError
+        An estimate with more recordings than its own.
     DataError
         A channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
     drives = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if isinstance(estimate, Estimate):
-        (drive,) = drives
-        return metrics.accuracy([metrics.score_whole(estimate, drive)])
+        if len(drives) != 1:
+            raise ConfigurationError(
+                f"an estimate is scored against the recording that it was made of, not {len(drives)}"
+            )
+        return metrics.accuracy([metrics.score_whole(estimate, drives[0])])
     parts = []
     for drive in drives:
-        of_car, _ = _for_recording(estimate, drive)
+        of_car, _ = _for_car(estimate, drive.car, _settings_for(estimate, drive))
         needed = prepared_recording(of_car, drive.without_references())
         made = require_estimate(of_car, drive, of_car.estimate([needed])[0])
         parts.append(metrics.score_whole(made, drive, estimate.preparation))
@@ -317,27 +322,26 @@ def estimate(
         model = load_model()
     elif not isinstance(model, Estimator):
         model = load_model(model)
-    of_car, trust = _for_recording(model, recording)
+    of_car, trust = _for_car(model, recording.car, _settings_for(model, recording))
     return estimate_recording(of_car, recording, trust, same_vehicle)
 
 
-def _for_recording(model: Estimator, recording: Recording) -> tuple[Estimator, Trust | None]:
-    """A model and its calibration for the car and channels of a recording; see `_for_car`."""
-    settings = {}
+def _settings_for(model: Estimator, recording: Recording) -> dict[str, Any]:
+    """Settings with which a model does without a channel that a recording lacks."""
     if isinstance(model, SelfCalibrating) and "ax" not in recording:
-        settings["measured_ax"] = False
-    return _for_car(model, recording.car, settings)
+        return {"measured_ax": False}
+    return {}
 
 
 def _for_car(
     model: Estimator, car: CarValues, settings: Mapping[str, Any]
 ) -> tuple[Estimator, Trust | None]:
-    """A model and its calibration for a car; warns where the model's wheelbase is an assumption."""
+            text = f"{ASSUMED} {of_car.settings.wheelbase:g} m; give your car's, as wheelbase=2.9"
     of_car, trust, remarks = adapted(model, model.trust, car, settings)
     for remark in remarks:
         if ASSUMED in remark:
             text = f"{ASSUMED} {of_car.settings.wheelbase:g} m; give your car's, as wheelbase=2.9"
-            warnings.warn(text, stacklevel=4)
+            warnings.warn(text, stacklevel=3)  # at the caller of the public function
     return of_car, trust
 
 

@@ -232,14 +232,18 @@ def test_the_python_functions_use_the_car_of_a_data_set_as_the_commands_do(place
     stepper = vehest.online(model, car=CarValues(wheelbase=0.33))
     assert stepper.stepper.estimator.settings.wheelbase == 0.33
     unknown = vehest.read_recording("lap.csv")
-    with pytest.warns(UserWarning, match="the wheelbase is assumed to be 2.7 m"):
+    with pytest.warns(UserWarning, match="the wheelbase is assumed to be 2.7 m") as warned:
         assumed = vehest.estimate(unknown, model)["vy"]
+        vehest.online(model)
+    assert {warning.filename for warning in warned} == {__file__}, "at the caller's line"
     assert np.abs(assumed - expected).max() > 0.05
     with_reference = replace(unknown, car=CarValues(wheelbase=0.33))
     small = vehest.score(model, with_reference)
     with pytest.warns(UserWarning, match="the wheelbase is assumed"):
         large = vehest.score(model, [unknown])
     assert small["rmse_sideslip"] != large["rmse_sideslip"]
+    with pytest.raises(ConfigurationError, match="the recording that it was made of, not 2"):
+        vehest.score(vehest.estimate(with_reference, model), [with_reference, unknown])
     with_car = replace(planar_drive(20.0, 100.0, seed=1), car=CarValues(2.4, 1500.0, 1.1))
     trained = vehest.train("data_sheet", [with_car], [with_car])
     assert (trained.settings.wheelbase, trained.settings.cg_to_rear_axle) == (2.4, 1.1)

@@ -38,12 +38,16 @@ def test_estimate_is_drawn_as_it_is_made_and_afterwards(log):
     [
         (["plot", "drive.parquet", "-o", "drive.jpg"], "pictures are written as"),
         (["plot", "no.parquet"], "no.parquet"),
+        (["plot", "dataset=tabular"], "name the file of a recording"),
+        (["plot", "drive.parquet", "-o", "folder.png"], "'folder.png' is a folder"),
         (["plot", "drive.parquet", "--start", "50"], "no samples between 50 s"),
         (["estimate", "drive.parquet", "-o", "b.csv", "--plot", "b.png"], "as .parquet"),
         (["estimate", "drive.parquet", "-o", "b.parquet", "--plot", "b.gif"], "are written as"),
+        (["estimate", "drive.parquet", "-o", "b.parquet", "--plot", "folder.png"], "is a folder"),
     ],
 )
 def test_a_mistake_is_one_error_and_writes_nothing(log, words, says):
+    Path("folder.png").mkdir()
     before = set(Path().iterdir())
     log.refused(*words, says=[says])
     assert set(Path().iterdir()) == before

@@ -51,8 +51,8 @@ MEANINGS = {
     "grip": "lateral acceleration at the rear axle's limit",
 }
 AGREEMENT = 0.95
-"""Probability at which the drives' values of a number, were they of one car, would agree; beyond it the number is not identified."""
-LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives do not tell apart from b and C
+"""Quantile of χ² within which the values of several drives count as those of one car; beyond it the number is not identified."""
+LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b and C
 
 
 class Normal(NamedTuple):

@@ -34,9 +34,9 @@ from vehest.sources.base import kind_of, open_source, origin_in_words, read_sing
 from vehest.sources.signals import MISSING
 from vehest.sources.tabular import unused_columns
 
-# time stamps between these [s], of 1989 and 2096, count from 1970
-EARLIEST_UNIX = 6e8
-LATEST_UNIX = 4e9
+# Time stamps between these count from 1970.
+EARLIEST_UNIX = 6e8  # s, in 1989
+LATEST_UNIX = 4e9  # s, in 2096
 MOST_COLUMNS = 40  # of a table that are listed
 SPREAD = ("min", "mean", "max", "std")
 

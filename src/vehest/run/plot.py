@@ -11,6 +11,7 @@ from vehest.configuration.estimate_options import EstimateOptions, estimate_opti
 from vehest.configuration.files import is_file_name
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
+from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
 from vehest.inference.reading import read_checked, without_references
 from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
@@ -35,11 +36,13 @@ WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
 
 
 def check_plot_name(out: Path) -> None:
-    """Raises `ConfigurationError` for the name of a file that no picture is written to."""
+    """Raise `ConfigurationError` where a picture cannot be written to a path, before it is drawn."""
     if out.suffix.lower() not in WRITERS:
         raise ConfigurationError(
             f"'{out}': pictures are written as {', '.join(WRITERS)}; name such a file"
         )
+    if out.is_dir():
+        raise ConfigurationError(f"'{out}' is a folder; name a file")
 
 
 def estimate_and_plot(
@@ -81,10 +84,14 @@ def plot_files(
         A file cannot be used or written.
     """
     check_plot_name(out)
-    recording_file, *estimate_files = (Path(word) for word in words if is_file_name(word))
+    files = [Path(word) for word in words if is_file_name(word)]
+    if not files:
+        raise ConfigurationError("name the file of a recording: vehest plot lap.csv")
+    recording_file, *estimate_files = files
     options = estimate_options([word for word in words if not is_file_name(word)])
     recording = _with_references_if_any(recording_file, options)
-    estimates = [read_estimate_table(file, recording) for file in estimate_files]
+    with use_limits(options.limits):
+        estimates = [read_estimate_table(file, recording) for file in estimate_files]
     content = WRITERS[out.suffix.lower()](recording.plot(*estimates, start=start, stop=stop))
     with written_aside(out) as aside:
         aside.write_bytes(content)

@@ -66,7 +66,7 @@ from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
 
-MOST_NAMED = 6  # trainings in one message
+MAX_NAMED = 6  # trainings in one message
 
 
 @contextmanager
@@ -385,12 +385,12 @@ def _error_of(
     if unfinished and not runner.dry_run:
         going_on = command_line("run" if study.file.name else "sweep", study.words)
         option = " --train-missing" if runner.evaluates_trained else ""
-        more = f" and {len(unfinished) - MOST_NAMED} more" if len(unfinished) > MOST_NAMED else ""
+        more = f" and {len(unfinished) - MAX_NAMED} more" if len(unfinished) > MAX_NAMED else ""
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished[:MOST_NAMED])}{more}; '{going_on}{option}' goes on with them",
+            f"{', '.join(unfinished[:MAX_NAMED])}{more}; '{going_on}{option}' goes on with them",
         )
     return error
 

@@ -26,7 +26,7 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 class Stretch:
     """A range to learn from, with the part of its recording before it."""
 
-    recording: Recording  # at the model's rate, from `WARM_UP_SECONDS` before the range if it is that long, references included
+    recording: Recording  # at the model's rate, with references, and with a warm-up before the range where it has one
     start: float  # of the range [s]
     dataset: str  # of the recording; may be empty
     name: str  # for people

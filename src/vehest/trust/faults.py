@@ -31,7 +31,7 @@ Sizes = tuple[float, float, float]
 DEGREE = math.pi / 180.0
 PIECE_SECONDS = 0.2  # of losses in pieces
 LOSS_SECONDS = 0.2  # until a wheel is locked or spins
-SPIKE_SHARE = 0.02
+SPIKE_SHARE = 0.02  # of the samples
 HUGE_SHARE = 0.05  # of the samples
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 

@@ -52,12 +52,13 @@ MAX_TOP_SPEED = MARGIN * CHANNELS["vx"].high  # [m/s] that can be learnt
 TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
 MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that can be learnt
 
-STANDSTILL_SPEED = 0.5
-STANDSTILL_YAW_RATE = 0.05  # m/s, rad/s: below both, nothing is expected to move
+STANDSTILL_SPEED = 0.5  # m/s
+STANDSTILL_YAW_RATE = 0.05  # rad/s; below both, nothing is expected to move
 
+# What an estimator does with a row.
 USE = 0
-WAIT = 1
-RESTART = 2  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
+WAIT = 1  # too much is missing
+RESTART = 2  # it starts anew with the row
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ CLEAR = 0.95  # times its limit, below which a statistic has to stay
 BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather than lost
 SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
-REVERSED = -0.5
-HOLDS = 0.7  # correlations below which a relation is one of the wrong sign, above which it holds
+REVERSED = -0.5  # correlation below which a relation has the wrong sign
+HOLDS = 0.7  # correlation above which a relation holds
 SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
