@@ -3,6 +3,7 @@
 import importlib
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -345,6 +346,11 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert f"P{remark[1:]}." in text
     blocks = document.data["blocks"]
     assert blocks.columns.tolist() == list(BlockRow.__dataclass_fields__)
+    answer = text[text.index("**Answer.**") : text.index("**Recommendation.**")]
+    errors = blocks[(blocks["part"] == "real") & (blocks["metric"] == "mse_weighted")]
+    mse = errors.groupby(["candidate", "test_set"])["value"].mean()
+    for other, test in product(("GRU", "NNTF"), ("tyre_a", "tyre_d")):
+        assert f" {mse['NNTF_UH', test] / mse[other, test]:.2f} [" in answer, (other, test)
     assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
     keys = ["candidate", "seed", "metric"]
     ours = blocks[(blocks["part"] == "real") & (blocks["test_set"] == "tyre_a")]
