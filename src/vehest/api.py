@@ -336,7 +336,7 @@ def _settings_for(model: Estimator, recording: Recording) -> dict[str, Any]:
 def _for_car(
     model: Estimator, car: CarValues, settings: Mapping[str, Any]
 ) -> tuple[Estimator, Trust | None]:
-            text = f"{ASSUMED} {of_car.settings.wheelbase:g} m; give your car's, as wheelbase=2.9"
+    """A model and its calibration for a car; warns where the model's wheelbase is an assumption."""
     of_car, trust, remarks = adapted(model, model.trust, car, settings)
     for remark in remarks:
         if ASSUMED in remark:
