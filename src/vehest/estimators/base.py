@@ -217,6 +217,11 @@ class Estimator(ABC):
         return self.n_parameters > 0
 
     @property
+    def adapts(self) -> bool:
+        """Whether parameters of the car or its sensors are states, which a fault may lead astray."""
+        return False
+
+    @property
     def warm_up_steps(self) -> int:
         """Samples after its first for which it has no estimate yet."""
         return 0

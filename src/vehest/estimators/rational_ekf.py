@@ -203,6 +203,11 @@ class RationalTrack(SideslipFilter):
         return KINDS[self.tyres]
 
     @property
+    def adapts(self) -> bool:
+        """Whether tyre parameters are states."""
+        return bool(self.adapted)
+
+    @property
     def adapted(self) -> tuple[str, ...]:
         """Tyre parameters that are states."""
         return self.kind.adapted

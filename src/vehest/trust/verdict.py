@@ -51,7 +51,7 @@ NO_FAULTS = np.array(
 
 def starts_anew(estimator: Estimator) -> bool:
     """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
-    return estimator.warm_up_steps == 0 and not getattr(estimator, "adapts", False)
+    return estimator.warm_up_steps == 0 and not estimator.adapts
 
 
 class Monitor:
@@ -81,7 +81,7 @@ class Monitor:
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._required = ~self._skippable
         self.starts_anew = starts_anew(estimator)
-        self.adapts = bool(getattr(estimator, "adapts", False))
+        self.adapts = estimator.adapts
         self.persistent_steps = max(round(PERSISTENT_FAULT_SECONDS * estimator.settings.rate_hz), 1)
         self._fault = np.zeros(2)
 
