@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ from vehest_papers.ksnn.pairs import (
     pair_rows,
     ratios_table,
 )
-from vehest_papers.ksnn.schemes import Scheme, with_common_blocks
+from vehest_papers.ksnn.schemes import THIRD, Scheme, with_common_blocks
 from vehest_papers.ksnn.sub_models import shares_of_parts, shares_table
 
 NAME = "ksnn"  # of the paper's package
@@ -83,20 +84,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     trained = block_errors.training_rows(content, artefacts.parts, schemes)
     kinds = kinds_of(artefacts)
     claims = claims_table(content, rows, trained, kinds)
-    shares = pd.concat(
-        [
-            shares_of_parts(pair_parts(artefacts.parts), "own", "pairs, SIMULATED"),
-            *(
-                shares_of_parts({name: artefacts.parts[name]}, "test", "Ferrari, REAL")
-                for name in ("ferrari_drive",)
-                if name in artefacts.parts
-            ),
-        ]
-    )
-    tables = [pair_claims(claims)]
+    shares = shares_of(artefacts)
+    overviews = [errors_table(errors, "raw")] if len(errors) else []
+    overviews += [schemes_table(schemes)]
+    tables = [pair_claims(claims), replace(overviews[0], name="overview"), *overviews[1:]]
     if len(errors):
-        tables += [errors_table(errors, measure) for measure in ("raw", "best_gain")]
-        tables += [ratios_table(errors)]
+        tables += [errors_table(errors, "best_gain"), ratios_table(errors)]
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)
@@ -215,6 +208,19 @@ def pairs_values(errors: pd.DataFrame) -> list[dict[str, object]]:
     ]
 
 
+def shares_of(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """Shares of the sub-models in the KS-NNs of the pairs and of the real Ferrari."""
+    groups = {"pairs": pair_parts(artefacts.parts)}
+    groups |= {name: {name: artefacts.parts[name]} for name in REAL[:1] if name in artefacts.parts}
+    tables = []
+    for name, parts in groups.items():
+        for part_name, part in parts.items():
+            test = "own" if name == "pairs" else next(iter(part.split.tests))
+            data = f"{name}, {words_of_kinds(part).upper()}"
+            tables.append(shares_of_parts({part_name: part}, test, data))
+    return pd.concat(tables) if tables else pd.DataFrame()
+
+
 def incomplete(artefacts: StudyArtefacts) -> list[dict[str, object]]:
     """What is planned and not trained: one entry, or none."""
     counts = {name: len(names) for name, names in artefacts.not_trained.items() if names}
@@ -261,6 +267,30 @@ def velocity_ratios(artefacts: StudyArtefacts) -> Table | None:
         "quantile of the magnitude of a_y. The gate was met before any network was trained."
     )
     return Table("velocity_ratios", caption, pd.DataFrame(rows), columns)
+
+
+def schemes_table(schemes: Mapping[str, Scheme]) -> Table:
+    """FVU of the structure that validation chooses of each kind, on the pair with the paper's ratio."""
+    rows = []
+    for name in (*SCHEMES, "one_vehicle_1", "one_vehicle"):
+        scheme = schemes.get(name)
+        if scheme is None:
+            continue
+        keys = {candidate: scheme.key_of(candidate) for candidate in ORDER}
+        for candidate, key in keys.items():
+            if key in scheme.errors(scheme.own):
+                row = {"comparison": scheme.title, "candidate": candidate}
+                tests = {"own": scheme.own, "other": scheme.other, "third": THIRD}
+                row |= {
+                    column: scheme.errors(test).in_words(key, "fvu")
+                    for column, test in tests.items()
+                    if test in scheme.part.split.tests
+                }
+                rows.append(row)
+    columns = {"comparison": Column("comparison"), "candidate": Column("candidate")}
+    columns |= {name: Column(f"{name} car") for name in ("own", "other", "third")}
+    caption = "FVU with 95 % intervals over blocks and seeds."
+    return Table("schemes", caption, pd.DataFrame(rows, columns=[*columns]), columns)
 
 
 def windows_table(artefacts: StudyArtefacts) -> Table | None:
