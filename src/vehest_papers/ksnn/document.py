@@ -90,12 +90,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     overviews = [errors_table(errors, "raw")] if len(errors) else []
     overviews += [schemes_table(schemes)]
     tables: list[Block] = [
-        pair_claims(claims),
         replace(overviews[0], name="overview"),
         *overviews[1:],
     ]
     if len(errors):
-        tables += [errors_table(errors, "best_gain"), ratios_table(errors), errors_figure(errors)]
+        tables += [
+            pair_claims(claims),
+            errors_table(errors, "best_gain"),
+            ratios_table(errors),
+            errors_figure(errors),
+        ]
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)
@@ -151,10 +155,9 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
 def pair_claims(claims: Table) -> Table:
     """The claims that pairs of cars decide."""
     chosen = claims.frame[claims.frame["id"].str.endswith("_pairs")]
-    columns = {name: claims.columns[name] for name in ("claim", "published", "ours", "verdict")}
-    return Table(
-        "pair_claims", "Claims over pairs of cars. SIMULATED.", chosen[[*columns]], columns
-    )
+    columns = {name: claims.columns[name] for name in ("claim", "published", "verdict")}
+    caption = "Claims over pairs of cars; the CSV has our values and what decided. SIMULATED."
+    return Table("pair_claims", caption, chosen, columns)
 
 
 def behaviours(schemes: Mapping[str, Scheme]) -> dict[str, Behaviour]:
@@ -325,7 +328,9 @@ def windows_table(artefacts: StudyArtefacts) -> Table | None:
         name: Column(f"{name.split('_')[0]} car, N = {name.split('_')[1]}", decimals=3)
         for name in table.columns[2:]
     }
-    caption = "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds. SIMULATED."
+    caption = (
+        "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds."
+    )
     return Table("windows", caption, table, columns)
 
 
@@ -346,5 +351,5 @@ def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
         return None
     columns = {"trained": Column("comparison"), "test": Column("test")}
     columns |= {name: Column(name) for name in ORDER}
-    caption = "FVU on real cars (DevBot: simulated), 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
+    caption = "FVU, 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
     return Table("real_cars", caption, pd.DataFrame(rows), columns)
