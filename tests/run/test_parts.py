@@ -83,7 +83,8 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
     overview = pd.DataFrame(json.loads(out)["overview"])
     assert (
-        list(overview["model"]) == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
+        list(overview["candidate"])
+        == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
     )
     results = place.folder / "results" / "both"
     metrics = pd.read_csv(results / "metrics.csv")
@@ -94,9 +95,10 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     about = json.loads((results / "provenance.json").read_text())
     assert (about["parts"], about["absent"]) == (["scheme_1", "scheme_2"], ["ferrari_drive"])
     report = (results / "report.md").read_text(encoding="utf-8")
-    assert report.startswith("# Both ways\n\n**SIMULATED:**")
+    assert report.startswith("# Both ways\n\n**Question.**")
+    assert "**Evidence.** SIMULATED data." in report
     assert "Not in this report, since the recordings are missing: Elsewhere" in report
-    for target in re.findall(r"\]\(([^)]+)\)", report):
+    for target in re.findall(r"\]\((?!\.\.)([^)]+)\)", report):
         assert (results / target).is_file(), target
 
     assert place("report", "both", "tracking=none")[0] == 0
