@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import PATENT_NOTE, REPORT, Column, Document, Table, as_text
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_text
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
@@ -33,6 +33,7 @@ from vehest_papers.ksnn.pairs import (
     ORDER,
     TRAININGS,
     detectable_ratio,
+    errors_figure,
     errors_table,
     geometric_mean,
     log_fvu,
@@ -87,9 +88,13 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     shares = shares_of(artefacts)
     overviews = [errors_table(errors, "raw")] if len(errors) else []
     overviews += [schemes_table(schemes)]
-    tables = [pair_claims(claims), replace(overviews[0], name="overview"), *overviews[1:]]
+    tables: list[Block] = [
+        pair_claims(claims),
+        replace(overviews[0], name="overview"),
+        *overviews[1:],
+    ]
     if len(errors):
-        tables += [errors_table(errors, "best_gain"), ratios_table(errors)]
+        tables += [errors_table(errors, "best_gain"), ratios_table(errors), errors_figure(errors)]
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)

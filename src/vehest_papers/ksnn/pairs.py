@@ -10,12 +10,13 @@ import pandas as pd
 from scipy import stats
 
 from vehest.constants import FloatArray
-from vehest.report.document import Column, Table
-from vehest.report.style import MISSING
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, MISSING, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit.block_rows import BlockRow
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.verdict_table import figure_in_words
-from vehest_papers.kit.verdicts import Figure
+from vehest_papers.kit.verdicts import Figure as Value
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
@@ -138,14 +139,14 @@ def log_fvu(errors: pd.DataFrame, training: str, test: str, measure: str) -> pd.
     return logs.pivot_table("log", "pair", "candidate", aggfunc="mean")
 
 
-def geometric_mean(logs: FloatArray) -> Figure:
+def geometric_mean(logs: FloatArray) -> Value:
     """Geometric mean over pairs with its 95 % bootstrap interval; no interval below three pairs."""
     value = float(np.exp(logs.mean()))
     if len(logs) < 3:
-        return Figure(value, np.nan, np.nan)
+        return Value(value, np.nan, np.nan)
     drawn = np.random.default_rng(0).integers(len(logs), size=(N_RESAMPLES, len(logs)))
     low, high = np.exp(np.quantile(logs[drawn].mean(axis=1), [ALPHA / 2, 1 - ALPHA / 2]))
-    return Figure(value, float(low), float(high))
+    return Value(value, float(low), float(high))
 
 
 def detectable_ratio(logs: FloatArray) -> float:
@@ -227,6 +228,36 @@ def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> Tabl
         "column: smallest ratio above 1 that so many pairs detect on the other car at the stop. SIMULATED."
     )
     return Table("pairs_ratios", caption, pd.DataFrame(rows, columns=[*columns]), columns)
+
+
+def errors_figure(errors: pd.DataFrame) -> Figure:
+    """FVU of each candidate on the three cars, at the stop and at convergence: figure ``pairs``."""
+    names = [name for name in ORDER if name in set(errors["candidate"])]
+    with new_figure(DOUBLE_COLUMN, 0.9 + 0.24 * len(names)) as figure:
+        panels = figure.subplots(1, len(TESTS), sharex=True, sharey=True)
+        for axes, test in zip(panels, TESTS, strict=True):
+            for place, (training, marker) in enumerate((("stop", "o"), ("converged", "s"))):
+                logs = log_fvu(errors, training, test, "raw")
+                means = [geometric_mean(logs[name].to_numpy()) for name in names]
+                axes.errorbar(
+                    [own.value for own in means],
+                    np.arange(len(names)) + 0.24 * (place - 0.5),
+                    xerr=np.transpose(
+                        [(own.value - own.low, own.high - own.value) for own in means]
+                    ),
+                    fmt=marker,
+                    markersize=3,
+                    linewidth=1,
+                    label=WORDS[training],
+                )
+            axes.set_title(f"{test} car")
+            axes.set_xscale("log")
+            axes.set_xlabel("FVU")
+        panels[0].set_yticks(np.arange(len(names)), names)
+        panels[0].invert_yaxis()
+        legend_above(figure, panels[0], columns=2)
+    caption = f"FVU on {errors['pair'].nunique()} pairs of SIMULATED cars: geometric mean and 95 % interval over pairs."
+    return Figure("pairs", caption, figure)
 
 
 def n_seeds(errors: pd.DataFrame, networks: Sequence[str]) -> int:
