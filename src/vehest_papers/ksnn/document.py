@@ -31,6 +31,7 @@ from vehest_papers.ksnn.behaviour import Behaviour
 from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
 from vehest_papers.ksnn.pairs import (
     ORDER,
+    PART,
     TRAININGS,
     detectable_ratio,
     errors_figure,
@@ -170,8 +171,8 @@ def kinds_of(artefacts: StudyArtefacts) -> dict[str, str]:
     """Part in claims.yaml -> real or simulated."""
     kinds = {}
     for name, part in artefacts.parts.items():
-        match = re.fullmatch(r"pair_\d+_(stop|converged)(?:_more)?", name)
-        title = f"pairs_{match[1]}" if match else re.sub(r"_[a-z]$", "", name)
+        match = PART.fullmatch(name)
+        title = f"pairs_{match[2]}" if match else re.sub(r"_[a-z]$", "", name)
         kinds[title] = words_of_kinds(part)
     return kinds
 

@@ -20,7 +20,7 @@ from vehest_papers.kit.verdicts import Figure as Value
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
-PART = re.compile(r"pair_(\d+)_(converged|stop)(?:_more)?")
+PART = re.compile(r"pair_(\d+)_(converged|stop)(?:_more|_last)?")
 TRAININGS = ("stop", "converged")
 TESTS = ("own", "other", "third")
 MEASURES = {"raw": "fvu", "best_gain": "fvu_best_gain"}
