@@ -87,7 +87,9 @@ def pair_errors(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
         assert match is not None
         for model in part.models:
             candidate = candidate_of(model)
-            trainings = TRAININGS if candidate in NOT_STOPPED else (match[2],)
+            trainings: tuple[str, ...] = (match[2],)
+            if candidate in NOT_STOPPED:
+                trainings = TRAININGS if match[2] == "converged" else ()
             for test in part.split.tests:
                 scored = part.scored(model, test)
                 sums = residuals(
