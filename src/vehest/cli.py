@@ -69,7 +69,7 @@ MODELS = _offer(
     lambda: [
         "pretrained",
         "self_calibrating",
-        *(own.name for own in Path(OUTPUT, "train").glob("[!.]*")),
+        *(model_folder.name for model_folder in Path(OUTPUT, "train").glob("[!.]*")),
     ]
 )
 OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
@@ -188,7 +188,7 @@ def new_car(
         float | None,
         typer.Option("--steering-ratio", help="Overall steering ratio."),
     ] = None,
-    own: Annotated[
+    with_estimators: Annotated[
         list[str] | None,
         typer.Option(
             "--with",
@@ -218,9 +218,9 @@ def new_car(
     )  # with torch: a file that is refused is so without it
 
     try:
-        further = [registered(word) for word in own or []]
+        extra_estimators = [registered(word) for word in with_estimators or []]
         examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
-        outcome = write(examined, left, further, dry_run=dry_run)
+        outcome = write(examined, left, extra_estimators, dry_run=dry_run)
     except VehestError as error:
         emit(as_json, {**found_in(examined), "stopped": str(error)}, [])
         raise
@@ -254,13 +254,13 @@ def ingest(
     ) as runner:
         if download:
             download_files(config, runner.messages, dry_run=dry_run)
-        made = runner.ingest(config)
+        artefact = runner.ingest(config)
     emit(
         as_json,
         {
-            "folder": str(made.folder),
-            "recordings": sorted(Path(n).stem for n in made.outputs),
-            "skipped": made.skipped,
+            "folder": str(artefact.folder),
+            "recordings": sorted(Path(n).stem for n in artefact.outputs),
+            "skipped": artefact.skipped,
         },
     )
 
@@ -335,9 +335,9 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.run.study_run import train_one
+    from vehest.run.study_run import train_estimator
 
-    emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
+    emit(as_json, train_estimator(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"), rich_help_panel=STAGES)
@@ -362,11 +362,11 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.run.study_run import evaluate_one
+    from vehest.run.study_run import evaluate_model
 
     emit(
         as_json,
-        evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note),
+        evaluate_model(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note),
     )
 
 
@@ -832,8 +832,12 @@ def report(
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         names = [word for word in words if is_file_name(word)]
-        others = [word for word in words if not is_file_name(word)]
-        verdicts = check_published(names, others) if names else check_listed(others)
+        overrides_of_check = [word for word in words if not is_file_name(word)]
+        verdicts = (
+            check_published(names, overrides_of_check)
+            if names
+            else check_listed(overrides_of_check)
+        )
         emit(as_json, verdicts, map(in_words, verdicts))
         failed = any(
             verdict["failure"] if "failure" in verdict else verdict["state"] != "up to date"
@@ -924,39 +928,41 @@ def prune(
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
-    found = unused_artefacts(Path(str(config["output"])))
-    total = sum(one["bytes"] for one in found)
+    unused = unused_artefacts(Path(str(config["output"])))
+    total = sum(entry["bytes"] for entry in unused)
     rows = [
         [
-            one["path"],
-            f"{one['bytes'] / 1e6:.3f} MB",
-            str(timedelta(seconds=one["seconds"])),
-            one["reason"],
+            entry["path"],
+            f"{entry['bytes'] / 1e6:.3f} MB",
+            str(timedelta(seconds=entry["seconds"])),
+            entry["reason"],
         ]
-        for one in found
+        for entry in unused
     ]
-    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if found else []
+    tables = (
+        [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if unused else []
+    )
     emit(
         False,
         None,
         []
         if as_json
         else [
-            *shown,
-            f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove",
+            *tables,
+            f"{len(unused)} to remove, {total / 1e6:.3f} MB" if unused else "nothing to remove",
         ],
     )
     removed: list[str] = []
-    if found and not dry_run:
+    if unused and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("no terminal for questions; use --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
             remove_unused(
-                [Path(one["path"]) for one in found], lambda path: removed.append(str(path))
+                [Path(entry["path"]) for entry in unused], lambda path: removed.append(str(path))
             )
     emit(
         as_json,
-        {"found": found, "bytes": total, "removed": removed},
+        {"found": unused, "bytes": total, "removed": removed},
         [f"{len(removed)} removed"] if removed else [],
     )
 
@@ -1115,15 +1121,17 @@ def data_align(
     from vehest.alignment.settings import AlignmentSettings
     from vehest.run.align import align_recording, as_plain, in_words, write_alignment
 
-    asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
+    quantities = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(
-        asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed
+        quantities, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed
     )
-    found = align_recording(source, overrides or [], recording, settings)
+    alignment = align_recording(source, overrides or [], recording, settings)
     if out is not None:
-        write_alignment(found, out)
+        write_alignment(alignment, out)
     emit(
-        as_json, {**as_plain(found), "out": None if out is None else str(out)}, in_words(found, out)
+        as_json,
+        {**as_plain(alignment), "out": None if out is None else str(out)},
+        in_words(alignment, out),
     )
 
 
@@ -1220,18 +1228,18 @@ def _run_study(
         ran = run_study(name, overrides, options, cache, sweep=sweep, only_report=only_report)
     page = ran.folder / ran.summary.page
     summary = ran.summary
-    own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
+    outcome: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:
-        own = {"report": str(page), "published": str(ran.published) if ran.published else None}
-    shown: list[str | TerminalTable] = [
+        outcome = {"report": str(page), "published": str(ran.published) if ran.published else None}
+    lines: list[str | TerminalTable] = [
         *summary.tables,
         *(summary.note.split("\n") if summary.note else []),
         f"report: {page}",
     ]
     emit(
         as_json,
-        {**own, **json.loads(summary.figures)},
-        [*shown, *([f"published: {ran.published}"] if ran.published else [])],
+        {**outcome, **json.loads(summary.figures)},
+        [*lines, *([f"published: {ran.published}"] if ran.published else [])],
     )
     if ran.failed is not None:
         raise ran.failed

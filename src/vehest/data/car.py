@@ -61,14 +61,14 @@ class CarValues:
             self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None, imu_to_rear_axle=imu
         )
 
-    def difference_to(self, other: CarValues) -> str:
+    def difference_to(self, second: CarValues) -> str:
         """Why this and another car cannot be the same: ``wheelbase 0.33 m, not 2.7 m``; else empty.
 
         They cannot where a value that both have differs by more than `SAME_CAR_RANGES`.
         """
         for name, (factor, unit) in SAME_CAR_RANGES.items():
             value = getattr(self, name)
-            expected = getattr(other, name)
+            expected = getattr(second, name)
             if value is None or expected is None:
                 continue
             if max(value, expected) > factor * min(value, expected):

@@ -48,13 +48,13 @@ class Derivation:
     def in_words(self) -> str:
         """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel (ratio: of …)``."""
         entries = ", ".join(
-            "{" + ", ".join(f"{key}: {_shown(value)}" for key, value in entry.items()) + "}"
+            "{" + ", ".join(f"{key}: {_as_text(value)}" for key, value in entry.items()) + "}"
             for entry in self.transforms
         )
         *first, last = self.of
         meanings = "; ".join(f"{name}: {meaning}" for name, meaning in self.meanings.items())
-        made_of = f"{', '.join(first)} and {last}" if first else last
-        return f"transforms: [{entries}] of {made_of}" + (f" ({meanings})" if meanings else "")
+        inputs = f"{', '.join(first)} and {last}" if first else last
+        return f"transforms: [{entries}] of {inputs}" + (f" ({meanings})" if meanings else "")
 
 
 def derivation_of(
@@ -80,8 +80,12 @@ def derivation_of(
         return None
     if speed in channels:
         return Derivation((*of, speed), (entry,))
-    made = derivation_of("vx", channels, (), rate_hz)
-    return None if made is None else Derivation((*of, *made.of), (*made.transforms, entry))
+    derived_speed = derivation_of("vx", channels, (), rate_hz)
+    return (
+        None
+        if derived_speed is None
+        else Derivation((*of, *derived_speed.of), (*derived_speed.transforms, entry))
+    )
 
 
 def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
@@ -91,5 +95,5 @@ def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
     )
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return "…" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

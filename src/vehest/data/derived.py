@@ -20,13 +20,13 @@ WHEELS = ("fl", "fr", "rl", "rr")
 STANDSTILL_SPEED = 0.1  # m/s
 
 
-def _known(name: str) -> str:
+def _checked_channel(name: str) -> str:
     if name not in CHANNELS:
         raise ValueError(f"there is no channel '{name}'; 'vehest data channels' lists them")
     return name
 
 
-ChannelName = Annotated[str, AfterValidator(_known)]  # name of a channel of the table
+ChannelName = Annotated[str, AfterValidator(_checked_channel)]  # name of a channel of the table
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -139,7 +139,7 @@ class SpeedFromWheels:
             )
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
         step = 1.0 / recording.rate_hz
-        most = self.most_acceleration * step
+        max_change = self.most_acceleration * step
         patience = round(min(self.hold_seconds * recording.rate_hz, len(recording)))
         number = counts.sum(0)
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
@@ -147,18 +147,18 @@ class SpeedFromWheels:
             np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         )
         vx = np.empty(len(recording))
-        held = 0
+        n_held = 0
         now = math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
-            held = 0 if agreeing >= enough else held + 1
-            wanted = wheels if agreeing >= enough else median
+            n_held = 0 if agreeing >= enough else n_held + 1
+            target = wheels if agreeing >= enough else median
             if math.isnan(now):
-                now = wanted
-            elif (held and held <= patience) or math.isnan(wanted):
+                now = target
+            elif (n_held and n_held <= patience) or math.isnan(target):
                 now += gain
             else:
-                now += min(max(wanted - now, -most), most)
+                now += min(max(target - now, -max_change), max_change)
             vx[k] = now
         if not np.isfinite(vx).any():
             raise DataError(
@@ -231,16 +231,16 @@ class VelocityFromSideslip:
         angle = recording["sideslip_ref"]
         if self.min_speed:
             angle = np.where(np.abs(recording[speed]) < self.min_speed, 0.0, angle)
-        beyond = np.abs(angle) >= 0.5 * np.pi
-        moving = beyond & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
+        is_sideways = np.abs(angle) >= 0.5 * np.pi
+        moving = is_sideways & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
         if moving.any():
             worst = int(np.argmax(np.where(moving, np.abs(angle), 0.0)))
-            what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
+            problem = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
             raise DataError(
-                f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only"
+                f"recording '{recording.id}': {problem}; lateral velocity follows from less than 90 degrees only"
             )
         return recording.with_channels(
-            {"vy_ref": recording[speed] * np.tan(np.where(beyond, 0.0, angle))},
+            {"vy_ref": recording[speed] * np.tan(np.where(is_sideways, 0.0, angle))},
             made_of=("sideslip_ref", speed),
         )
 

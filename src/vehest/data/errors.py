@@ -59,6 +59,12 @@ def counted(names: Sequence[str]) -> str:
     )
 
 
+def abbreviated(names: Sequence[str], max_named: int) -> str:
+    """The first of some names, and the number of the others: ``a, b and 3 more``."""
+    n_more = len(names) - max_named
+    return ", ".join(names[:max_named]) + (f" and {n_more} more" if n_more > 0 else "")
+
+
 def closest(name: str, choices: Iterable[str]) -> str:
     """The choice that is spelt most like a name; empty if none is close."""
     return next(iter(get_close_matches(name, list(choices), n=1)), "")
@@ -91,10 +97,10 @@ def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]])
     hint = suggestion(option, names.get(family, ()), "estimator.")
     if not hint:
         families = {
-            other: name
-            for other, options in names.items()
+            candidate: name
+            for candidate, options in names.items()
             for name in options
-            if other != family and _spelling(name) == _spelling(option)
+            if candidate != family and _spelling(name) == _spelling(option)
         }
         if families:
             name = next(iter(families.values()))

@@ -83,13 +83,13 @@ class Estimate(TimeSeries):
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
-        where = f"estimate of '{self.recording_id}'"
+        subject = f"estimate of '{self.recording_id}'"
         lengths = {len(values) for values in self.channels.values()}
         for name in self.channels.keys() - QUANTITIES.keys():
-            raise ValueError(f"{where}: unknown quantity '{name}'")
+            raise ValueError(f"{subject}: unknown quantity '{name}'")
         if len(lengths) != 1:
             raise ValueError(
-                f"{where}: quantities must have one common length, not {sorted(lengths)}"
+                f"{subject}: quantities must have one common length, not {sorted(lengths)}"
             )
         n_rows = len(self.covariance_of)
         shape = None if self.covariance is None else self.covariance.shape
@@ -97,9 +97,9 @@ class Estimate(TimeSeries):
             shape != ((len(self), n_rows, n_rows) if n_rows else None)
             or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows
         ):
-            what = f"not {shape} and ({', '.join(self.covariance_of)})"
+            actual = f"not {shape} and ({', '.join(self.covariance_of)})"
             raise ValueError(
-                f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}"
+                f"{subject}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {actual}"
             )
 
     @property

@@ -97,11 +97,11 @@ def without_links(path: Path) -> Path:
 def file_name(name: str, ending: str = "") -> str:
     """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
     at 100 bytes, and the start of its hash added."""
-    kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
-    if kept != name or not name or len(kept.encode()) > 120:
+    component = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
+    if component != name or not name or len(component.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
-        kept = f"{kept.encode()[:100].decode('utf-8', 'ignore')}~{digest}"
-    return f"{kept}{ending}"
+        component = f"{component.encode()[:100].decode('utf-8', 'ignore')}~{digest}"
+    return f"{component}{ending}"
 
 
 def no_room(error: BaseException) -> OSError | None:
@@ -163,7 +163,7 @@ def is_left_over(path: Path) -> bool:
     """Whether ``path`` was written aside and its process has ended; of another host: whether it is a day old."""
     if not path.name.startswith(ASIDE_PREFIX):
         return False
-    process, host = found.groups() if (found := _ASIDE.match(path.name)) else ("0", None)
+    process, host = match.groups() if (match := _ASIDE.match(path.name)) else ("0", None)
     if (
         host in (None, _host()) and os.name == "posix"
     ):  # elsewhere os.kill would end what it asks for
@@ -234,7 +234,9 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
-    for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
+    for file in (
+        [entry for entry in path.rglob("*") if entry.is_file()] if path.is_dir() else [path]
+    ):
         descriptor = os.open(
             file, os.O_RDWR
         )  # Windows flushes no file that is open for reading alone

@@ -59,8 +59,8 @@ def _first_of(recording: Recording, *names: str) -> FloatArray:
 
 def _turns(turned: FloatArray) -> list[int]:
     """Points at which whole turns of a circle are done."""
-    whole = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
-    return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(whole))) + 1).tolist()]
+    n_turns = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
+    return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(n_turns))) + 1).tolist()]
 
 
 def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
@@ -72,13 +72,13 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
     off = np.abs(mean_turn - 2.0 * math.pi * np.rint(mean_turn / (2.0 * math.pi)))
     peak = np.zeros(len(correlation), dtype=bool)
     peak[1:-1] = (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
-    found = np.flatnonzero(
+    periods = np.flatnonzero(
         peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8)
     )
-    if not len(found):
+    if not len(periods):
         return None
-    best = correlation[found].max()
-    return int(found[correlation[found] >= LEAST_SHARE_OF_BEST * best][0])
+    best = correlation[periods].max()
+    return int(periods[correlation[periods] >= LEAST_SHARE_OF_BEST * best][0])
 
 
 def _correlations(samples: FloatArray) -> FloatArray:

@@ -57,24 +57,24 @@ def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
 
 
 def check_limit(
-    name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError
+    name: str, value: float, subject: str, error: type[ConfigurationError | DataError] = DataError
 ) -> None:
     """Refuse a number above the limit ``name``, a field of `Limits`.
 
-    Raises `DataError`: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
+    Raises `DataError`: it is above (or ``error``); its message begins with ``subject``, ``"'lap.csv' would hold 4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:
         raise error(
-            f"{what}, more than the limit of {limit}; if that is meant, raise it: limits.{name}=NUMBER"
+            f"{subject}, more than the limit of {limit}; if that is meant, raise it: limits.{name}=NUMBER"
         )
 
 
 def check_unpacked(file: object, packed: float, unpacked: float) -> None:
     """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times its packed size [bytes]."""
-    beyond = unpacked - 10.0 * packed
+    excess = unpacked - 10.0 * packed
     check_limit(
         "memory",
-        beyond,
-        f"'{file}' unpacks to {unpacked:.0f} bytes, {beyond:.0f} beyond ten times its size",
+        excess,
+        f"'{file}' unpacks to {unpacked:.0f} bytes, {excess:.0f} beyond ten times its size",
     )

@@ -125,7 +125,7 @@ def has_time_unit(kind: pa.DataType) -> bool:
 
 def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
     """Numbers of a column, (T,), NaN where one is missing; not by ``to_numpy``, which imports pandas."""
-    found = [np.empty(0)]
+    chunks = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
         counted = chunk.cast(pa.int64()) if has_time_unit(chunk.type) else chunk
         numbers = (
@@ -136,9 +136,9 @@ def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
             if len(numbers)
             else np.empty(0)
         )
-        found.append(
+        chunks.append(
             np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values)
             if numbers.null_count
             else values
         )
-    return np.concatenate(found)
+    return np.concatenate(chunks)

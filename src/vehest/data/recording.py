@@ -53,9 +53,9 @@ class Recording(TimeSeries):
 
     def __post_init__(self) -> None:
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
-            where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
+            bounds = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
             raise DataError(
-                f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz"
+                f"recording '{self.id}': the sampling rate must lie {bounds}, not at {self.rate_hz:g} Hz"
             )
         if not math.isfinite(self.start_time):
             raise DataError(
@@ -67,7 +67,9 @@ class Recording(TimeSeries):
             )
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
-        frozen = {channel(name).name: _own(samples) for name, samples in self.channels.items()}
+        frozen = {
+            channel(name).name: _immutable(samples) for name, samples in self.channels.items()
+        }
         n_samples = max((samples.size for samples in frozen.values()), default=0)
         if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
             shapes = {name: samples.shape for name, samples in frozen.items()}
@@ -81,12 +83,12 @@ class Recording(TimeSeries):
             bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
             if len(bad):
                 first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
-                what = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
+                problem = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
                 fix = (
                     "cut the range out (max_gap of the data set ends a recording there), or declare "
                     "the channel in 'gappy' if a gap means 'not measured'"
                 )
-                raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
+                raise DataError(f"recording '{self.id}': channel '{name}' holds {problem}; {fix}")
 
     @property
     def label(self) -> str:
@@ -128,10 +130,10 @@ class Recording(TimeSeries):
 
     def without_references(self) -> Recording:
         """The same drive as an estimator may see it: no ``_ref`` channels."""
-        kept = [name for name in self.channels if not CHANNELS[name].is_reference]
-        if not kept:
+        measured = [name for name in self.channels if not CHANNELS[name].is_reference]
+        if not measured:
             raise DataError(f"recording '{self.id}' has reference channels only")
-        return self.select(kept)
+        return self.select(measured)
 
     def cut(self, start: float, stop: float) -> Recording:
         """The samples taken in [start, stop) seconds. Raises `DataError`: the range holds no samples."""
@@ -200,7 +202,7 @@ def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)
 
 
-def _own(samples: FloatArray) -> FloatArray:
+def _immutable(samples: FloatArray) -> FloatArray:
     """Samples that nobody else can change: a copy, unless they are those of a recording."""
     shared = (
         isinstance(samples, np.ndarray)

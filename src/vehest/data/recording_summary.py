@@ -40,5 +40,5 @@ def stored_summary(path: Path) -> RecordingSummary:
 
 def common_channels(recordings: Iterable[RecordingSummary]) -> frozenset[str]:
     """Channels that all recordings have; none where there are no recordings."""
-    held = [recording.channels for recording in recordings]
-    return frozenset.intersection(*held) if held else frozenset()
+    channel_sets = [recording.channels for recording in recordings]
+    return frozenset.intersection(*channel_sets) if channel_sets else frozenset()

@@ -79,12 +79,12 @@ class SplitFile:
 
 def _read(config: Any) -> SplitFile:
     name = config.get("name") if isinstance(config, Mapping) else None
-    where = f"split '{name}'" if isinstance(name, str) else ""
-    plain = _spelt_out(config, where) if isinstance(config, Mapping) else config
-    return validated(SplitFile, plain, where, error=ConfigurationError, group="split")
+    subject = f"split '{name}'" if isinstance(name, str) else ""
+    plain = _spelt_out(config, subject) if isinstance(config, Mapping) else config
+    return validated(SplitFile, plain, subject, error=ConfigurationError, group="split")
 
 
-def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _spelt_out(config: Mapping[str, Any], subject: str) -> dict[str, Any]:
     """Roles in short (``60 %``, ``last lap``) as ranges of all recordings; percentages follow one another, training first."""
     done = 0.0
 
@@ -97,19 +97,23 @@ def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
             done = done + float(share[1])
             if done > 100.0 + 1e-9:
                 raise ConfigurationError(
-                    f"{where}: the percentages come to {done:g} %, more than there is"
+                    f"{subject}: the percentages come to {done:g} %, more than there is"
                 )
             return [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
         if LAPS.fullmatch(entries) is not None:
             return [{"recordings": "*", "laps": entries}]
-        what = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
-        raise ConfigurationError(f"{where}: {role} must be {what}")
+        expected = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
+        raise ConfigurationError(f"{subject}: {role} must be {expected}")
 
-    given = {key: value for key, value in config.items() if value is not None}
-    given |= {role: ranges(role, given[role]) for role in ("train", VALIDATION) if role in given}
-    if isinstance(tests := given.get("tests"), Mapping):
-        given["tests"] = {name: ranges(f"tests.{name}", entries) for name, entries in tests.items()}
-    return given
+    content = {key: value for key, value in config.items() if value is not None}
+    content |= {
+        role: ranges(role, content[role]) for role in ("train", VALIDATION) if role in content
+    }
+    if isinstance(tests := content.get("tests"), Mapping):
+        content["tests"] = {
+            name: ranges(f"tests.{name}", entries) for name, entries in tests.items()
+        }
+    return content
 
 
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
@@ -141,8 +145,8 @@ def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Spa
     """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on; it wraps around; ends of seconds are left out."""
     total = _seconds_of(spans)
     begin = at * total
-    kept = _between(spans, begin, min(begin + seconds, total))
-    pieces = (*_between(spans, 0.0, begin + seconds - total), *kept)
+    upper = _between(spans, begin, min(begin + seconds, total))
+    pieces = (*_between(spans, 0.0, begin + seconds - total), *upper)
     return tuple(piece for piece in pieces if piece.stop - piece.start >= LEAST_SECONDS) or pieces
 
 
@@ -152,16 +156,16 @@ def _seconds_of(spans: Iterable[Span]) -> float:
 
 def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
     """Pieces of ranges laid end to end that lie between two times of that line [s]."""
-    found = []
+    pieces = []
     position = 0.0
     for span in spans:
         length = span.stop - span.start
         start = max(begin - position, 0.0)
         stop = min(end - position, length)
         if stop - start > 1e-9:
-            found.append(replace(span, start=span.start + start, stop=span.start + stop))
+            pieces.append(replace(span, start=span.start + start, stop=span.start + stop))
         position += length
-    return found
+    return pieces
 
 
 class _Ranges:
@@ -230,8 +234,8 @@ class _Ranges:
                 if entry.recording is not None
                 else self._matching(dataset, str(entry.recordings))
             )
-            whole = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
-            spans += whole if entry.keep is None else self._cut(role, whole, entry.keep)
+            ranges = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
+            spans += ranges if entry.keep is None else self._cut(role, ranges, entry.keep)
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
@@ -242,8 +246,8 @@ class _Ranges:
     def _time(self, dataset: str, name: str, bound: float | str) -> float:
         if not isinstance(bound, str):
             return bound
-        found = PERCENT.fullmatch(bound)
-        share = float(found[1]) if found else math.inf
+        match = PERCENT.fullmatch(bound)
+        share = float(match[1]) if match else math.inf
         if share > 100.0:
             raise ConfigurationError(
                 f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
@@ -254,22 +258,22 @@ class _Ranges:
         return recording.start_time + round(share / 100.0 * len(recording)) / recording.rate_hz
 
     def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
-        found = LAPS.fullmatch(words)
-        if found is None:
+        match = LAPS.fullmatch(words)
+        if match is None:
             raise ConfigurationError(
                 f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'"
             )
-        end, number, first, last = found.groups()
+        end, number, first, last = match.groups()
         laps = laps_of(self._recording(dataset, name))
         count = int(number or 1)
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
-            there = (
+            problem = (
                 f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
             )
             raise ConfigurationError(
-                f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead"
+                f"{self._where}: recording '{name}' has no '{words.strip()}': {problem}; name times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
 
@@ -288,9 +292,11 @@ class _Ranges:
         recordings = self._recordings(dataset)
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
-            known = ", ".join([*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])])
+            available = ", ".join(
+                [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
+            )
             raise ConfigurationError(
-                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {known})"
+                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {available})"
             )
         return names
 
@@ -303,10 +309,10 @@ class _Ranges:
             self._known[dataset] = self._catalogue(dataset)
         return self._known[dataset]
 
-    def _cut(self, role: str, whole: Sequence[Span], condition: Condition) -> list[Span]:
+    def _cut(self, role: str, ranges: Sequence[Span], condition: Condition) -> list[Span]:
         """Stretches of spans in which a condition holds."""
         spans: list[Span] = []
-        for span in whole:
+        for span in ranges:
             recording = self._recording(span.dataset, span.recording, condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
             for begin, after in stretches_where(recording, condition, first, end):

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 
 from vehest.data.errors import ConfigurationError, printable
 
@@ -21,7 +21,7 @@ YAML_NUMBER = re.compile(
 WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
-def check_name(name: str, what: str) -> None:
+def check_name(name: str, subject: str) -> None:
     """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or an override.
 
     It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
@@ -30,20 +30,20 @@ def check_name(name: str, what: str) -> None:
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
-            f"{what}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
+            f"{subject}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
             "'.', begin with none of the last two and not end with '.'; it becomes part of file names"
         )
     if len(name) > LONGEST_NAME:
         raise ConfigurationError(
-            f"{what}: '{name[:20]}…' has {len(name)} characters; take {LONGEST_NAME} at most"
+            f"{subject}: '{name[:20]}…' has {len(name)} characters; take {LONGEST_NAME} at most"
         )
     if name.lower() in YAML_WORDS or YAML_NUMBER.fullmatch(name):
         raise ConfigurationError(
-            f"{what}: '{name}' is a word or number of YAML; add letters, such as car_{name}"
+            f"{subject}: '{name}' is a word or number of YAML; add letters, such as car_{name}"
         )
     if WINDOWS_DEVICE.fullmatch(name.partition(".")[0]):
         raise ConfigurationError(
-            f"{what}: '{name}' is a device of Windows, not a file; add letters, such as car_{name}"
+            f"{subject}: '{name}' is a device of Windows, not a file; add letters, such as car_{name}"
         )
 
 
@@ -64,8 +64,8 @@ class Span:
 
     def overlaps(self, other: Span) -> bool:
         """Whether both stretches share samples."""
-        same = (self.dataset, self.recording) == (other.dataset, other.recording)
-        return same and self.start < other.stop and other.start < self.stop
+        is_same_recording = (self.dataset, self.recording) == (other.dataset, other.recording)
+        return is_same_recording and self.start < other.stop and other.start < self.stop
 
     def describe(self) -> str:
         """For messages and reports, for example ``lap3 [150, 450) s``."""
@@ -113,13 +113,20 @@ class Split:
         ]:
             for span, other in product(spans, other_spans):
                 if span.overlaps(other):
-                    what = f"{role} and {other_role} share samples of recording '{span.recording}'"
+                    problem = (
+                        f"{role} and {other_role} share samples of recording '{span.recording}'"
+                    )
                     raise ConfigurationError(
-                        f"split '{self.name}': {what} ({span.describe()} and {other.describe()}); separate the ranges"
+                        f"split '{self.name}': {problem} ({span.describe()} and {other.describe()}); separate the ranges"
                     )
 
     @property
     def datasets(self) -> tuple[str, ...]:
         """Names of the data sets it draws on, sorted."""
-        spans = (self.train, self.validation, *self.tests.values())
-        return tuple(sorted({span.dataset for own in spans for span in own}))
+        spans = (*self.train, *self.validation, *self.test_spans)
+        return tuple(sorted({span.dataset for span in spans}))
+
+    @property
+    def test_spans(self) -> tuple[Span, ...]:
+        """The ranges of all test sets."""
+        return tuple(chain.from_iterable(self.tests.values()))

@@ -148,10 +148,10 @@ def write_estimate_parts(parts: Iterable[Estimate], path: Path, band: str = "") 
     MissingError
         The file cannot be written.
     """
-    rest = iter(parts)
-    first = next(rest)
+    remaining = iter(parts)
+    first = next(remaining)
     about = _about_estimate(first) | ({"band": band} if band else {})
-    columns = map(with_degrees, estimate_columns(chain([first], rest)))
+    columns = map(with_degrees, estimate_columns(chain([first], remaining)))
     units = [QUANTITIES[name] for name in first.covariance_of]
     of_covariance = {
         f"{_COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
@@ -206,10 +206,10 @@ def read_estimate(path: Path) -> Estimate:
         for name in IN_DEGREES:
             columns.pop(name, None)
         if n_states is not None:
-            here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
-            if n_states < 1 or n_states**2 != here:
+            n_entries = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
+            if n_states < 1 or n_states**2 != n_entries:
                 raise DataError(
-                    f"n_states is {n_states}, and there are {here} columns of the covariance; make it again"
+                    f"n_states is {n_states}, and there are {n_entries} columns of the covariance; make it again"
                 )
             entries = [
                 columns.pop(f"{_COVARIANCE}_{row}_{column}")
@@ -232,13 +232,13 @@ def read_estimate(path: Path) -> Estimate:
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
     """The description of a recording or an estimate beside its table; `DataError` if it is damaged or of another kind or format."""
     content = "recording" if kind is RecordingDescription else "estimate"
-    found = _metadata(schema, path)
-    if found.get("content") != content:
+    content_found = _metadata(schema, path)
+    if content_found.get("content") != content:
         raise DataError(
             f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} {content} that vehest wrote"
         )
-    check_format(found.get("format", 0), _FORMAT, f"'{path}'")
-    return validated(kind, found, f"'{path}'")
+    check_format(content_found.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, content_found, f"'{path}'")
 
 
 def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
@@ -282,7 +282,8 @@ def _table(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> pa.Ta
         for name, values in columns.items()
     }  # without pandas
     arrays = [
-        pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for own in buffers.values()
+        pa.Array.from_buffers(pa.float64(), buffer.size // 8, [None, buffer])
+        for buffer in buffers.values()
     ]
     fields = [
         pa.field(name, pa.float64(), metadata={"unit": units[name]} if name in units else None)

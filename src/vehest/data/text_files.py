@@ -39,23 +39,23 @@ def read_yaml(path: Path) -> Any:
     return parse_yaml(read_text(path), f"'{path}'")
 
 
-def parse_yaml(text: str, where: str) -> Any:
+def parse_yaml(text: str, subject: str) -> Any:
     """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
-    check_yaml_size(text, where)
+    check_yaml_size(text, subject)
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     except (
         AttributeError,
         LookupError,
     ):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
         raise DataError(
-            f"{where} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)"
+            f"{subject} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)"
         ) from None
 
 
-def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> None:
+def check_yaml_size(text: str, subject: str, max_values: int = MOST_VALUES) -> None:
     """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built; raises `DataError`."""
     try:
         try:
@@ -65,10 +65,10 @@ def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> Non
         ):  # libyaml refuses names that are not UTF-8, which are written as surrogates
             is_larger = _is_larger(text, max_values, yaml.SafeLoader)
     except (yaml.YAMLError, ValueError) as error:
-        raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     if is_larger:
         raise DataError(
-            f"{where} nests deeper than {DEEPEST} levels or holds more than {max_values} values, repeated ones included"
+            f"{subject} nests deeper than {DEEPEST} levels or holds more than {max_values} values, repeated ones included"
         )
 
 
@@ -96,13 +96,19 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path), f"'{path}'")
 
 
-def parse_json(text: str | bytes, where: str) -> Any:
+def parse_json(text: str | bytes, subject: str) -> Any:
     """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
-    check_limit("text_bytes", len(text), f"{where} holds a description of {len(text)} bytes")
+    check_limit("text_bytes", len(text), f"{subject} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # a UnicodeDecodeError is a ValueError
-        raise DataError(f"{where} cannot be read as JSON ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as JSON ({first_line(error)})") from None
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write plain values as JSON; bytes of names that are not UTF-8 become escapes."""
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:

@@ -71,29 +71,29 @@ class Resample:
     def __call__(self, recording: Recording) -> Recording:
         """Resample every channel; errors where the outcome or the filter is more than the limits, or a gappy channel needs filtering."""
         expected = len(recording) * (self.rate_hz / recording.rate_hz)
-        what = (
+        problem = (
             f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
         )
-        check_limit("samples", expected, what)
+        check_limit("samples", expected, problem)
         check_limit(
             "memory",
             8 * expected * len(recording.channels),
-            f"{what} in each of {len(recording.channels)} channels",
+            f"{problem} in each of {len(recording.channels)} channels",
         )
         exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
         ratio = exact.limit_denominator(1000)
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
-            what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
-            raise DataError(f"recording '{recording.id}': {what}")
+            problem = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
+            raise DataError(f"recording '{recording.id}': {problem}")
         up = ratio.numerator
         down = ratio.denominator
         if up == down:
             return recording
         if self.method == "decimate":
             if up != 1:
-                what = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
+                problem = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
                 raise ConfigurationError(
-                    f"recording '{recording.id}': {what}; use method=polyphase"
+                    f"recording '{recording.id}': {problem}; use method=polyphase"
                 )
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:
@@ -159,15 +159,17 @@ class LowPass:
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels; errors where one is missing or has gaps, or the cut-off does not suit the rate or the limits."""
-        where = f"recording '{recording.id}'"
+        subject = f"recording '{recording.id}'"
         rate_hz = recording.rate_hz
         if not 0 < self.cutoff_hz < rate_hz / 2:
             raise ConfigurationError(
-                f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz"
+                f"{subject}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz"
             )
         length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
-        what = f"{where}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
-        check_limit("filter_samples", length, what, ConfigurationError)
+        problem = (
+            f"{subject}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
+        )
+        check_limit("filter_samples", length, problem, ConfigurationError)
         sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos")
 
         def filtered(samples: FloatArray) -> FloatArray:
@@ -207,12 +209,12 @@ class RemoveOutliers:
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels; errors where one is missing or has gaps, or the windows are more than the limits."""
         width = 2 * self.half_window + 1
-        what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
-        check_limit("filter_samples", width, what, ConfigurationError)
+        problem = f"recording '{recording.id}': outlier removal over windows of {width} samples"
+        check_limit("filter_samples", width, problem, ConfigurationError)
         check_limit(
             "memory",
             8 * width * len(recording),
-            f"{what} compares {width * len(recording)} values a channel",
+            f"{problem} compares {width * len(recording)} values a channel",
             ConfigurationError,
         )
         at_once = max(VALUES_AT_ONCE // width, 1)
@@ -252,11 +254,14 @@ class BridgeImpossible:
         places = np.arange(len(recording))
         changed = {}
         for name, samples in recording.channels.items():
-            beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
+            is_impossible = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
             if (
-                beyond.any()
+                is_impossible.any()
                 and (
-                    near := np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5
+                    near := np.convolve(is_impossible, around)[len(around) // 2 :][
+                        : len(is_impossible)
+                    ]
+                    > 0.5
                 ).mean()
                 <= MOST_BRIDGED
             ):
@@ -343,11 +348,11 @@ class DelayCorrection:
         """Shift the channels, and cut the recording to the samples that then exist."""
         length = len(recording)
         position = self.delay * recording.rate_hz
-        whole = round(min(max(position, -length), length))
-        fraction = position - whole
+        n_samples = round(min(max(position, -length), length))
+        fraction = position - n_samples
         reach = 0 if abs(fraction) < 1e-9 else self.reach
-        first = max(reach - whole, 0)
-        last = length - max(reach + whole, 0)
+        first = max(reach - n_samples, 0)
+        last = length - max(reach + n_samples, 0)
         if first >= last:
             raise DataError(
                 f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s"
@@ -358,7 +363,7 @@ class DelayCorrection:
             recording, self.channels
         ):  # output sample k is the sum of taps over the samples around k + whole
             neighbours = np.lib.stride_tricks.sliding_window_view(recording[name], len(taps))
-            channels[name] = neighbours[first + whole - reach : last + whole - reach] @ taps
+            channels[name] = neighbours[first + n_samples - reach : last + n_samples - reach] @ taps
         return replace(
             recording,
             start_time=recording.start_time + first / recording.rate_hz,
@@ -513,8 +518,8 @@ def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ..
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
     for name in chosen:
         if name in recording.gappy:
-            what = f"channel '{name}' has gaps and cannot be filtered"
+            problem = f"channel '{name}' has gaps and cannot be filtered"
             raise DataError(
-                f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate"
+                f"recording '{recording.id}': {problem}; leave it out, or resample with method=decimate"
             )
     return chosen

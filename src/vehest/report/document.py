@@ -180,8 +180,8 @@ def write_document(
         _markdown(document, numbers).encode("utf-8", "backslashreplace")
     )
     if page:
-        whole = replace(document, blocks=[*document.blocks, *on_page])
-        (folder / f"{name}.html").write_bytes(page_of(whole, images))
+        page_document = replace(document, blocks=[*document.blocks, *on_page])
+        (folder / f"{name}.html").write_bytes(page_of(page_document, images))
 
 
 def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
@@ -211,10 +211,10 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
     """Headers of a table, rows of cells, and for each column whether it contains numbers."""
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
-    shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
+    visible = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
     columns = []
     numeric = []
-    for name, column in shown.items():
+    for name, column in visible.items():
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
@@ -224,7 +224,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         )
         columns.append(_number_cells(values.tolist(), column) if is_number else list(texts))
     return (
-        [printable(column.header) for column in shown.values()],
+        [printable(column.header) for column in visible.values()],
         [list(row) for row in zip(*columns, strict=True)],
         numeric,
     )
@@ -266,10 +266,10 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
     with paper_style():
         figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
-        few = image.convert("RGB").quantize(
+        quantized = image.convert("RGB").quantize(
             PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(small, format="png", optimize=True, dpi=(dpi, dpi))
+        quantized.save(small, format="png", optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
 
 
@@ -479,15 +479,15 @@ def bars_of(
 
     The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far beyond; what is longer is ``cut``.
     """
-    known = [value for value in values if math.isfinite(value)]
+    finite = [value for value in values if math.isfinite(value)]
     ends = [
         high if math.isfinite(high) else value
         for value, high in zip(values, highs, strict=True)
         if math.isfinite(value)
     ]
-    if not known or max(ends) <= 0:
+    if not finite or max(ends) <= 0:
         return [None] * len(values)
-    axis = min(max(ends), LONGEST_AXIS * sorted(known)[len(known) // 2] or max(ends))
+    axis = min(max(ends), LONGEST_AXIS * sorted(finite)[len(finite) // 2] or max(ends))
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)

@@ -32,8 +32,8 @@ def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray |
     described, data = packed(
         {name: values for name, values in columns.items() if values is not None}
     )
-    whole = {**content, "columns": described, "data": data}
-    return json.dumps(whole, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    payload = {**content, "columns": described, "data": data}
+    return json.dumps(payload, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
 
 
 def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:
@@ -46,13 +46,15 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
     described = {}
     parts = []
     for name, values in columns.items():
-        known = np.isfinite(values)
+        finite = np.isfinite(values)
         low, high = (
-            (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+            (float(values[finite].min()), float(values[finite].max()))
+            if finite.any()
+            else (0.0, 0.0)
         )
         scale = (high - low) / LEVELS or 1.0
         codes = np.full(len(values), GAP, np.uint16)
-        codes[known] = np.round((values[known] - low) / scale).astype(np.uint16)
+        codes[finite] = np.round((values[finite] - low) / scale).astype(np.uint16)
         differences = np.diff(codes, prepend=np.uint16(0))  # modulo 2¹⁶
         parts += [(differences & 0xFF).astype(np.uint8), (differences >> 8).astype(np.uint8)]
         described[name] = [low, scale]
@@ -78,16 +80,16 @@ def reckoned_course(
     """
     x = np.full(len(vx), np.nan)
     y = np.full(len(vx), np.nan)
-    known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
-    for first, end in true_runs(known).tolist():
-        own = slice(first, end)
-        heading = _integral(yaw_rate[own], step)
-        x[own] = _integral(vx[own] * np.cos(heading) - vy[own] * np.sin(heading), step)
-        y[own] = _integral(vx[own] * np.sin(heading) + vy[own] * np.cos(heading), step)
+    finite = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
+    for first, end in true_runs(finite).tolist():
+        run = slice(first, end)
+        heading = _integral(yaw_rate[run], step)
+        x[run] = _integral(vx[run] * np.cos(heading) - vy[run] * np.sin(heading), step)
+        y[run] = _integral(vx[run] * np.sin(heading) + vy[run] * np.cos(heading), step)
     return x, y
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:
     steps = 0.5 * step * (values[1:] + values[:-1])
-    whole: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
-    return whole
+    integral: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
+    return integral

@@ -143,8 +143,8 @@ def draw_quantity(
 ) -> None:
     """Draw a quantity of estimates, the first one above the others, with a band, over a wide line of the reference."""
     for estimate in reversed(estimates):
-        shown = decimated(time, getattr(estimate, quantity), MAX_POINTS)
-        axes.plot(*shown, label=estimate.label, **_looks(estimate.line))
+        points = decimated(time, getattr(estimate, quantity), MAX_POINTS)
+        axes.plot(*points, label=estimate.label, **_looks(estimate.line))
     if band is not None:
         centre = getattr(band.estimate, quantity)
         half_width = getattr(band, quantity)
@@ -156,8 +156,8 @@ def draw_quantity(
             label=f"90 % band of {band.estimate.label}",
         )
     if reference is not None:
-        shown = decimated(time, getattr(reference, quantity), MAX_POINTS)
-        axes.plot(*shown, label=reference.label, zorder=1, **BELOW_ESTIMATES)
+        points = decimated(time, getattr(reference, quantity), MAX_POINTS)
+        axes.plot(*points, label=reference.label, zorder=1, **BELOW_ESTIMATES)
 
 
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
@@ -296,7 +296,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         )
         axes.set_xlabel("nominal level [%]")
         axes.set_ylabel("errors of β inside [%]")
-        heights = _apart(
+        heights = _spread_heights(
             [float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0
         )
         for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
@@ -320,7 +320,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
     return figure
 
 
-def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
+def _spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
     """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
     placed = [0.0] * len(heights)
     last = top + step

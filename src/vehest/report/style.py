@@ -101,12 +101,19 @@ def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
     """
     lines: dict[tuple[str, str], Line] = {}
     for name in names:
-        own = line_of(*name)
-        dashes = (own.dash, *(dash for dash in _DASHES if dash != own.dash))
-        markers = (own.marker, *(marker for marker in _MARKERS if marker != own.marker))
-        taken = set(lines.values())
-        options = (replace(own, dash=dash, marker=marker) for marker in markers for dash in dashes)
-        lines[name] = next((line for line in options if line not in taken), own)
+        line_of_family = line_of(*name)
+        dashes = (line_of_family.dash, *(dash for dash in _DASHES if dash != line_of_family.dash))
+        markers = (
+            line_of_family.marker,
+            *(marker for marker in _MARKERS if marker != line_of_family.marker),
+        )
+        used_lines = set(lines.values())
+        options = (
+            replace(line_of_family, dash=dash, marker=marker)
+            for marker in markers
+            for dash in dashes
+        )
+        lines[name] = next((line for line in options if line not in used_lines), line_of_family)
     return lines
 
 

@@ -20,7 +20,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.model_files import load_model, read_description
 from vehest.inference.models import CALIBRATION_STAGE as STAGE
 from vehest.inference.models import calibration_label
-from vehest.run.train import file_digest, recording_file
+from vehest.run.train import digests_of_spans, stored_recording
 from vehest.run.versions import code_of
 from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import read_trust, write_trust
@@ -42,13 +42,13 @@ def plan_calibrate(
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
-    inputs = {"model": model.digest}
-    inputs |= {
-        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
-        for own in spans.values()
-        for span in own
+    inputs = {
+        "model": model.digest,
+        **digests_of_spans(data, (*split.train, *split.validation)),
     }
-    config: dict[str, Any] = {role: [str(span) for span in own] for role, own in spans.items()}
+    config: dict[str, Any] = {
+        role: [str(span) for span in of_role] for role, of_role in spans.items()
+    }
     calibrated_cars = {
         name: asdict(cars[name])
         for name in sorted({span.dataset for span in split.validation})
@@ -71,7 +71,7 @@ def _write(
     """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
 
     def stretch(span: Span) -> Stretch:
-        recording = read_recording(recording_file(data[span.dataset], span)).cut(
+        recording = read_recording(stored_recording(data, span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
         recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))

@@ -121,23 +121,23 @@ def compare_files(
             wheelbase = validated(
                 CarValues, of_command, "", error=ConfigurationError, group="estimator"
             ).wheelbase
-        found = compare_estimates(drive, estimates, wheelbase, trained_here)
+        comparison = compare_estimates(drive, estimates, wheelbase, trained_here)
     for text in notes:
         note(text)
     cells = [
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
-        for row in found["rows"]
+        for row in comparison["rows"]
     ]
-    scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
+    scored = f"scored from {comparison['start']:.6g} to {comparison['stop']:.6g} s at {comparison['rate_hz']:g} Hz"
     of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
-        f", sideslip from {found['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
-        f"{100 * found['share_below_min_speed']:.1f} % of the samples"
+        f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
+        f"{100 * comparison['share_below_min_speed']:.1f} % of the samples"
     )
-    return found | {"findings": findings}, [
+    return comparison | {"findings": findings}, [
         TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
         scored,
-        found["verdict"],
+        comparison["verdict"],
     ]
 
 
@@ -181,13 +181,13 @@ def compare_estimates(
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
-    if taken := {"zero", "static_map"} & set(estimates):
+    if reserved := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(
-            f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file"
+            f"an estimate cannot be called '{min(reserved)}', which is a baseline; rename its file"
         )
-    further = [name for name in ("ay", "yaw_rate") if name in drive]
+    optional = [name for name in ("ay", "yaw_rate") if name in drive]
     reference = resampled(
-        drive.select(["vx", "vy_ref", *further]),
+        drive.select(["vx", "vy_ref", *optional]),
         min(RATE_HZ, drive.rate_hz),
         {"method": "polyphase", "transforms": []},
     )
@@ -207,8 +207,8 @@ def compare_estimates(
     }
     ranking = rank(
         {
-            name: [segments_of([own], reference.rate_hz)]
-            for name, own in scored.items()
+            name: [segments_of([part], reference.rate_hz)]
+            for name, part in scored.items()
             if name[0] not in trained_here
         },
         reference.rate_hz,
@@ -219,7 +219,7 @@ def compare_estimates(
         )
         for name in ranking.order
     }
-    errors = {name: accuracy([own]) for name, own in scored.items()}
+    errors = {name: accuracy([part]) for name, part in scored.items()}
     verdict = (
         verdict_sentences(ranking, titles, "this recording")
         if ranking.order
@@ -240,11 +240,11 @@ def compare_estimates(
             key: errors[name][key]
             for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
         }
-        standing = standing_columns(ranking, name)
+        columns = standing_columns(ranking, name)
         if name in excluded:
-            standing |= dict.fromkeys(("beats_zero", "beats_static_map"), MISSING)
-            standing["against_best"] = "trained on it"
-        rows.append({"estimate": name[0], **figures, **standing})
+            columns |= dict.fromkeys(("beats_zero", "beats_static_map"), MISSING)
+            columns["against_best"] = "trained on it"
+        rows.append({"estimate": name[0], **figures, **columns})
     return {
         "rows": rows,
         "verdict": verdict,
@@ -267,19 +267,19 @@ def _with_exclusions(verdict: str, trained_here: Collection[str], *, has_others:
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
     """Start and end [s] of the part in which every estimate and the reference have values."""
-    known = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
-    times = {"the reference": reference.time[known]}
+    finite = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
+    times = {"the reference": reference.time[finite]}
     times |= {
         f"'{name}'": estimate.time[np.isfinite(estimate["vy"])]
         for name, estimate in estimates.items()
     }
-    if empty := [name for name, own in times.items() if not len(own)]:
+    if empty := [name for name, clock in times.items() if not len(clock)]:
         raise DataError(f"{empty[0]} has no value at all")
-    start = max(float(own[0]) for own in times.values())
-    stop = min(float(own[-1]) for own in times.values())
+    start = max(float(clock[0]) for clock in times.values())
+    stop = min(float(clock[-1]) for clock in times.values())
     if stop - start < LEAST_SECONDS:
         ranges = ", ".join(
-            f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items()
+            f"{name} goes from {clock[0]:.6g} to {clock[-1]:.6g} s" for name, clock in times.items()
         )
         raise DataError(
             f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift SECONDS or auto moves tables of other tools)"
@@ -293,31 +293,31 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
     """v = 0, and the static map where the car turns enough to fit one."""
-    found = {"zero": np.zeros(len(reference))}
+    velocities = {"zero": np.zeros(len(reference))}
     if "yaw_rate" in reference:
         with suppress(DataError):
-            found["static_map"] = _held_out_map(reference, start, stop)
+            velocities["static_map"] = _cross_validated_map(reference, start, stop)
     clock = (reference.rate_hz, reference.start_time)
     return {
         name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)})
-        for name, vy in found.items()
+        for name, vy in velocities.items()
     }
 
 
-def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
+def _cross_validated_map(reference: Recording, start: float, stop: float) -> FloatArray:
     """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
     middle = 0.5 * (start + stop)
     vy = np.zeros(len(reference))
-    for fitted, held_out in (
+    for fitted, is_tested in (
         ((start, middle), reference.time >= middle),
         ((middle, stop), reference.time < middle),
     ):
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
-        kept = {name: values[clean] for name, values in part.channels.items()}
+        channels = {name: values[clean] for name, values in part.channels.items()}
         model = StaticMap(StaticMap.settings_type(reference.rate_hz))
         model.values = model.closed_form(
-            [Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)]
+            [Recording(part.id, part.vehicle, part.rate_hz, 0.0, channels)]
         )
-        vy[held_out] = model.run(reference.stack(model.channels)[held_out], None)[0]["vy"]
+        vy[is_tested] = model.run(reference.stack(model.channels)[is_tested], None)[0]["vy"]
     return vy

@@ -26,7 +26,7 @@ from vehest.run.group import Group, Member
 from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
-from vehest.run.study import Job
+from vehest.run.study import Job, failure_messages
 from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
 from vehest.run.training_differences import Differences, difference_text, differences_of
 from vehest.run.usable import lack
@@ -80,11 +80,11 @@ class Comparison:
     def unfinished(self) -> list[str]:
         """Trainings for which no time was left, by name."""
         trainings = [job.training for job in self.usable if job.training is not None]
-        remaining = [own for own in trainings if own.plan.key not in self.found]
+        remaining = [training for training in trainings if training.plan.key not in self.found]
         return list(
             dict.fromkeys(
-                label_of(own) + difference_text(self.differences.get(own.plan.key, {}))
-                for own in remaining
+                label_of(training) + difference_text(self.differences.get(training.plan.key, {}))
+                for training in remaining
             )
         )
 
@@ -138,16 +138,13 @@ class Comparison:
                 runner.messages.line("plan", "train", name)
             raise
         if not self.usable:
-            reasons = "; ".join(
-                dict.fromkeys(job.failure.message for job in usable if job.failure is not None)
-            )
             location = location_of_config(usable[0].config)
-            known = ", ".join(
+            commands = ", ".join(
                 f"'{command_line('data usable', [name, *location])}'" for name in split.datasets
             )
             raise DataError(
-                f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
-                f"{known} shows what each estimator needs"
+                f"none of these estimators can be used with the recordings of split '{split.name}'; {failure_messages(usable)}; "
+                f"{commands} shows what each estimator needs"
             )
         self._print_failures(checked, runner)
         self.groups = self._groups(split, runner.force, evaluated=evaluated)
@@ -156,7 +153,7 @@ class Comparison:
             self.facts = [
                 *training_facts(configs),
                 resampling_fact(configs),
-                *(f"{what} {text}" for what, text in notes),
+                *(f"{subject} {text}" for subject, text in notes),
             ]
             datasets = {
                 name: runner.dataset_config(name, usable[0].config)["dataset"]
@@ -181,14 +178,16 @@ class Comparison:
             groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
         return [
             Group(
-                own,
+                trainings,
                 split,
-                replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None,
+                replace(self.evaluation, data=trainings[0].data, faults=faults)
+                if evaluated
+                else None,
                 force,
                 label,
                 self.cars,
             )
-            for (_, faults, label), own in groups.items()
+            for (_, faults, label), trainings in groups.items()
         ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
@@ -278,9 +277,9 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
 
 def print_notes(notes: Iterable[Note], runner: Runner) -> None:
     """Print rates that were lowered, each once."""
-    for what, text in notes:
-        key = "evaluation.rate_hz" if what == "evaluation" else "estimator.rate_hz"
-        line = ("note", "rate", what, f"{text}; {key}=… chooses a lower rate")
+    for subject, text in notes:
+        key = "evaluation.rate_hz" if subject == "evaluation" else "estimator.rate_hz"
+        line = ("note", "rate", subject, f"{text}; {key}=… chooses a lower rate")
         if line not in runner.messages.printed:
             runner.messages.line(*line)
 
@@ -323,11 +322,13 @@ def label_of(training: TrainJob) -> str:
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
     """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
-    alike: dict[Failure, list[Job]] = {}
+    jobs_of_failure: dict[Failure, list[Job]] = {}
     for job in jobs:
         if job.failure is not None:
-            alike.setdefault(job.failure, []).append(job)
-    return [(name, failure) for failure, own in alike.items() for name in _names(own)]
+            jobs_of_failure.setdefault(job.failure, []).append(job)
+    return [
+        (name, failure) for failure, failed in jobs_of_failure.items() for name in _names(failed)
+    ]
 
 
 def _names(jobs: Iterable[Job]) -> list[str]:
@@ -340,7 +341,8 @@ def _names(jobs: Iterable[Job]) -> list[str]:
             stem = f"{estimator.name}-{estimator.variant}"
         seeds.setdefault(stem, []).append(str(job.config["seed"]))
     return [
-        f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()
+        f"{stem} seed{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
+        for stem, numbers in seeds.items()
     ]
 
 
@@ -351,14 +353,14 @@ def resampling_fact(configs: Sequence[Config]) -> str:
         | {protocol_from_config(configs[0]["evaluation"]).rate_hz}
     )
     options = configs[0]["downsample"]
-    how = {
+    method = {
         "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
         "decimate": "by plain decimation",
     }[options["method"]]
     first = (
         f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
     )
-    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
+    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {method}{first}"
 
 
 def training_facts(configs: Sequence[Config]) -> list[str]:

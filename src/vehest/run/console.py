@@ -76,8 +76,8 @@ class Messages:
         if status == WARNING:
             text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
         else:
-            shown = (f" {printable(detail)}" if detail else "", "dim")
-            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown)
+            suffix = (f" {printable(detail)}" if detail else "", "dim")
+            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)
         self._print(text, always=status == WARNING)
 
     def print_reused(self) -> None:

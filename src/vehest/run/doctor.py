@@ -50,17 +50,17 @@ def examine() -> Iterator[Item]:
         f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}",
     )
     yield _kernels()
-    absent = [
+    missing = [
         f"{use} need 'vehest[{extra}]'"
         for extra, (package, use) in EXTRAS.items()
         if importlib.util.find_spec(package) is None
     ]
     extras = (
-        f"{'; '.join(absent)}: pip install it where you need it"
-        if absent
+        f"{'; '.join(missing)}: pip install it where you need it"
+        if missing
         else f"{', '.join(EXTRAS)} are there"
     )
-    yield Item("warning" if absent else "ok", "extras", extras)
+    yield Item("warning" if missing else "ok", "extras", extras)
     root = os.environ.get("VEHEST_DATA")
     if not root:
         yield Item(

@@ -86,7 +86,7 @@ def estimate_file(
         parts = (
             (part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file)
         )
-        first, known = next(parts)
+        first, first_findings = next(parts)
         remarks: list[str] = []
         if name == SELF_CALIBRATING and "ax" not in first and "measured_ax" not in settings:
             settings["measured_ax"] = False
@@ -111,17 +111,17 @@ def estimate_file(
             )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
-        drive = report.checked(chain([(first, known)], parts))
+        drive = report.checked(chain([(first, first_findings)], parts))
         if writes_log or not run.takes_parts:
             first = joined(list(drive))
             drive = iter([first])
-        needed = resampled_parts(
+        resampled_drive = resampled_parts(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
             slowest_hz=SLOWEST_LOG_HZ,
         )
-        estimates = report.counted(estimate_parts(run, needed))
+        estimates = report.counted(estimate_parts(run, resampled_drive))
         if writes_log:
             (estimate,) = estimates
             write_log(estimate, first, file, out)
@@ -187,22 +187,23 @@ def findings_of(
     recording: Recording,
     model: Estimator,
     accepted: Sequence[str],
-    known: Sequence[Finding] | None = None,
+    of_all_channels: Sequence[Finding] | None = None,
 ) -> list[Finding]:
     """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
     read = [name for name in model.channels if name in recording]
-    if known is not None and (
-        set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)
+    if of_all_channels is not None and (
+        set(read) == set(recording.channels)
+        or all(finding.level == "note" for finding in of_all_channels)
     ):
-        findings = list(known)
+        findings = list(of_all_channels)
     else:
         findings = checks_of_recording(recording.select(read)) if read else []
     findings = [finding for finding in findings if finding.level != "note"]
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            what = f"channels contradict each other: {finding.message}"
+            problem = f"channels contradict each other: {finding.message}"
             raise DataError(
-                f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])"
+                f"recording '{recording.id}': {problem} (or dataset.accept=[{finding.check}])"
             )
     return findings + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
@@ -217,7 +218,7 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    problem = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
     remedy = "give estimator.wheelbase"
     if wheelbase * turn > SHARPEST_TURN:
         return [
@@ -225,13 +226,15 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
                 "warning",
                 "wheelbase",
                 "",
-                f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}",
+                f"{problem} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}",
             )
         ]
     fast = float(np.quantile(speed, 0.99))
     if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
         return [
-            Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")
+            Finding(
+                "warning", "wheelbase", "", f"{problem} does not reach {fast:.0f} m/s; {remedy}"
+            )
         ]
     return []
 
@@ -262,11 +265,11 @@ class _Report:
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
         """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
-        for part, known in parts:
-            found = findings_of(part, self.model, self.accepted, known)
-            if self.strict and found:
-                raise DataError(f"{self.strict}: {finding_in_words(found[0])}")
-            self.findings.append(found)
+        for part, of_all_channels in parts:
+            findings = findings_of(part, self.model, self.accepted, of_all_channels)
+            if self.strict and findings:
+                raise DataError(f"{self.strict}: {finding_in_words(findings[0])}")
+            self.findings.append(findings)
             self.seconds += part.duration
             if self.health is not None:
                 self.outside = self.outside + outside_domain(
@@ -278,12 +281,12 @@ class _Report:
         """The parts of the estimate, once they count; raises `DataError` where all are empty."""
         for part in parts:
             self.last = part
-            known = ~np.isnan(part["vy"])
+            is_estimated = ~np.isnan(part["vy"])
             degrees = np.degrees(part["sideslip"])
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
             self.samples, self.estimated = (
                 self.samples + len(part),
-                self.estimated + int(known.sum()),
+                self.estimated + int(is_estimated.sum()),
             )
             if "band_sideslip" in part.channels:
                 self.half.frombytes(
@@ -291,11 +294,11 @@ class _Report:
                     .astype(np.float32)
                     .tobytes()
                 )
-            status = part["health"][known]
-            reasons = part["health_reason"][known]
+            status = part["health"][is_estimated]
+            reasons = part["health_reason"][is_estimated]
             self.invalid += int((status > 0).sum())
-            found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
-            self.reasons.update(dict(zip(found.tolist(), counts.tolist(), strict=True)))
+            codes, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
+            self.reasons.update(dict(zip(codes.tolist(), counts.tolist(), strict=True)))
             yield part
         if not self.estimated:
             raise too_short_error(self.model, self.last.recording_id, self.seconds)

@@ -46,13 +46,13 @@ def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) ->
     if out.suffix.lower() == ".mat":
         from scipy.io import savemat
 
-        own = {
+        quantities = {
             f"{PREFIX}{name}": estimate.held_at(recording.time, name) for name in estimate.channels
         }
         with written_aside(out) as aside, open(aside, "wb") as stream:
             savemat(
                 stream,
-                {"time": recording.time, **recording.channels, **own},
+                {"time": recording.time, **recording.channels, **quantities},
                 oned_as="column",
                 do_compression=True,
             )

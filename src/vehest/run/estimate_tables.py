@@ -119,9 +119,9 @@ def read_estimate_table(
             f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
             "description: another program has written it anew; it is read like another tool's table"
         )
-    found = _columns_of(file, names, columns)
-    time = found.pop("time", None)
-    channel = next((name for name in ("vy_ref", "sideslip_ref") if name in found), None)
+    declared = _columns_of(file, names, columns)
+    time = declared.pop("time", None)
+    channel = next((name for name in ("vy_ref", "sideslip_ref") if name in declared), None)
     if time is None or channel is None:
         raise DataError(_missing_columns(file, names, time is None))
     options = {
@@ -131,13 +131,13 @@ def read_estimate_table(
         "clock": "interpolate",
         "gappy": [channel],
         "time": {key: time[key] for key in ("column", "unit")},
-        "channels": {channel: found[channel]},
+        "channels": {channel: declared[channel]},
     }
     plain = asdict(TextLayout())
     options |= {name: value for name, value in asdict(layout).items() if value != plain[name]}
     table = read_single(options, file)
     table = replace(table, start_time=table.start_time + _seconds(file, table, drive, shift))
-    _warn_of_estimate(file, str(found[channel]["column"]), table, drive)
+    _warn_of_estimate(file, str(declared[channel]["column"]), table, drive)
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, drive.time, drive["vx"])
@@ -164,19 +164,19 @@ def _columns_of(
     file: Path, names: Sequence[str], columns: Sequence[NamedColumn]
 ) -> dict[str, dict[str, str | int]]:
     """Time and channels of a table with column, unit and sign, as a data set declares them."""
-    found: dict[str, dict[str, str | int]] = {}
+    declared: dict[str, dict[str, str | int]] = {}
     for named in columns:
         place = named.find(names)
         if place is not None:
             name, stated, sign = place
             unit = unit_of(named.channel, name, file, stated)
-            found[named.channel] = {"column": name, "unit": unit, "sign": sign}
-    is_chosen = not {"vy_ref", "sideslip_ref"}.isdisjoint(found)
+            declared[named.channel] = {"column": name, "unit": unit, "sign": sign}
+    is_chosen = not {"vy_ref", "sideslip_ref"}.isdisjoint(declared)
     for quantity, accepted in SPELLINGS.items():
         for name in names if quantity == "time" or not is_chosen else ():
-            if quantity not in found and _plain_names(name) & set(accepted):
-                found[quantity] = {"column": name, "unit": unit_of(quantity, name, file)}
-    return found
+            if quantity not in declared and _plain_names(name) & set(accepted):
+                declared[quantity] = {"column": name, "unit": unit_of(quantity, name, file)}
+    return declared
 
 
 def _plain_names(name: str) -> set[str]:
@@ -209,9 +209,9 @@ def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
         return DEFAULT_UNITS[quantity]
     unit = TIME_UNITS.get(text) if quantity == "time" else plain_unit(text)
     if unit is None:
-        known = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
+        accepted = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
         raise DataError(
-            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known are {known}); "
+            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known are {accepted}); "
             "convert it, or rename the column"
         )
     try:

@@ -109,9 +109,9 @@ def in_words(record: CarRecord) -> TerminalTable:
     """A record for a terminal."""
     numbers = {name: getattr(record, name) for name in LIMITS}
     numbers |= {
-        f"offset of {channel}, {drive}": one
-        for drive, own in record.offsets.items()
-        for channel, one in own.items()
+        f"offset of {channel}, {drive}": number
+        for drive, numbers_of_drive in record.offsets.items()
+        for channel, number in numbers_of_drive.items()
     }
     car = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
     prior = prior_of(with_settings(SelfCalibrating.from_config({}), car))
@@ -120,14 +120,14 @@ def in_words(record: CarRecord) -> TerminalTable:
     rows = [
         (
             name,
-            f"{one.value:.4g}",
-            f"{one.deviation:.2g}",
+            f"{number.value:.4g}",
+            f"{number.deviation:.2g}",
             UNITS.get(name, "m/s²"),
-            _excitation(one.deviation, at_start[name]) if name in at_start else "",
-            ", ".join(one.identified_on) or "not identified",
+            _excitation(number.deviation, at_start[name]) if name in at_start else "",
+            ", ".join(number.identified_on) or "not identified",
             MEANINGS.get(name, "mean error of the accelerometer"),
         )
-        for name, one in numbers.items()
+        for name, number in numbers.items()
     ]
     heads = ("quantity", "value", "deviation", "unit", "seen", "identified on", "meaning")
     return TerminalTable("", heads, rows)
@@ -150,15 +150,16 @@ def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Norm
         )
     turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
     on_time, early, late = (
-        _found(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
+        _final_state(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
         for shift in (0.0, turning, -turning)
     )
     return {
-        name: Normal(*own, (late[name][0] - early[name][0]) / 2.0) for name, own in on_time.items()
+        name: Normal(*normal, (late[name][0] - early[name][0]) / 2.0)
+        for name, normal in on_time.items()
     }
 
 
-def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
+def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
     """Means and deviations after samples of the model's channels, (T, C)."""
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
@@ -198,17 +199,19 @@ def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float
 def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
     """The record of a car from `posterior_of` its drives; raises `DataError` where a number is not of a car."""
     prior = prior_of(model)
-    found = {
-        name: together(prior[name], {drive: own[name] for drive, own in drives.items()})
+    combined = {
+        name: together(prior[name], {drive: numbers[name] for drive, numbers in drives.items()})
         for name in LIMITS
     }
-    grip = math.exp(found["grip"].value)
-    found["grip"] = Number(grip, grip * found["grip"].deviation, found["grip"].identified_on)
+    grip = math.exp(combined["grip"].value)
+    combined["grip"] = Number(
+        grip, grip * combined["grip"].deviation, combined["grip"].identified_on
+    )
     offsets = {
-        drive: {name: together(prior[name], {drive: own[name]}) for name in OFFSETS}
-        for drive, own in drives.items()
+        drive: {name: together(prior[name], {drive: numbers[name]}) for name in OFFSETS}
+        for drive, numbers in drives.items()
     }
-    return CarRecord(model.wheelbase, model.cg_to_rear_axle, **found, offsets=offsets)
+    return CarRecord(model.wheelbase, model.cg_to_rear_axle, **combined, offsets=offsets)
 
 
 def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
@@ -217,7 +220,7 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT` none of them identifies the number.
     """
     mean, deviation, of_lateness = (
-        np.array([own for own in drives.values() if own.deviation < prior.deviation])
+        np.array([normal for normal in drives.values() if normal.deviation < prior.deviation])
         .reshape(-1, 3)
         .T
     )
@@ -228,14 +231,14 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     shares = deviation**-2.0 / total
     value = prior.mean + float(shares @ (mean - prior.mean))
     squares = float(np.sum(np.square((alone - value) / of_alone)))
-    others = max(len(alone) - 1, 1)
-    scatter = squares / others if len(alone) > 1 else 1.0
-    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT, others))
-    least = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
+    n_degrees = max(len(alone) - 1, 1)
+    scatter = squares / n_degrees if len(alone) > 1 else 1.0
+    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT, n_degrees))
+    max_deviation = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
     identified = tuple(
         drive
-        for drive, own in drives.items()
-        if agree and math.hypot(own.deviation, own.of_lateness) < least
+        for drive, normal in drives.items()
+        if agree and math.hypot(normal.deviation, normal.of_lateness) < max_deviation
     )
     return Number(
         value,

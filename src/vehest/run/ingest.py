@@ -126,13 +126,13 @@ def write_ingest(
 
 def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataError:
     """The first failure with its recording, the names of other recordings that failed, and its exit code."""
-    (recording_id, first), *others = failures
+    (recording_id, first), *further_failures = failures
     place = f"data set '{dataset}', recording '{recording_id}'"
     message = first.message if first.message.startswith(place) else f"{place}: {first.message}"
-    if others:
-        names = [f"'{name}'" for name, _ in others[:MAX_NAMES]]
-        more = ", …" if len(others) > MAX_NAMES else ""
-        message += f" (and {len(others)} more: {', '.join(names)}{more})"
+    if further_failures:
+        names = [f"'{name}'" for name, _ in further_failures[:MAX_NAMES]]
+        more = ", …" if len(further_failures) > MAX_NAMES else ""
+        message += f" (and {len(further_failures)} more: {', '.join(names)}{more})"
     error = DataError(message)
     error.exit_code = first.exit_code
     return error
@@ -193,9 +193,9 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
     return {
         "drives": len(drives),
         "hours": sum(len(drive) / drive.rate_hz for drive in drives) / 3600.0,
-        "spun": [name for name, own in flags.items() if own["spun"]],
-        "left_road": [name for name, own in flags.items() if own["left_road"]],
-        "not_completed": [name for name, own in flags.items() if not own["completed"]],
+        "spun": [name for name, flag in flags.items() if flag["spun"]],
+        "left_road": [name for name, flag in flags.items() if flag["left_road"]],
+        "not_completed": [name for name, flag in flags.items() if not flag["completed"]],
     }
 
 
@@ -215,10 +215,10 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
-        others = ", ".join(_datasets_with_download()) or "none"
+        downloadable = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"put them into its folder by hand, or declare download in its file; data sets that do: {others}"
+            f"put them into its folder by hand, or declare download in its file; data sets that do: {downloadable}"
         )
     download = download_of(source)
     if dry_run:

@@ -67,40 +67,40 @@ def open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
+def emit(as_json: bool, outcome: Any, lines: Iterable[str | TerminalTable] | None = None) -> None:
     """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key; raises `MissingError`."""
     if as_json:
         echo(as_json_text(outcome), keep="\n")
         return
-    if shown is None:
-        shown = (
+    if lines is None:
+        lines = (
             f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}"
             for key, value in outcome.items()
         )
-    for one in shown:
-        if isinstance(one, str):
-            echo(one)
+    for line in lines:
+        if isinstance(line, str):
+            echo(line)
         else:
-            _print_table(one)
+            _print_table(line)
 
 
-def _print_table(shown: TerminalTable) -> None:
+def _print_table(content: TerminalTable) -> None:
     """Print a table, 160 characters wide without a terminal; a title after an empty line."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
 
-    if shown.title:
+    if content.title:
         echo("")
-        echo(shown.title)
+        echo(content.title)
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
     table = Table(
-        *(Column(Text(printable(name))) for name in shown.header),
+        *(Column(Text(printable(name))) for name in content.header),
         box=None,
         header_style="bold",
         pad_edge=False,
     )
-    for row in shown.rows:
+    for row in content.rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     with console.capture() as captured:
         console.print(table)
@@ -177,7 +177,7 @@ def summary_of_leaderboard(
     tables = []
     notes = []
     for test_set, rows in board.groupby("test_set", sort=False):
-        given = (
+        remark = (
             " (estimates start at the reference state)"
             if (rows["start"] == "reference").any()
             else ""
@@ -192,7 +192,7 @@ def summary_of_leaderboard(
             )
             for row in rows.to_dict("records")
         ]
-        tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
+        tables.append(TerminalTable(f"{title}: test set '{test_set}'{remark}", header, cells))
         share = float(rows["share_below_min_speed"].iloc[0])
         if share > 0:
             notes.append(
@@ -214,10 +214,10 @@ def _summary(
     left_out: Mapping[str, str],
 ) -> TerminalSummary:
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
-    shown = "\n".join([*notes, *missing, *figures.get("verdict", [])])
+    note = "\n".join([*notes, *missing, *figures.get("verdict", [])])
     return TerminalSummary(
         tuple(tables),
-        shown,
+        note,
         "report.html",
         json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})),
     )

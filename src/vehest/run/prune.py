@@ -42,9 +42,9 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
         ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written to.
     """
     artefacts = _artefacts(output)
-    whole = [artefact for artefact in artefacts.values() if artefact is not None]
+    readable = [artefact for artefact in artefacts.values() if artefact is not None]
     present = {
-        digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())
+        digest for artefact in readable for digest in (artefact.digest, *artefact.outputs.values())
     }
     reasons = {
         folder: reason
@@ -54,7 +54,7 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     for folder in _entries(output / CHECKPOINTS):  # without a model its training may go on
         model = output / TRAIN / folder.name
         if model in reasons or any(
-            own.folder == model and own.status == "complete" for own in whole
+            artefact.folder == model and artefact.status == "complete" for artefact in readable
         ):
             reasons[folder] = SUPERFLUOUS
     for path in (
@@ -85,15 +85,15 @@ def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> 
 
 def _artefacts(output: Path) -> dict[Path, Artefact | None]:
     """Artefacts whose manifest gives their own name; none where one is damaged otherwise."""
-    found: dict[Path, Artefact | None] = {}
+    artefacts: dict[Path, Artefact | None] = {}
     for folder in (folder for stage in VERSIONS for folder in _entries(output / stage)):
         with suppress(VehestError, KeyError, TypeError):
             manifest = read_json(folder / MANIFEST)
             named = (manifest["stage"], f"{manifest['label']}-{manifest['key'][:12]}")
             if named == (folder.parent.name, folder.name) and not (folder / MANIFEST).is_symlink():
-                found[folder] = None
-                found[folder] = read_artefact(folder, hash_files=False)
-    return found
+                artefacts[folder] = None
+                artefacts[folder] = read_artefact(folder, hash_files=False)
+    return artefacts
 
 
 def _reason(artefact: Artefact | None, present: set[str]) -> str:
@@ -125,9 +125,9 @@ def _entries(place: Path) -> list[Path]:
 
 
 def _size_and_age(path: Path) -> dict[str, int]:
-    about = [one.lstat() for one in (path, *path.rglob("*"))]
-    size = sum(one.st_size for one in about if not stat.S_ISDIR(one.st_mode))
+    about = [entry.lstat() for entry in (path, *path.rglob("*"))]
+    size = sum(entry.st_size for entry in about if not stat.S_ISDIR(entry.st_mode))
     return {
         "bytes": size,
-        "seconds": round(max(0.0, time.time() - max(one.st_mtime for one in about))),
+        "seconds": round(max(0.0, time.time() - max(entry.st_mtime for entry in about))),
     }

@@ -17,7 +17,7 @@ from typing import Any
 from vehest.artefacts.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
 from vehest.configuration.composition import Config
 from vehest.configuration.files import find_pipeline, pipeline_names
-from vehest.data.errors import ConfigurationError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, MissingError, VehestError, abbreviated
 from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
 from vehest.data.text_files import read_yaml
@@ -37,7 +37,7 @@ from vehest.run.versions import code_of, is_of_other_stages
 CODE = "code"
 DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
-MOST_NAMED = 6
+MAX_NAMED = 6
 STALE_LIST = "stale.yaml"
 """File in results/: studies that may still be stale, each with the reason and what will end it."""
 
@@ -71,12 +71,12 @@ def keys_of_study(
 def _ingests(
     study: Study, jobs: Jobs, absent: Collection[str], runner: Runner
 ) -> dict[str, Config]:
-    there = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
+    configs = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
-        return there
+        return configs
     return {
         name: runner.dataset_config(name, config)
-        for config in there.values()
+        for config in configs.values()
         for name in dataset_names(config["split"])
     }
 
@@ -133,8 +133,7 @@ def in_words(verdict: Mapping[str, Any]) -> str:
     for cause in CAUSES:
         named = [change["what"] for change in verdict["changes"] if change["cause"] == cause]
         if named:
-            more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
-            words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
+            words.append(f"{cause} ({abbreviated(named, MAX_NAMED)})")
     may_be = verdict.get("may_be_stale")
     listed = f"may be until {may_be}" if may_be else ""
     failure = verdict["failure"] if may_be else ""
@@ -188,8 +187,8 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
                 _outcome(study, "not known", note="published before keys were recorded")
             )
         elif changes := [
-            (what, CODE)
-            for what, entry in published.keys.items()
+            (name, CODE)
+            for name, entry in published.keys.items()
             if is_of_other_stages(entry.get(CODE, ""))
         ]:
             verdicts.append(_outcome(study, "stale", changes))
@@ -282,7 +281,7 @@ def _outcome(
     return {
         "study": study,
         "state": state,
-        "changes": [{"what": what, "cause": cause} for what, cause in changes],
+        "changes": [{"what": name, "cause": cause} for name, cause in changes],
         "note": note,
         "n_not_trained": n_not_trained,
     }

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import math
 import subprocess
 from collections.abc import Mapping
@@ -18,10 +17,10 @@ from pathlib import Path
 from vehest.artefacts.artefact import TIMINGS, Artefact
 from vehest.artefacts.keys import Keys, changed_keys
 from vehest.artefacts.locks import Lock, held
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, abbreviated
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
-from vehest.data.text_files import read_json
+from vehest.data.text_files import read_json, write_json
 from vehest.run.console import Messages
 
 RESULTS = Path("results")
@@ -130,8 +129,10 @@ def uncommitted_changes() -> str:
     files = [line[3:] for line in result.stdout.splitlines()]
     if not files:
         return ""
-    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
-    return f"the work tree has changes that are not committed ({', '.join(files[:3])}{more}); commit them and run it again"
+    return (
+        f"the work tree has changes that are not committed ({abbreviated(files, 3)}); "
+        "commit them and run it again"
+    )
 
 
 def check_results_folder(folder: Path) -> None:
@@ -169,10 +170,10 @@ def _is_published(report: Artefact, folder: Path, publication: Publication) -> b
         for file in folder.rglob("*")
         if file.is_file()
     }
-    needed = {
+    expected = {
         name: hashlib.sha256(content).hexdigest() for name, content in _contents(report).items()
     }
-    return {**present, PROVENANCE: ""} == {**needed, PROVENANCE: ""}
+    return {**present, PROVENANCE: ""} == {**expected, PROVENANCE: ""}
 
 
 def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
@@ -184,11 +185,7 @@ def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
         about = {**read_json(report.folder / PROVENANCE), "keys": publication.keys}
         if publication.n_not_trained:
             about["n_not_trained"] = publication.n_not_trained
-        (aside / PROVENANCE).write_text(
-            json.dumps(about, indent=1, ensure_ascii=False) + "\n",
-            encoding="utf-8",
-            errors="backslashreplace",
-        )
+        write_json(aside / PROVENANCE, about)
 
 
 def published_content(file: Path) -> bytes:
@@ -209,5 +206,7 @@ def _rounded(cell: str) -> str:
         value = float(cell)
     except ValueError:
         return cell
-    kept = "." not in cell or len(cell) <= DIGITS or not math.isfinite(value) or value.is_integer()
-    return cell if kept else repr(float(f"{value:.{DIGITS}g}"))
+    is_short = (
+        "." not in cell or len(cell) <= DIGITS or not math.isfinite(value) or value.is_integer()
+    )
+    return cell if is_short else repr(float(f"{value:.{DIGITS}g}"))

@@ -73,9 +73,9 @@ def replay_log(
     elsewhere = is_other_vehicle(trust, vehicle, options.same_vehicle, car)
     band = describe_band(trust, vehicle, options.same_vehicle, car)
     with use_limits(options.limits):
-        wanted = _signals(options.dataset if dataset else None, dbc, signals, fitted)
+        bus_signals = _signals(options.dataset if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
-        timing = survey(frames, wanted, bus_rate)
+        timing = survey(frames, bus_signals, bus_rate)
         faster = (
             timing.rate_hz
             if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE
@@ -84,7 +84,7 @@ def replay_log(
         if write_dbc is not None:
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
-        figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
+        figures = Replay(frames, bus_signals, timing, bus, estimates, stopped).run(
             lambda clock: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere, clock=clock),
             out,
             view,

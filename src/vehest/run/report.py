@@ -6,7 +6,6 @@ comparison of a sweep -> table of jobs -> SweepArtefacts -> `vehest.studies.swee
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -21,11 +20,12 @@ from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, provenance
 from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import VALIDATION
+from vehest.data.text_files import write_json
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
-from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
+from vehest.run.evaluate import METRICS, read_metrics, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
@@ -40,7 +40,7 @@ from vehest.run.publishing import PROVENANCE, PUBLISHED_WEIGHTS
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
-from vehest.run.train import read_fit_metrics, recording_file
+from vehest.run.train import read_fit_metrics, stored_recording
 from vehest.run.training_differences import difference_suffix, difference_text
 from vehest.run.versions import code_of
 from vehest.run.weights import (
@@ -56,8 +56,10 @@ from vehest.studies.artefacts import (
     StoredDataset,
     StudyArtefacts,
     Trial,
+    nominal_rows,
     of_parts,
     read_frame,
+    write_frame,
 )
 from vehest.studies.kit.timings import timings_of_study
 from vehest.studies.reference_minutes import start_in_words
@@ -85,25 +87,25 @@ def draw_report(
     """
     is_complete = not any(part.unfinished for part in comparisons.values())
     comparisons = {name: part for name, part in comparisons.items() if name not in study.trials}
-    shown = {name: part for name, part in comparisons.items() if part.members}
+    drawn = {name: part for name, part in comparisons.items() if part.members}
     left_out = {
-        name_in_part(part_name, name, shown): reason
-        for part_name, part in shown.items()
+        name_in_part(part_name, name, drawn): reason
+        for part_name, part in drawn.items()
         for name, reason in part.failed.items()
         if reason != NOT_TRAINED  # the run prints how many these are
     }
-    shown_parts = [name for name in study.parts if name not in study.trials]
+    drawn_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(
         study=study.study,
         title=study.title,
         about=study.about,
         command=study.command,
-        titles={name: study.parts[name].title for name in shown_parts},
+        titles={name: study.parts[name].title for name in drawn_parts},
         parts={
             name: _part_artefacts(study, study.parts[name].title, part)
-            for name, part in shown.items()
+            for name, part in drawn.items()
         },
-        absent=[name for name in shown_parts if name not in comparisons],
+        absent=[name for name in drawn_parts if name not in comparisons],
         not_trained={
             name: part.unfinished for name, part in comparisons.items() if part.unfinished
         },
@@ -142,21 +144,21 @@ def draw_report(
         if study.datasets and artefact.stage == INGEST
     ]
     inputs = {artefact.label: artefact.digest for artefact in ingested}
-    for name, part in shown.items():
-        made = [own for member in part.members for own in member.made]
+    for name, part in drawn.items():
+        artefacts_of_part = [artefact for member in part.members for artefact in member.made]
         inputs |= {
             f"{name}: {artefact.label}" if name else artefact.label: artefact.digest
-            for artefact in made
+            for artefact in artefacts_of_part
         }
     models = [
         member.model
-        for part in shown.values()
+        for part in drawn.values()
         for member in part.members
         if member.model is not None
     ]
 
     def write(folder: Path) -> None:
-        _write(artefacts, study.report, _recordings(shown, ingested), folder)
+        _write(artefacts, study.report, _recordings(drawn, ingested), folder)
         if trials:
             write_trials(trials, folder / SEARCHES)
         if study.publish and models:
@@ -204,13 +206,11 @@ def _write(
         )
     if artefacts.parts:
         table = artefacts.metrics
-        kept = getattr(module, "METRICS", None)
-        if kept is not None:
-            table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
+        metric_names = getattr(module, "METRICS", None)
+        if metric_names is not None:
+            table = table[table["metric"].isin(metric_names) & (table["subset"] == "all")]
         for file, written in ((METRICS, table), (TIMINGS, of_parts(timings))):
-            written.to_csv(
-                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
-            )
+            write_frame(written, folder / file)
     kinds = {name: kind for part in artefacts.parts.values() for name, kind in part.kinds.items()}
     about = provenance()
     about |= {
@@ -221,26 +221,22 @@ def _write(
         "kinds": kinds | {dataset.name: dataset.kind for dataset in artefacts.datasets},
         "recordings": recordings,
     }
-    (folder / PROVENANCE).write_text(
-        json.dumps(about, indent=1, ensure_ascii=False) + "\n",
-        encoding="utf-8",
-        errors="backslashreplace",
-    )
+    write_json(folder / PROVENANCE, about)
 
 
 def _recordings(
     comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]
 ) -> dict[str, str]:
     """Data set and recording -> digest, of every recording that is scored, at the evaluation rate, or shown."""
-    found = {}
+    digests = {}
     for part in comparisons.values():
         for span in scored_spans(part.evaluation.split):
             outputs = part.evaluation.references[span.dataset].outputs
-            found[f"{span.dataset}/{span.recording}"] = outputs[f"{span.recording}.parquet"]
-    return found | {
-        f"{own.label}/{Path(name).stem}": digest
-        for own in ingested
-        for name, digest in own.outputs.items()
+            digests[f"{span.dataset}/{span.recording}"] = outputs[f"{span.recording}.parquet"]
+    return digests | {
+        f"{artefact.label}/{Path(name).stem}": digest
+        for artefact in ingested
+        for name, digest in artefact.outputs.items()
     }
 
 
@@ -253,7 +249,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         estimator = new_estimator(member.job.estimator)
         differences = part.differences.get(member.job.plan.key, {})
         variant = estimator.variant + difference_suffix(differences)
-        tables.append(_table_of(member.evaluation.folder, METRICS).assign(variant=variant))
+        tables.append(read_metrics(member.evaluation.folder).assign(variant=variant))
         models.append(
             EvaluatedModel(
                 estimator=estimator.name,
@@ -284,7 +280,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         metrics=_together(tables, study.study),
         models=models,
         references={
-            (s.dataset, s.recording): recording_file(e.references[s.dataset], s)
+            (s.dataset, s.recording): stored_recording(e.references, s)
             for s in (*e.split.train, *scored_spans(e.split))
         },
         facts=part.facts,
@@ -309,22 +305,18 @@ def _timings_of(part: PartArtefacts) -> pd.DataFrame:
     """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s]; in no published file."""
     tables = []
     for model in part.models:
-        own = _table_of(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
+        times = read_metrics(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
         fit = {
             name: value
             for name, value in read_fit_metrics(model.model_folder).items()
             if name.endswith("_seconds")
         }
-        phases = {name: value for name, value in fit.items() if name not in set(own["metric"])}
+        phases = {name: value for name, value in fit.items() if name not in set(times["metric"])}
         tables += [
-            own,
-            *(own.head(1).assign(metric=name, value=value) for name, value in phases.items()),
+            times,
+            *(times.head(1).assign(metric=name, value=value) for name, value in phases.items()),
         ]
     return _together(tables, part.study)
-
-
-def _table_of(evaluation: Path, file: str) -> pd.DataFrame:
-    return read_frame(evaluation / file, COLUMNS, numbers=("value",))
 
 
 def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
@@ -347,11 +339,11 @@ def draw_sweep(
     part = _part_artefacts(study, "", comparison)
     part = replace(part, facts=[*part.facts, *under])
     artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
-    made = [
-        own
+    artefacts_of_jobs = [
+        artefact
         for member in comparison.members
-        for own in (member.model, member.evaluation)
-        if own is not None
+        for artefact in (member.model, member.evaluation)
+        if artefact is not None
     ]
     plan = StagePlan(
         stage=SWEEP,
@@ -368,7 +360,10 @@ def draw_sweep(
             "data_titles": part.data_titles,
             "facts": part.facts,
         },
-        inputs={f"{own.stage}/{own.folder.name}": own.digest for own in made},
+        inputs={
+            f"{artefact.stage}/{artefact.folder.name}": artefact.digest
+            for artefact in artefacts_of_jobs
+        },
         code=code_of(SWEEP),
         output=runner.output,
     )
@@ -378,9 +373,7 @@ def draw_sweep(
 
         write_document(build(artefacts), folder, page=False)
         for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", artefacts.table)):
-            written.to_csv(
-                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
-            )
+            write_frame(written, folder / file)
 
     return runner.ensure(plan, write), summary_of_sweep(artefacts)
 
@@ -419,9 +412,9 @@ def _figures(
     columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(["n_parameters", "epochs", *columns], float("nan"))
-    table = _table_of(member.evaluation.folder, METRICS)
-    nominal = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
-    own = {
+    table = read_metrics(member.evaluation.folder)
+    nominal = nominal_rows(table)
+    figures = {
         metric: float(nominal.loc[nominal["metric"] == metric, "value"].iloc[0])
         for metric in ("n_parameters", "epochs")
     }
@@ -430,11 +423,11 @@ def _figures(
         if fault is None
         else table[(table["subset"] == FAULTED) & (table["condition"] == fault.condition)]
     )
-    found = dict(
+    scores = dict(
         zip(scored["metric"] + "." + scored["test_set"], map(float, scored["value"]), strict=True)
     )
     return {
-        **own,
-        **{column: found.get(column, float("nan")) for column in columns},
+        **figures,
+        **{column: scores.get(column, float("nan")) for column in columns},
         "model": member.model.folder.name,
     }

@@ -9,7 +9,6 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -78,9 +77,9 @@ class Runner:
     )  # those found or made so far, by folder
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)
 
-    def _once(self, what: str, of: Any, make: Callable[[], Value]) -> Value:
+    def _once(self, kind: str, of: Any, make: Callable[[], Value]) -> Value:
         """The value of ``make``, which is called the first time alone."""
-        key = what, json.dumps(of, sort_keys=True)
+        key = kind, json.dumps(of, sort_keys=True)
         if key not in self._known:
             self._known[key] = make()
         value: Value = self._known[key]
@@ -91,12 +90,12 @@ class Runner:
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
-            made = self.ensure(
+            artefact = self.ensure(
                 plan,
                 lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report),
             )
         plan.drop(parts_of(plan))
-        return made
+        return artefact
 
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
@@ -164,7 +163,7 @@ class Runner:
         The stored recordings are checked, so that a warning does not depend on which run has ingested them. References of a simulation
         are right.
         """
-        spans = [*split.train, *split.validation, *chain.from_iterable(split.tests.values())]
+        spans = (*split.train, *split.validation, *split.test_spans)
         for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
             if self.dataset_config(dataset, config)["dataset"]["source"] != SIMULATED:
                 self._once(
@@ -231,24 +230,24 @@ class Runner:
         """Make an artefact unless it is there."""
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
-        found = None if plan.stage in self.force else find(plan, self.messages.warn)
-        if found is None and self.dry_run:
+        artefact = None if plan.stage in self.force else find(plan, self.messages.warn)
+        if artefact is None and self.dry_run:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
-        if found is None:
-            found = ensured(
+        if artefact is None:
+            artefact = ensured(
                 plan, write, plan.stage in self.force, self.stop.requested, self._print_waiting
             )
             self.stop.raise_if_requested()
-            assert found is not None
+            assert artefact is not None
         detail = (
             "up to date"
-            if found.skipped
-            else f"{found.provenance['seconds']:.1f} s, {found.folder}"
+            if artefact.skipped
+            else f"{artefact.provenance['seconds']:.1f} s, {artefact.folder}"
         )
-        self.messages.line(REUSED if found.skipped else "done", plan.stage, plan.label, detail)
-        self.artefacts[plan.folder] = found
-        return found
+        self.messages.line(REUSED if artefact.skipped else "done", plan.stage, plan.label, detail)
+        self.artefacts[plan.folder] = artefact
+        return artefact
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
         """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
@@ -264,9 +263,9 @@ class Runner:
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
-            found = existing(group, self.messages.warn)
-            members |= self._received([member for member in found if member.finished])
-            missing = [member.job for member in found if not member.finished]
+            members_of_group = existing(group, self.messages.warn)
+            members |= self._received([member for member in members_of_group if member.finished])
+            missing = [member.job for member in members_of_group if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
         self._publish_weights(members.values())
         failures: dict[str, Failure] = {}
@@ -313,8 +312,8 @@ class Runner:
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
         """Take models that are published under the key of a training and are not there."""
-        wanted = [plan for plan in plans if plan.key in weights and find(plan) is None]
-        for plan in wanted if not self.dry_run else ():
+        published = [plan for plan in plans if plan.key in weights and find(plan) is None]
+        for plan in published if not self.dry_run else ():
             ensured(
                 plan,
                 partial(weights.write, plan.key),
@@ -323,11 +322,11 @@ class Runner:
                 self._print_waiting,
             )
             self.stop.raise_if_requested()
-        if wanted:
+        if published:
             self.messages.line(
                 "note",
                 TRAIN,
-                f"{len(wanted)} of {len(plans)}",
+                f"{len(published)} of {len(plans)}",
                 f"taken from {weights.path}; --retrain trains them",
             )
 
@@ -373,12 +372,14 @@ class Runner:
                     member.job.plan.label,
                     "before its first epoch was over; the next run goes on",
                 )
-            for made in member.made:
-                self.artefacts[made.folder] = made
-                status, detail = _in_words(made)
-                self.messages.line(status, made.stage, made.label, detail)
-                if made.stage == TRAIN and read_fit_metrics(made.folder).get("ended_by_divergence"):
-                    self.messages.warn(f"the training of {made.label} {DIVERGED}")
+            for artefact in member.made:
+                self.artefacts[artefact.folder] = artefact
+                status, detail = _in_words(artefact)
+                self.messages.line(status, artefact.stage, artefact.label, detail)
+                if artefact.stage == TRAIN and read_fit_metrics(artefact.folder).get(
+                    "ended_by_divergence"
+                ):
+                    self.messages.warn(f"the training of {artefact.label} {DIVERGED}")
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
@@ -415,14 +416,14 @@ class Runner:
         )
 
 
-def _in_words(made: Artefact) -> tuple[str, str]:
+def _in_words(artefact: Artefact) -> tuple[str, str]:
     """How a model, a calibration or an evaluation ended, and what came out."""
-    if made.skipped:
+    if artefact.skipped:
         return REUSED, "up to date"
-    if made.status == "interrupted":
-        return "stop", f"the best so far is kept in {made.folder}; the next run goes on"
-    if made.stage == "train":
-        fit = read_fit_metrics(made.folder)
+    if artefact.status == "interrupted":
+        return "stop", f"the best so far is kept in {artefact.folder}; the next run goes on"
+    if artefact.stage == "train":
+        fit = read_fit_metrics(artefact.folder)
         loss = fit.get("best_validation_loss")
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
         if halvings := fit.get("step_size_halvings"):
@@ -432,14 +433,14 @@ def _in_words(made: Artefact) -> tuple[str, str]:
             if loss is None
             else f"validation loss {loss:.4g}"
         )
-    if made.stage == "evaluate":
+    if artefact.stage == "evaluate":
         errors = {
             name: error
-            for name, error in test_figures(made.folder).items()
+            for name, error in test_figures(artefact.folder).items()
             if name.startswith("rmse_sideslip")
         }
         return "done", ", ".join(f"{name} {error:.3f}°" for name, error in errors.items())
-    trust = read_trust(made.folder)
+    trust = read_trust(artefact.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"
     return (

@@ -22,12 +22,12 @@ from vehest.data.splits import VALIDATION
 from vehest.data.text_files import number_in, read_rows
 from vehest.estimators.registry import new_estimator
 from vehest.run.comparison import Comparison
-from vehest.run.evaluate import COLUMNS, METRICS, evaluation_options
+from vehest.run.evaluate import evaluation_options, read_metrics
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.study import Job, Study
 from vehest.run.train import training_options
 from vehest.run.versions import code_of
-from vehest.studies.artefacts import Trial, read_frame
+from vehest.studies.artefacts import Trial, nominal_rows, write_frame
 
 SEARCHES = "searches.csv"
 TRIAL_COLUMNS = (
@@ -58,13 +58,13 @@ def published_values(
     finished: dict[str, float] = {}
     for trials in study.searches.values():
         planned = [_planned_trial(study, name, comparisons) for name in trials]
-        found = {
+        values_found = {
             trial.name: values[trial.key, trial.evaluation, trial.metric]
             for trial in planned
             if trial is not None and (trial.key, trial.evaluation, trial.metric) in values
         }
-        if len(found) == len(trials):
-            finished |= found
+        if len(values_found) == len(trials):
+            finished |= values_found
     return finished
 
 
@@ -122,8 +122,7 @@ def remarks_on(
 def write_trials(trials: Sequence[Trial], path: Path) -> None:
     """Write the trials of searches, a row each, with their keys."""
     rows = [{column: getattr(trial, column) for column in TRIAL_COLUMNS} for trial in trials]
-    table = pd.DataFrame(rows, columns=list(TRIAL_COLUMNS))
-    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
+    write_frame(pd.DataFrame(rows, columns=list(TRIAL_COLUMNS)), path)
 
 
 def _options(study: Study, name: str) -> tuple[str, ...]:
@@ -166,13 +165,8 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
     """Value of the metric that chooses, over all samples of the validation range."""
     evaluation = comparison.members[0].evaluation
     assert evaluation is not None
-    table = read_frame(evaluation.folder / METRICS, COLUMNS, numbers=("value",))
-    rows = table[
-        (table["metric"] == trial.metric)
-        & (table["test_set"] == VALIDATION)
-        & (table["subset"] == "all")
-        & (table["condition"] == "nominal")
-    ]
+    table = nominal_rows(read_metrics(evaluation.folder))
+    rows = table[(table["metric"] == trial.metric) & (table["test_set"] == VALIDATION)]
     if len(rows) != 1:
         raise DataError(
             f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a validation range"
@@ -191,9 +185,9 @@ def _compared(config: Config, tried: set[str] | frozenset[str] = frozenset()) ->
 
 def _without(content: Any, path: Sequence[str]) -> Any:
     """A mapping without a nested key, and without mappings that are empty then."""
-    first, *rest = path
+    first, *nested_path = path
     if not isinstance(content, dict) or first not in content:
         return content
-    others = {key: value for key, value in content.items() if key != first}
-    nested = _without(content[first], rest) if rest else {}
-    return {**others, first: nested} if nested else others
+    siblings = {key: value for key, value in content.items() if key != first}
+    nested = _without(content[first], nested_path) if nested_path else {}
+    return {**siblings, first: nested} if nested else siblings

@@ -88,8 +88,10 @@ def _config_lines(
         text = textwrap.indent(as_yaml({key: value}), indent)
         if line is not None and isinstance(value, list):
             text = f"{indent}{key}: {value_as_yaml(tuple(value))}\n"
-        is_one_line = text.count("\n") == 1
-        yield _line(text.rstrip("\n"), line.comment) if line is not None and is_one_line else text
+        is_single_line = text.count("\n") == 1
+        yield (
+            _line(text.rstrip("\n"), line.comment) if line is not None and is_single_line else text
+        )
 
 
 def _line(key: str, comment: str) -> str:

@@ -20,6 +20,7 @@ from vehest.data.errors import (
     JobsFailedError,
     MissingError,
     VehestError,
+    abbreviated,
 )
 from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
@@ -58,7 +59,16 @@ from vehest.run.run_cache import Ran, RunCache
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
-from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
+from vehest.run.study import (
+    Job,
+    Jobs,
+    Study,
+    content_overrides,
+    failure_messages,
+    jobs_of,
+    read_study,
+    sweep_of,
+)
 from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import learnt_spans, model_artefact, read_fit_metrics, trained_rate
@@ -151,16 +161,18 @@ def run_study(
         runner.evaluates_trained = not (only_report or _trains_missing(study, overrides, options))
         if only_report or runner.evaluates_trained:
             runner.train_first = command_line("run", study.words)
-        shown = [job.config for job in jobs[""]] if study.datasets else []
-        used = [config["dataset"] for config in shown]
+        dataset_configs = [job.config for job in jobs[""]] if study.datasets else []
+        datasets_read = [config["dataset"] for config in dataset_configs]
         for part in study.parts:
-            used += runner.datasets_of(_first(jobs[part]))
+            datasets_read += runner.datasets_of(_first(jobs[part]))
         raw = {
             path: stamp_of(Path(path).expanduser())
-            for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)
+            for path in dict.fromkeys(
+                str(dataset["path"]) for dataset in datasets_read if "path" in dataset
+            )
         }
         datasets: list[StoredDataset | AbsentDataset] = []
-        for config in shown:
+        for config in dataset_configs:
             with suppress(DryRunStop):
                 datasets.append(_dataset(config, study, runner))
         planned = _planned(study, jobs, runner)
@@ -174,7 +186,9 @@ def run_study(
                 f"{len(values)} of {len(study.trials)} trials",
                 f"taken from {RESULTS / study.study / SEARCHES}; --retrain trains them",
             )
-        comparisons = {name: own for name, own in planned.items() if name not in values}
+        comparisons = {
+            name: comparison for name, comparison in planned.items() if name not in values
+        }
         _note_missing(comparisons, runner)
         for comparison in comparisons.values():
             if runner.evaluates_trained:
@@ -194,20 +208,20 @@ def run_study(
                 runner.messages.warn(remark)
             report, summary = draw_report(study, comparisons, datasets, runner, trials, remarks)
         published = None
-        n_not_trained = sum(len(own.unfinished) for own in comparisons.values())
+        n_not_trained = sum(len(comparison.unfinished) for comparison in comparisons.values())
         if error is None and not runner.dry_run and (runner.evaluates_trained or not n_not_trained):
             publication = None
             if study.publish and not content_overrides(overrides):
                 gone = {name: f"part '{name}'" for name in study.parts if name not in planned}
                 gone |= {
-                    own.name: f"data set '{own.name}'"
-                    for own in datasets
-                    if isinstance(own, AbsentDataset)
+                    dataset.name: f"data set '{dataset.name}'"
+                    for dataset in datasets
+                    if isinstance(dataset, AbsentDataset)
                 }
                 inputs = {
-                    own.label: own.inputs
-                    for own in runner.artefacts.values()
-                    if own.stage == INGEST
+                    artefact.label: artefact.inputs
+                    for artefact in runner.artefacts.values()
+                    if artefact.stage == INGEST
                 }  # raw files as they were
                 publication = Publication(
                     study.study,
@@ -292,57 +306,60 @@ def _first(jobs: Sequence[Job]) -> Config:
 
 def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
     """Part -> its planned jobs, before anything is trained; optional parts whose raw files are missing are left out."""
-    found: dict[str, Comparison] = {}
+    comparisons: dict[str, Comparison] = {}
     for name, part in study.parts.items():
         try:
             runner.look_for_files(_first(jobs[name]))
-            found[name] = Comparison(
+            comparisons[name] = Comparison(
                 [replace(job) for job in jobs[name]]
             )  # published keys hold rates before they are lowered
         except MissingError as error:
             if not part.optional:
                 raise
             runner.messages.warn(f"{error}; the study goes on without part '{name}'")
-    if study.parts and not found:
+    if study.parts and not comparisons:
         raise MissingError(
             f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER"
         )
-    for comparison in found.values():
+    for comparison in comparisons.values():
         with suppress(DryRunStop):
             comparison.plan(runner)
-            if not any(comparison.evaluation.split.tests.values()):
+            if not comparison.evaluation.split.test_spans:
                 raise ConfigurationError(
                     f"split '{comparison.evaluation.split.name}' has no test ranges to compare estimators on"
                 )
-    lacking = dict.fromkeys(
-        job.failure.message for own in found.values() for job in own.jobs if job.failure is not None
+    reasons = failure_messages(
+        job for comparison in comparisons.values() for job in comparison.jobs
     )
-    if lacking and not study.shows_failed:
-        raise DataError(f"a study in parts needs all of its jobs; {'; '.join(lacking)}")
-    return found
+    if reasons and not study.shows_failed:
+        raise DataError(f"a study in parts needs all of its jobs; {reasons}")
+    return comparisons
 
 
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
     """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
-    own = config["dataset"]
+    dataset = config["dataset"]
     title, licence, citation = (
-        " ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation")
+        " ".join(str(dataset.get(key, dataset["name"])).split())
+        for key in ("title", "licence", "citation")
     )
     try:
         planned = plan_ingest(config)
     except MissingError as error:
-        if own["name"] not in study.optional_datasets:
+        if dataset["name"] not in study.optional_datasets:
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
-        return AbsentDataset(own["name"], title, licence, citation)
+        return AbsentDataset(dataset["name"], title, licence, citation)
     is_only_drawn = runner.train_first and not runner.evaluates_trained
     if is_only_drawn and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
-    made = runner.ingest(config)
-    files = {Path(name).stem: made.folder / name for name in made.outputs}
-    return StoredDataset(own["name"], title, kind_of(own), made.config, files, licence, citation)
+    artefact = runner.ingest(config)
+    files = {Path(name).stem: artefact.folder / name for name in artefact.outputs}
+    return StoredDataset(
+        dataset["name"], title, kind_of(dataset), artefact.config, files, licence, citation
+    )
 
 
 def _error_of(
@@ -351,12 +368,12 @@ def _error_of(
     """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
     reasons: dict[str, list[str]] = {}
     for name, failure in (
-        pair for own in comparisons.values() for pair in named_failures(own.jobs)
+        pair for comparison in comparisons.values() for pair in named_failures(comparison.jobs)
     ):
         if failure.detail:
             runner.messages.warn(f"{name}:\n{failure.detail}")
         reasons.setdefault(failure.message, []).append(name)
-    jobs = [job for own in comparisons.values() for job in own.jobs]
+    jobs = [job for comparison in comparisons.values() for job in comparison.jobs]
     error = None
     if reasons:
         listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
@@ -364,11 +381,13 @@ def _error_of(
         error = JobsFailedError(
             f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}"
         )
-    nothing = bool(study.parts) and not any(own.members for own in comparisons.values())
+    nothing = bool(study.parts) and not any(
+        comparison.members for comparison in comparisons.values()
+    )
     unfinished = [
         name_in_part(part, name, comparisons)
-        for part, own in comparisons.items()
-        for name in own.unfinished
+        for part, comparison in comparisons.items()
+        for name in comparison.unfinished
     ]
     if unfinished and runner.train_first and (nothing or not study.shows_failed):
         option = " --train-missing" if runner.evaluates_trained else ""
@@ -385,17 +404,16 @@ def _error_of(
     if unfinished and not runner.dry_run:
         going_on = command_line("run" if study.file.name else "sweep", study.words)
         option = " --train-missing" if runner.evaluates_trained else ""
-        more = f" and {len(unfinished) - MAX_NAMED} more" if len(unfinished) > MAX_NAMED else ""
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished[:MAX_NAMED])}{more}; '{going_on}{option}' goes on with them",
+            f"{abbreviated(unfinished, MAX_NAMED)}; '{going_on}{option}' goes on with them",
         )
     return error
 
 
-def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
+def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
@@ -417,7 +435,7 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     }
 
 
-def evaluate_one(
+def evaluate_model(
     overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]
 ) -> dict[str, Any]:
     """Evaluate a model by folder or start of its name, or the one that overrides train, on the tests of a split; raises `MissingError`."""
@@ -431,23 +449,23 @@ def evaluate_one(
             trained = model_artefact(find_model(model, runner.output, note))
             if not any(key_of(override).split(".")[0] == "downsample" for override in overrides):
                 config["downsample"] = preparation_of(trained.folder)
-            how = runner.evaluation(
+            evaluation = runner.evaluation(
                 config, runner.data_for(split, trained_rate(trained), config), faults_of(config)
             )
-            check_channels(how.faults, split, how.data)
+            check_channels(evaluation.faults, split, evaluation.data)
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (found := find(plan, runner.messages.warn)) is None:
+            if (model_found := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
                     f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
                 )
             assert group.evaluation is not None
-            trained = found
-            how = group.evaluation
-        calibration = _calibration(trained, how, runner)
-        artefact = runner.ensure(*how.of(trained, calibration))
+            trained = model_found
+            evaluation = group.evaluation
+        calibration = _calibration(trained, evaluation, runner)
+        artefact = runner.ensure(*evaluation.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
     return {
         "folder": str(artefact.folder),
@@ -457,20 +475,22 @@ def evaluate_one(
     }
 
 
-def _calibration(model: Artefact, how: Evaluation, runner: Runner) -> Artefact | None:
+def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
     learnt = learnt_spans(model)
-    found = None
+    calibration = None
     if model.status == "complete" and (
-        not learnt or set(learnt) == {*how.split.train, *how.split.validation}
+        not learnt or set(learnt) == {*evaluation.split.train, *evaluation.split.validation}
     ):
-        job = plan_calibrate(model, how.split, how.data, runner.output, how.cars)
+        job = plan_calibrate(
+            model, evaluation.split, evaluation.data, runner.output, evaluation.cars
+        )
         if job is not None:
-            found = runner.ensure(*job)
+            calibration = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests
-        found = calibration_of(model.folder, runner.output)
-    if found is None:
+        calibration = calibration_of(model.folder, runner.output)
+    if calibration is None:
         runner.messages.line(
             "note", "calibrate", model.label, "has no calibration, so its estimates have no bands"
         )
-    return found
+    return calibration

@@ -79,11 +79,13 @@ def estimate_shift(estimate: Series, reference: Series) -> Shift:
         raise DataError("--shift auto: both are too short to correlate; give --shift SECONDS")
     best = int(np.argmax(correlations))
     peak = float(correlations[best])
-    other = _second_peak(correlations, best)
-    second = float(correlations[other]) if other is not None else 0.0
+    second_best = _second_peak(correlations, best)
+    second = float(correlations[second_best]) if second_best is not None else 0.0
     unexplained = max(1.0 - max(peak, 0.0) ** 2, MIN_UNEXPLAINED)
     if 1.0 - max(second, 0.0) ** 2 < MIN_VARIANCE_RATIO * unexplained:
-        alternative = f", {second:.2f} at {shifts[other]:.3g} s" if other is not None else ""
+        alternative = (
+            f", {second:.2f} at {shifts[second_best]:.3g} s" if second_best is not None else ""
+        )
         raise DataError(
             f"--shift auto is ambiguous: its correlation with the reference is {peak:.2f} at "
             f"{shifts[best]:.3g} s{alternative}; give --shift SECONDS"
@@ -135,8 +137,8 @@ def _second_peak(correlations: FloatArray, best: int) -> int | None:
         high += 1
     outside = correlations.copy()
     outside[low : high + 1] = -np.inf
-    other = int(np.argmax(outside))
-    return other if np.isfinite(outside[other]) else None
+    highest = int(np.argmax(outside))
+    return highest if np.isfinite(outside[highest]) else None
 
 
 def _vertex(correlations: FloatArray, best: int) -> float:

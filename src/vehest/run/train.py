@@ -101,10 +101,7 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         "seed": seed,
         **ranges,
     }
-    inputs = {
-        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
-        for span in (*split.train, *split.validation)
-    }
+    inputs = digests_of_spans(data, (*split.train, *split.validation))
     label = f"{estimator.name}-{estimator.variant}-seed{seed}"
     plan = StagePlan(
         STAGE,
@@ -149,9 +146,7 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
     training: Any = settings_from_config(members[0].training_type, first.training, "training")
     train, validation = (
         [
-            read_recording(recording_file(first.data[span.dataset], span)).cut(
-                span.start, span.stop
-            )
+            read_recording(stored_recording(first.data, span)).cut(span.start, span.stop)
             for span in spans
         ]
         for spans in (first.split.train, first.split.validation)
@@ -231,12 +226,15 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
     """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles."""
 
     def ranges(config: Mapping[str, Any]) -> list[Span]:
-        named = [own for role in roles or ("train", "validation") for own in config[role]]
         return [
             Span(
-                str(own["dataset"]), str(own["recording"]), float(own["start"]), float(own["stop"])
+                str(entry["dataset"]),
+                str(entry["recording"]),
+                float(entry["start"]),
+                float(entry["stop"]),
             )
-            for own in named
+            for role in roles or ("train", "validation")
+            for entry in config[role]
         ]
 
     return _from_manifest(model, ranges)
@@ -270,18 +268,37 @@ def model_artefact(folder: Path) -> Artefact:
     )
 
 
-def recording_file(data: Artefact, span: Span) -> Path:
-    """The stored recording of a span; raises `DataError` where the data set does not have it."""
-    file_digest(data, span)
-    return data.folder / f"{span.recording}.parquet"
+def stored_recording(data: Mapping[str, Artefact], span: Span) -> Path:
+    """The file of a span's recording.
 
+    Parameters
+    ----------
+    data : mapping
+        Data set -> its recordings.
+    span : Span
+        Range of a recording.
 
-def file_digest(data: Artefact, span: Span) -> str:
-    """Digest of the recording of a span; raises `DataError` where the data set does not have it."""
+    Raises
+    ------
+    DataError
+        The data set does not have the recording.
+    """
+    artefact = data[span.dataset]
     name = f"{span.recording}.parquet"
-    if name not in data.outputs:
-        known = ", ".join(sorted(Path(file).stem for file in data.outputs))
+    if name not in artefact.outputs:
+        available = ", ".join(sorted(Path(file).stem for file in artefact.outputs))
         raise DataError(
-            f"data set '{span.dataset}' has no recording '{span.recording}' (it has {known}); correct the split"
+            f"data set '{span.dataset}' has no recording '{span.recording}' "
+            f"(it has {available}); correct the split"
         )
-    return data.outputs[name]
+    return artefact.folder / name
+
+
+def digests_of_spans(data: Mapping[str, Artefact], spans: Iterable[Span]) -> dict[str, str]:
+    """``DATASET/RECORDING`` -> digest of its file; raises as `stored_recording`."""
+    return {
+        f"{span.dataset}/{span.recording}": data[span.dataset].outputs[
+            stored_recording(data, span).name
+        ]
+        for span in spans
+    }

@@ -196,8 +196,8 @@ def _usability(
         if recordings
         else ()
     )
-    own_rate = estimator.settings.rate_hz
-    rate = min([own_rate, *(summary.rate_hz for summary in summaries)])
+    configured_rate = estimator.settings.rate_hz
+    rate = min([configured_rate, *(summary.rate_hz for summary in summaries)])
     gappy = {name for summary in summaries for name in summary.gappy}
     gaps = tuple(
         channel
@@ -208,7 +208,7 @@ def _usability(
     return Usability(
         name,
         rate,
-        own_rate,
+        configured_rate,
         missing,
         gaps,
         settings,
@@ -304,9 +304,7 @@ def _cells(row: Usability) -> list[str]:
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
     """Channels that recordings of a split lack and its estimator needs, as one line; empty if none; raises `ConfigurationError`."""
     estimator, training = _built(config)
-    tested = (
-        [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
-    )
+    tested = split.test_spans if "evaluation" in config else ()
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
     derived = made_by(config["downsample"]["transforms"])  # of references they are no part
     to_train, to_estimate = (

@@ -38,6 +38,16 @@ def read_frame(
     return table
 
 
+def write_frame(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV, numbers with all their digits."""
+    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
+
+
+def nominal_rows(metrics: pd.DataFrame) -> pd.DataFrame:
+    """Rows of metrics over all samples without a fault."""
+    return metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
+
+
 HEAD = (
     "estimator",
     "variant",
@@ -87,10 +97,10 @@ class EvaluatedModel:
     def segments(self, test_set: str) -> Segments:
         """Sums of its errors over segments of a test set; raises `DataError` where the file is damaged, or has no such test set."""
         path = self.evaluation_folder / "blocks.csv"
-        found = read_segments(path)
-        if test_set not in found:
+        segments = read_segments(path)
+        if test_set not in segments:
             raise DataError(f"'{path}' has no test set '{test_set}'; evaluate again")
-        return found[test_set]
+        return segments[test_set]
 
     def estimate(self, test_set: str, position: int) -> Estimate:
         """The stored estimate of the n-th range of a test set, or of the n-th sequence (`sequences`)."""

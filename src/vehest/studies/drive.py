@@ -56,7 +56,7 @@ from vehest.studies.kit.standing import (
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
-MOST_SHOWN = 8
+MAX_DRAWN = 8
 
 VERSION = "5"
 _ACCURACY = (
@@ -188,7 +188,7 @@ def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
     for test_set in artefacts.split.tests:
         ranking = ranking_of(artefacts, test_set)
         if ranking.order:
-            paragraphs.append(basis_sentence(ranking, _where(artefacts, test_set)))
+            paragraphs.append(basis_sentence(ranking, _describe_test_set(artefacts, test_set)))
     warned = warnings_of(artefacts)
     if warned:
         paragraphs.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
@@ -220,8 +220,10 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
         for name, models in by_name(artefacts.models).items():
             seeds = sorted(model.seed for model in models)
             seed = chosen_seed(seeds, name, runs)
-            own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
-            shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
+            of_seeds = {
+                metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY
+            }
+            of_chosen = {metric: values[seeds.index(seed)] for metric, values in of_seeds.items()}
             row: dict[str, object] = {
                 "estimator": name[0],
                 "variant": name[1],
@@ -230,22 +232,22 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             }
             row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
             row |= {"min_sideslip_speed": min_speed}
-            chosen = shown.pop("rmse_sideslip")
+            chosen = of_chosen.pop("rmse_sideslip")
             finite = name in ranking.order and math.isfinite(chosen)
             row |= {
                 "rmse_sideslip": ranking.rmse[name] if finite else math.nan,
                 "rmse_sideslip_chosen": chosen,
             }
-            row |= {**standing_columns(ranking, name), **_spread_of(own["rmse_sideslip"])}
+            row |= {**standing_columns(ranking, name), **_spread_of(of_seeds["rmse_sideslip"])}
             row |= {
                 f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0]
                 for role in (TRAINING, VALIDATION)
             }
             row |= {
-                "rmse_vy": shown["rmse_vy"],
+                "rmse_vy": of_chosen["rmse_vy"],
                 "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0],
             }
-            row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
+            row |= {**of_chosen, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
             placed.append((ranking.order.index(name) if finite else math.inf, row))
         rows += [row for _, row in sorted(placed, key=lambda pair: pair[0])]
@@ -271,7 +273,7 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 # The words
 
 
-def _where(artefacts: PartArtefacts, test_set: str) -> str:
+def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
     ranges = "; ".join(
         f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}"
@@ -308,23 +310,23 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
         [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]
     )
     if (epochs > 0).any():
-        fewest, most = (
+        lowest, highest = (
             fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max())
         )
         words += (
-            f"; training took {fewest} epochs a network"
-            if fewest == most
-            else f"; training took {fewest} to {most} epochs a network"
+            f"; training took {lowest} epochs a network"
+            if lowest == highest
+            else f"; training took {lowest} to {highest} epochs a network"
         )
     return words + "."
 
 
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     """How one of several parts was made; its tables are called after it."""
-    made, ranges = how_it_was_made(part)
+    method, ranges = how_it_was_made(part)
     title = f"## Appendix: {as_text(part.title)}, method and ranges"
     return [
-        made.replace("## Appendix: method and ranges", title),
+        method.replace("## Appendix: method and ranges", title),
         replace(ranges, name=f"ranges_{name}"),
     ]
 
@@ -450,7 +452,7 @@ def _figures_of(
     finite = board[np.isfinite(board["rmse_sideslip"])]
     if finite.empty:
         return DrawnTest([], [], [], "", {})
-    rows = _shown(finite, recommended)
+    rows = _drawn_rows(finite, recommended)
     forest = _forest(artefacts, finite, test_set, lines)
     signals = signals_of(artefacts, rows, test_set, lines)
     estimators = {
@@ -569,7 +571,7 @@ def _forest(
         for row in board.to_dict("records")
     ]
     caption = (
-        f"RMSE(β) of every estimator over all its seeds with its 95 % interval, on {_where(artefacts, test_set)}. "
+        f"RMSE(β) of every estimator over all its seeds with its 95 % interval, on {_describe_test_set(artefacts, test_set)}. "
         "Filled: the best and those that are not significantly worse."
     )
     return Figure(f"forest_{file_of(test_set)}", caption, forest_figure(rows))
@@ -588,7 +590,7 @@ def _leaderboard_table(
     chosen = [
         folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")
     ]
-    standing = Table(
+    ranked = Table(
         name,
         f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
         "another drive of this kind and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
@@ -613,10 +615,10 @@ def _leaderboard_table(
         # a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY
         [
             ModelLink(
-                f"../../{own.parent.name}/{own.name}/",
-                f"vehest estimate {own.name} lap.csv -o out.parquet",
+                f"../../{folder.parent.name}/{folder.name}/",
+                f"vehest estimate {folder.name} lap.csv -o out.parquet",
             )
-            for own in chosen
+            for folder in chosen
         ],
     )
     seeds = Table(
@@ -638,10 +640,10 @@ def _leaderboard_table(
             "epochs": Column("epochs", decimals=0),
         },
     )
-    return [standing, seeds]
+    return [ranked, seeds]
 
 
-def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
+def _drawn_rows(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
     """At most `MOST_SHOWN` rows in the order of the board, picked by validation.
 
     Where an estimator is ``named``, it comes first, and the best on the test is among them, since the verdict names both.
@@ -652,13 +654,13 @@ def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
         else board["seed"].isna()
     )
     sure = ours | (board.index == board.index[0]) if named else ours
-    kept = (
+    rows = (
         board["rmse_vy_validation"]
         .where(~sure, -math.inf)
         .sort_values(kind="stable", na_position="last")
-        .index[:MOST_SHOWN]
+        .index[:MAX_DRAWN]
     )
-    return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
+    return board.loc[sorted(rows, key=lambda row: (not ours[row], row))]
 
 
 # The training
@@ -670,7 +672,7 @@ def _training(
     models = {(*model.name, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []
-    for row in _shown(first).to_dict("records"):
+    for row in _drawn_rows(first).to_dict("records"):
         name = (row["estimator"], row["variant"])
         history = models[*name, row["seed"]].history()
         if history is not None and len(history) and set(figures.LOSSES) <= set(history):

@@ -35,7 +35,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
     ranking = rank(
-        {name: [joined(own) for own in seeds] for name, seeds in folds.items()},
+        {name: [joined(folds_of_seed) for folds_of_seed in seeds] for name, seeds in folds.items()},
         first.protocol.rate_hz,
     )
     titles = {model.name: as_text(model.title) for part in parts.values() for model in part.models}
@@ -45,7 +45,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         if set(artefacts.titles) <= set(parts)
         else f"{len(parts)} of {len(artefacts.titles)} folds"
     )
-    where = f"{number} ({kinds} data), each estimated by models that were not trained on it"
+    test_text = f"{number} ({kinds} data), each estimated by models that were not trained on it"
     board = overview(ranking, folds, titles, list(parts))
     blocks: list[Block] = [
         _table(board, list(parts)),
@@ -55,7 +55,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "\n\n".join(
             [
                 data_sentence(first),
-                verdict_sentences(ranking, titles, where),
+                verdict_sentences(ranking, titles, test_text),
                 f"In each fold: {budget_sentence(first)}",
             ]
         )
@@ -82,10 +82,13 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
     """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold."""
     groups = [
-        {name: {model.seed: model for model in own} for name, own in by_name(part.models).items()}
+        {
+            name: {model.seed: model for model in models}
+            for name, models in by_name(part.models).items()
+        }
         for part in parts.values()
     ]
-    found = {}
+    segments = {}
     for name in groups[0]:
         if not all(name in group and set(group[name]) == set(groups[0][name]) for group in groups):
             continue
@@ -94,14 +97,14 @@ def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[lis
             for seed in sorted(groups[0][name])
         ]
         if all(
-            math.isfinite(float(own.squared_error_sideslip.sum()))
+            math.isfinite(float(models.squared_error_sideslip.sum()))
             for folds in seeds
-            for own in folds
+            for models in folds
         ):
-            found[name] = seeds
-    if not found:
+            segments[name] = seeds
+    if not segments:
         raise DataError("no estimator has finite errors in all folds")
-    return found
+    return segments
 
 
 def overview(
@@ -123,7 +126,7 @@ def overview(
         row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
         for fold, part in enumerate(parts):
             square, samples = (
-                sum(float(getattr(own[fold], name).sum()) for own in seeds)
+                sum(float(getattr(folds_of_seed[fold], name).sum()) for folds_of_seed in seeds)
                 for name in ("squared_error_sideslip", "sideslip_samples")
             )
             row[part] = math.sqrt(square / samples) if samples else math.nan

@@ -49,13 +49,13 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         for curve in curves_of(list(artefacts.parts.values()))
         for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))
     ]
-    absent = not_compared(part)
+    not_included = not_compared(part)
     appendices: list[Block] = []
-    if absent:
-        lines = "\n".join(f"- {as_text(line)}" for line in absent)
+    if not_included:
+        lines = "\n".join(f"- {as_text(line)}" for line in not_included)
         appendices.append(f"## Estimators that were not compared\n\n{lines}")
-    for name, other in list(artefacts.parts.items())[1:]:
-        appendices += drive.appendix_of(name, other)
+    for name, further_part in list(artefacts.parts.items())[1:]:
+        appendices += drive.appendix_of(name, further_part)
     sentences = {name: text for name, (text, _) in verdicts.items()}
     models = {name: model.name for name, (_, model) in verdicts.items() if model is not None}
     report = drive.comparison(
@@ -97,16 +97,16 @@ def _comparison_with_plain(recommendation: Recommendation) -> str:
         "not told apart": "It is not significantly different from",
         "higher": "It is significantly worse than",
     }
-    others: dict[str, list[str]] = {verdict: [] for verdict in sentences}
-    for other in ranking.order:
-        if other != name and other[0] in PLAIN and other[0] not in BASELINES:
-            pair = ranking.pairs.get((name, other))
+    by_verdict: dict[str, list[str]] = {verdict: [] for verdict in sentences}
+    for plain_name in ranking.order:
+        if plain_name != name and plain_name[0] in PLAIN and plain_name[0] not in BASELINES:
+            pair = ranking.pairs.get((name, plain_name))
             if pair is not None:
-                others[pair.verdict].append(recommendation.titles[other])
+                by_verdict[pair.verdict].append(recommendation.titles[plain_name])
     return " ".join(
-        f"{words} {listed(others[verdict])}."
+        f"{words} {listed(by_verdict[verdict])}."
         for verdict, words in sentences.items()
-        if others[verdict]
+        if by_verdict[verdict]
     )
 
 
@@ -133,13 +133,14 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     counted = np.concatenate(scored)
     left_out = np.concatenate(hidden)
     share = 100.0 * len(counted) / max(len(counted) + len(left_out), 1)
-    most, most_hidden = (
-        float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out)
+    largest, largest_hidden = (
+        float(np.nanmax(angles)) if np.isfinite(angles).any() else 0.0
+        for angles in (counted, left_out)
     )
     words = f"{fixed(share, 0)} % of the test is scored"
     words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
-    if most_hidden > most:
-        words += f", **which contain the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
+    if largest_hidden > largest:
+        words += f", **which contain the largest sideslip** ({fixed(largest_hidden, 1)}°; scored: up to {fixed(largest, 1)}°)"
     if n_slow:
         speed = protocol.describe_min_sideslip_speed(
             span.dataset for span in part.split.tests[test_set]
@@ -186,11 +187,7 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
 def _hard_driving(part: PartArtefacts) -> str:
     """Minutes of hard driving, and how many more would halve the interval, whose width goes as one over the root of the time."""
     split = part.split
-    spans = [
-        *split.train,
-        *split.validation,
-        *(span for spans in split.tests.values() for span in spans),
-    ]
+    spans = (*split.train, *split.validation, *split.test_spans)
     ay = _samples(part, spans, "ay")
     if not len(ay):
         return ""
@@ -208,7 +205,7 @@ def _hard_driving(part: PartArtefacts) -> str:
 
 def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatArray:
     """Samples of a channel over ranges, at the evaluation rate, end to end; none where a recording lacks it."""
-    found = []
+    samples = []
     for span in spans:
         file = part.references.get((span.dataset, span.recording))
         if file is None:
@@ -216,17 +213,17 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
         recording = read_recording(file).cut(span.start, span.stop)
         if channel not in recording:
             return np.zeros(0)
-        found.append(recording[channel][np.isfinite(recording[channel])])
-    return np.concatenate(found) if found else np.zeros(0)
+        samples.append(recording[channel][np.isfinite(recording[channel])])
+    return np.concatenate(samples) if samples else np.zeros(0)
 
 
 def not_compared(part: PartArtefacts) -> list[str]:
     """Families that were not compared, each with the channels that its plainest form lacks; those that failed or had no time come first."""
     lines = [f"{name}: {reason}" for name, reason in part.failed.items()]
-    there = {model.estimator for model in part.models} | {
+    compared = {model.estimator for model in part.models} | {
         name.split("-")[0] for name in part.failed
     }
-    spans = [*part.split.train, *(span for spans in part.split.tests.values() for span in spans)]
+    spans = (*part.split.train, *part.split.test_spans)
     files = [
         part.references[key]
         for span in spans
@@ -236,13 +233,13 @@ def not_compared(part: PartArtefacts) -> list[str]:
         return lines
     channels = set(read_recording(files[0]).channels)
     for name, family in estimator_classes().items():
-        if name in there:
+        if name in compared:
             continue
         reads = getattr(family, "channels", None)
-        lacking = (
+        missing = (
             [channel for channel in reads if channel not in channels]
             if isinstance(reads, tuple)
             else []
         )
-        lines.append(f"{name}: {f'lacks {listed(lacking)}' if lacking else 'not in the pipeline'}")
+        lines.append(f"{name}: {f'lacks {listed(missing)}' if missing else 'not in the pipeline'}")
     return lines

@@ -23,18 +23,21 @@ from vehest.data.errors import ConfigurationError, printable
 from vehest.data.text_files import first_line
 
 ENTRY_POINTS = "vehest.studies"
-OWN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer")
+BUILT_IN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer")
 
 
 @cache
 def study_names() -> list[str]:
     """Every known name: vehest's own, then those that other packages installed."""
-    return [*OWN, *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - set(OWN))]
+    return [
+        *BUILT_IN,
+        *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - set(BUILT_IN)),
+    ]
 
 
 def study_module(name: str) -> ModuleType:
     """The module behind a name; raises `ConfigurationError` where none is or it cannot be loaded."""
-    if name in OWN:
+    if name in BUILT_IN:
         return importlib.import_module(f"{ENTRY_POINTS}.{name}")
     point = next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)
     if point is None:

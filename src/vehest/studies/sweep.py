@@ -71,14 +71,14 @@ class SweepArtefacts:
         or where combinations differ in faults, the mildest of which would win.
         """
         rows = []
-        for number, own in self.jobs.groupby("combination", sort=False):
-            done = own[own["status"] == DONE]
+        for number, jobs in self.jobs.groupby("combination", sort=False):
+            done = jobs[jobs["status"] == DONE]
             row: dict[str, object] = {
                 "combination": number,
-                **{name: own.iloc[0][name] for name in ("title", *self.keys)},
+                **{name: jobs.iloc[0][name] for name in ("title", *self.keys)},
             }
             row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
-            row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
+            row |= {"n_seeds": len(done), "n_failed": len(jobs) - len(done)}
             for name in self.sets:
                 row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(
                     done[f"{METRIC}.{name}"].to_numpy(dtype=float)
@@ -148,13 +148,13 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
             if row["n_failed"]
             else str(row["n_seeds"])
         )
-        which = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
+        settings = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
         scores = [
             mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name])
             for name in artefacts.sets
         ]
         rows.append(
-            ["*" if row["chosen"] else "", *which, fixed(row["n_parameters"], 0), seeds, *scores]
+            ["*" if row["chosen"] else "", *settings, fixed(row["n_parameters"], 0), seeds, *scores]
         )
     return header, rows
 
@@ -179,15 +179,15 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
     maps = []
     for name in artefacts.sets:
         panels = []
-        for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
+        for key, rows in table.groupby(switches, sort=False) if switches else [((), table)]:
             title = ", ".join(
                 f"{names[switch]} = {shown_value(value)}"
                 for switch, value in zip(switches, key, strict=True)
             )
-            panels.append(_panel(own, title, name, numeric, cells))
-        where = _set_in_words(name)
+            panels.append(_panel(rows, title, name, numeric, cells))
+        set_text = _set_in_words(name)
         caption = (
-            f"RMSE(β) on {where} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
+            f"RMSE(β) on {set_text} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
             f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
         )
         ticks = [[str(value) for value in values] for values in cells]
@@ -221,10 +221,10 @@ def _panel(
     """Combinations with two numeric keys of these values, across and up."""
     across, up = numeric
     mean, half, chosen = (
-        table.pivot(index=up, columns=across, values=shown)
+        table.pivot(index=up, columns=across, values=column)
         .reindex(index=cells[1], columns=cells[0])
         .to_numpy(dtype=float)
-        for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
+        for column in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
     )
     return title, mean, half, np.argwhere(chosen == 1.0).tolist()
 
@@ -336,8 +336,10 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
         return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
     row = table[table["chosen"]].iloc[0]
     names = short_names(artefacts.keys)
-    which = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
-    words = f"Chosen on the validation range: **{row['title']}**" + (f" ({which})" if which else "")
+    settings = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
+    words = f"Chosen on the validation range: **{row['title']}**" + (
+        f" ({settings})" if settings else ""
+    )
     figures = [
         f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})"
         for name in artefacts.sets
@@ -375,9 +377,9 @@ def _budget(jobs: pd.DataFrame) -> str:
     done = jobs[jobs["status"] == DONE]
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
-    fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
+    lowest, highest = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
     took = (
-        f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs"
+        f"; training took {lowest if lowest == highest else f'{lowest} to {highest}'} epochs"
         if len(epochs)
         else ""
     )

@@ -76,12 +76,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         Figure("transfer", caption, _drawn(board)),
         *([artefacts.about] if artefacts.about.strip() else []),
     ]
-    absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
+    missing = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     blocks.append(
         carried_over(board)
         + (
-            f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}."
-            if absent
+            f"\n\nNot here, since nothing could be trained or scored: {listed(missing)}."
+            if missing
             else ""
         )
     )
@@ -128,14 +128,14 @@ def overview(
 def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str, float]:
     """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m]; NaN where the point is known."""
     metrics = part.metrics
-    own = metrics[
+    rows = metrics[
         (metrics["condition"] == "best_lever_arm")
         & (metrics["test_set"] == test_set)
         & (metrics["subset"] == "all")
     ]
-    own = own[(own["estimator"] == name[0]) & (own["variant"].fillna("") == name[1])]
+    rows = rows[(rows["estimator"] == name[0]) & (rows["variant"].fillna("") == name[1])]
     errors, arms = (
-        own.loc[own["metric"] == metric, "value"].to_numpy(dtype=float)
+        rows.loc[rows["metric"] == metric, "value"].to_numpy(dtype=float)
         for metric in ("rmse_sideslip", "lever_arm")
     )
     if not len(errors):
@@ -153,13 +153,13 @@ def carried_over(board: pd.DataFrame) -> str:
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
     lines = []
     everywhere = []
-    for title, own in tested.groupby("estimator_title", sort=False):
+    for title, rows in tested.groupby("estimator_title", sort=False):
         names = beaten[beaten["estimator_title"] == title]
-        where = [_place(row, board) for row in names.to_dict("records")]
-        if len(names) == len(own) == len(places):
+        places_beaten = [_place(row, board) for row in names.to_dict("records")]
+        if len(names) == len(rows) == len(places):
             everywhere.append(str(title))
         lines.append(
-            f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}"
+            f"- {title}: {len(names)} of {len(rows)}{f' ({listed(places_beaten)})' if places_beaten else ''}"
         )
     if everywhere:
         first = f"On every one of {len(places)} tests {listed(everywhere)} are significantly better than zero and the static map."
@@ -181,10 +181,10 @@ def _matrix(board: pd.DataFrame) -> Table:
         title: {"estimator": title} for title in board["estimator_title"]
     }
     columns = {"estimator": Column("estimator")}
-    for place, (_, own) in enumerate(board.groupby(["part", "test_set"], sort=False)):
-        found = own.drop_duplicates("estimator_title").to_dict("records")
-        cells = {row["estimator_title"]: _cell(row) for row in found}
-        columns[f"place_{place}"] = Column(_place(found[0], board))
+    for place, (_, rows_of_test) in enumerate(board.groupby(["part", "test_set"], sort=False)):
+        rows_by_title = rows_of_test.drop_duplicates("estimator_title").to_dict("records")
+        cells = {row["estimator_title"]: _cell(row) for row in rows_by_title}
+        columns[f"place_{place}"] = Column(_place(rows_by_title[0], board))
         for title, row in rows.items():
             row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
@@ -225,17 +225,17 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)
         for axes, (part, test_set) in zip(grid.flat, places, strict=False):
-            own = board[(board["part"] == part) & (board["test_set"] == test_set)].set_index(
-                ["estimator", "variant"]
-            )
-            nothing = _first(own, "zero")
+            rows_of_test = board[
+                (board["part"] == part) & (board["test_set"] == test_set)
+            ].set_index(["estimator", "variant"])
+            nothing = _first(rows_of_test, "zero")
             for height, name in enumerate(names):
-                if name[:2] not in own.index or not math.isfinite(
-                    own.loc[name[:2], "rmse_sideslip"]
+                if name[:2] not in rows_of_test.index or not math.isfinite(
+                    rows_of_test.loc[name[:2], "rmse_sideslip"]
                 ):
                     continue
                 value, low, high = (
-                    float(own.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
+                    float(rows_of_test.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
                     for end in ("", "_low", "_high")
                 )
                 colour = lines[name[:2]].colour
@@ -249,10 +249,10 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                     )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
             axes.axvline(1.0, color="black", linewidth=0.7)
-            static = _first(own, "static_map") / nothing
+            static = _first(rows_of_test, "static_map") / nothing
             if math.isfinite(static):
                 axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
-            title = str(own["title"].iloc[0])
+            title = str(rows_of_test["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
             lines_of_title = [
                 *textwrap.wrap(title, TITLE_WIDTH),
@@ -270,16 +270,19 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     return figure
 
 
-def _first(own: pd.DataFrame, estimator: str) -> float:
-    found = own[own.index.get_level_values("estimator") == estimator]["rmse_sideslip"]
-    return float(found.iloc[0]) if len(found) else math.nan
+def _first(rows_of_test: pd.DataFrame, estimator: str) -> float:
+    errors = rows_of_test[rows_of_test.index.get_level_values("estimator") == estimator][
+        "rmse_sideslip"
+    ]
+    return float(errors.iloc[0]) if len(errors) else math.nan
 
 
 def _part(
     name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]
 ) -> list[Block]:
     titles: dict[Name, str] = {
-        own: as_text(models[0].title) for own, models in by_name(part.models).items()
+        name_of_model: as_text(models[0].title)
+        for name_of_model, models in by_name(part.models).items()
     }
     blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
     for test_set in part.split.tests:
@@ -292,7 +295,7 @@ def _part(
         blocks.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
     blocks.append(budget_sentence(part))
     decimals = decimals_for(board["rmse_sideslip"].tolist())
-    shown = board.assign(
+    table = board.assign(
         interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
     )
     columns: dict[str, Column] = (
@@ -316,4 +319,4 @@ def _part(
             " Where the reference was measured is not known: the best lever arm, within 0.5 m, takes off the part of an error that is "
             "one alone; it is chosen on the test, of each estimator for itself."
         )
-    return [*blocks, Table(f"leaderboard_{name}", caption, shown, columns)]
+    return [*blocks, Table(f"leaderboard_{name}", caption, table, columns)]

@@ -94,11 +94,11 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
 
     Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
     """
-    here = versions_here()
+    versions = versions_here()
     unlike = [
-        f"{name} {here.get(name, 'missing')} instead of {own}"
-        for name, own in spec.versions.items()
-        if here.get(name) != own
+        f"{name} {versions.get(name, 'missing')} instead of {version}"
+        for name, version in spec.versions.items()
+        if versions.get(name) != version
     ]
     if unlike:
         raise MissingError(
@@ -112,12 +112,12 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
         if not shared:
             unpack(copies or {})
         outcome = guarded(spec.group.run, should_stop, lambda _: None)
-        made = (
+        files = (
             {}
             if shared or isinstance(outcome, Failure)
             else pack(folders_of(outcome).difference(copies or ()))
         )
-    return Done(spec.position, outcome, made)
+    return Done(spec.position, outcome, files)
 
 
 def versions_here() -> dict[str, str]:
@@ -137,25 +137,25 @@ def inputs_of(group: Group) -> set[Path]:
     starts = {Path(start) for job in group.jobs if (start := job.training.get("start_from"))}
     return (
         folders_of(existing(group))
-        | {artefact.folder for own in data for artefact in own.values()}
+        | {artefact.folder for artefacts in data for artefact in artefacts.values()}
         | starts
     )
 
 
 def folders_of(members: Sequence[Member]) -> set[Path]:
     """Folders of the artefacts of members."""
-    return {own.folder for member in members for own in member.made}
+    return {artefact.folder for member in members for artefact in member.made}
 
 
 def pack(folders: set[Path]) -> Files:
     """The files of artefacts, their manifests included."""
     return {
-        own: {
-            file.relative_to(own).as_posix(): file.read_bytes()
-            for file in own.rglob("*")
+        folder: {
+            file.relative_to(folder).as_posix(): file.read_bytes()
+            for file in folder.rglob("*")
             if file.is_file()
         }
-        for own in folders
+        for folder in folders
     }
 
 
@@ -191,8 +191,8 @@ class RayLauncher:
     @property
     def cores(self) -> int:
         """Cores of the cluster as it is now, ``jobs`` at most; 1 before it is connected."""
-        there = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
-        return min(there, self._jobs or there)
+        n_cores = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
+        return min(n_cores, self._jobs or n_cores)
 
     def launch(
         self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
@@ -234,13 +234,16 @@ class RayLauncher:
         os.environ.update(ENVIRONMENT | os.environ)
         import ray
 
-        own: dict[str, Any] = (
+        options: dict[str, Any] = (
             {"num_cpus": self._jobs, "include_dashboard": False} if self._address == "local" else {}
         )
         handler = signal.getsignal(signal.SIGTERM)
         try:
             ray.init(
-                address=self._address, log_to_driver=False, logging_level=logging.CRITICAL, **own
+                address=self._address,
+                log_to_driver=False,
+                logging_level=logging.CRITICAL,
+                **options,
             )
         except Exception as error:  # ConnectionError, RuntimeError, ValueError, … by what is wrong
             raise MissingError(
@@ -313,17 +316,22 @@ def _line(error: BaseException) -> str:
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
     """What jobs ask the queue for; raises `ConfigurationError` unless each is NAME=VALUE of `PARAMETERS`, positive where it must be."""
-    found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
+    parameters: dict[str, Any] = {
+        "mem_gb": 2.0,
+        "timeout_min": 60,
+        "cpus_per_task": 1,
+        "name": "vehest",
+    }
     for word in words:
         name, _, value = word.partition("=")
         if name not in PARAMETERS or not value:
             raise ConfigurationError(
                 f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}"
             )
-        found[PARAMETERS[name]] = (
+        parameters[PARAMETERS[name]] = (
             _positive(name, value) if name in ("memory_gb", "minutes") else value
         )
-    return {**found, "timeout_min": max(round(found["timeout_min"]), 1)}
+    return {**parameters, "timeout_min": max(round(parameters["timeout_min"]), 1)}
 
 
 def _positive(name: str, text: str) -> float:

@@ -69,11 +69,13 @@ def explorer_of(
     for i, name in enumerate(names[:MOST_INPUTS]):
         columns[f"input{i}"], unit = in_display_unit(name, measured(name))
         inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
-    for i, (own, (model, title, line)) in enumerate(shown.items()):
-        columns[f"vy{i}"] = chained([part.vy for part in scored[own]], gap)
-        bands = [part.bands for part in scored[own]]
+    for i, (candidate, (model, title, line)) in enumerate(shown.items()):
+        columns[f"vy{i}"] = chained([part.vy for part in scored[candidate]], gap)
+        bands = [part.bands for part in scored[candidate]]
         band_vy, band_sideslip = (
-            chained([one[q] for one in bands], gap) if all(q in one for one in bands) else None
+            chained([half_widths[q] for half_widths in bands], gap)
+            if all(q in half_widths for half_widths in bands)
+            else None
             for q in _BANDS
         )
         columns |= {
@@ -127,16 +129,16 @@ def health_over(
         return None
     if not all(name in recording for recording, _ in pieces for name in health.channels):
         return None
-    found = []
+    statuses = []
     for recording, piece in pieces:
         first, end = scored_range(recording, piece, artefacts.protocol)
         begin = recording.index_range(
             max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop
         )[0]
         rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
-        found.append(
+        statuses.append(
             health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[
                 first - begin :
             ]
         )
-    return chained(found, gap)
+    return chained(statuses, gap)

@@ -105,8 +105,8 @@ def plain_text(markdown: str) -> str:
 
 
 def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str]:
-    few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {MIN_BLOCKS} are needed"
-    return [*([few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
+    too_few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {MIN_BLOCKS} are needed"
+    return [*([too_few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
 
 
 def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> EvaluatedModel:

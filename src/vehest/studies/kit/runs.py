@@ -10,7 +10,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, nominal_rows
 
 Name = tuple[str, str]  # estimator and variant
 
@@ -21,8 +21,7 @@ Runs = dict[
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by run and test set; raises `DataError`."""
-    metrics = artefacts.metrics
-    nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
+    nominal = nominal_rows(artefacts.metrics)
     columns = (
         nominal[name].tolist()
         for name in ("estimator", "variant", "seed", "test_set", "metric", column)
@@ -52,10 +51,10 @@ def values_of(
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
     """A metric of the model itself, under whatever test set it was noted."""
-    known = (
+    values = (
         run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run
     )
-    return next(known, math.nan)
+    return next(values, math.nan)
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:

@@ -18,7 +18,7 @@ from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly distinguishes estimators
 CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
 SILENT = 0.7  # bound over the reference itself, above which a drive adds no information on v
-DIFFERENT = (
+MIN_RATIO_OF_PERCENTILES = (
     1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 )
 
@@ -31,7 +31,7 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
     ]
     return [
         *left_out,
-        *_standing(artefacts),
+        *_slow_tests(artefacts),
         *_excitation(artefacts),
         *_floors(artefacts),
         *_kinds(artefacts),
@@ -40,17 +40,17 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
     ]
 
 
-def _standing(artefacts: PartArtefacts) -> list[str]:
+def _slow_tests(artefacts: PartArtefacts) -> list[str]:
     """Tests in which the car is too slow throughout for sideslip to be scored."""
     runs = runs_of(artefacts)
-    found = []
+    sentences = []
     for test_set, spans in artefacts.split.tests.items():
         if _lowest(runs, test_set, "share_below_min_speed") == 1.0:
             speed = artefacts.protocol.describe_min_sideslip_speed(span.dataset for span in spans)
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}`: sideslip is not scored, since the car is slower than {speed} throughout; RMSE(v) counts all samples."
             )
-    return found
+    return sentences
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
@@ -59,24 +59,26 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     An error below the bound shows that an estimator uses information that the bound does not.
     """
     level = _level(artefacts, artefacts.split.tests[test_set])
-    found = []
+    clauses = []
     if level < LITTLE_SIDESLIP:
-        found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
+        clauses.append(f"they hardly excite sideslip ({level:.2g}° rms)")
     bound, error = (
         _lowest(runs_of(artefacts), test_set, name)
         for name in ("floor_cramer_rao", "rmse_sideslip")
     )
     if min(bound, error) > SILENT * level:
-        found.append(
+        clauses.append(
             f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the zero-sideslip baseline {level:.2g}°"
         )
-    return found
+    return clauses
 
 
 def _lowest(runs: Runs, test_set: str, metric: str) -> float:
     """Lowest value of a metric on a test set; NaN where no run has it."""
-    own = [metrics for (*_, name), metrics in runs.items() if name == test_set]
-    return min((metrics[metric] for metrics in own if metric in metrics), default=math.nan)
+    metrics_of_test = [metrics for (*_, name), metrics in runs.items() if name == test_set]
+    return min(
+        (metrics[metric] for metrics in metrics_of_test if metric in metrics), default=math.nan
+    )
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
@@ -86,29 +88,29 @@ def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
-    found = []
+    sentences = []
     for test_set, spans in artefacts.split.tests.items():
         sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
         level = float(np.sqrt(np.mean(np.square(sideslip))))
         if level < LITTLE_SIDESLIP:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the time below "
                 f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide the order."
             )
-    return found
+    return sentences
 
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
     """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain little information on v."""
     runs = runs_of(artefacts)
-    found = list[str]()
+    sentences = list[str]()
     for test_set, spans in artefacts.split.tests.items():
         error, noise, bound = (
             _lowest(runs, test_set, name)
             for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
         )
         if error < CLOSE * noise:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
                 f"errors of the reference may decide the order."
             )
@@ -116,11 +118,11 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
             continue
         level = _level(artefacts, spans)
         if min(bound, error) > SILENT * level:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their inputs is {bound:.2g}°, and the error of "
                 f"the zero-sideslip baseline {level:.2g}°."
             )
-    return found
+    return sentences
 
 
 def _kinds(artefacts: PartArtefacts) -> list[str]:
@@ -128,39 +130,45 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
     if not artefacts.split.train:
         return []
     learnt = _reference(artefacts, artefacts.split.train)
-    found = []
+    sentences = []
     words = {"ay": "lateral acceleration", "sideslip": "sideslip", "vx": "speed"}
     for test_set, spans in artefacts.split.tests.items():
         tested = _reference(artefacts, spans)
-        beyond = []
+        exceeded = []
         short = []
         for name, word in words.items():
             if not (name in tested and name in learnt):
                 continue
-            own, other = (float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt))
-            if other > 0 and own > DIFFERENT * other:
-                beyond.append(f"{word} ({own / other:.2g} times at the 99th percentile)")
-            elif own > 0 and other > DIFFERENT * own:
-                short.append(f"{word} ({own / other:.2g} times)")
-        if beyond:
-            found.append(
-                f"Test set `{test_set}` goes beyond the training ranges in {listed(beyond)}: estimators extrapolate there."
+            tested_level, trained_level = (
+                float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt)
+            )
+            if trained_level > 0 and tested_level > MIN_RATIO_OF_PERCENTILES * trained_level:
+                exceeded.append(
+                    f"{word} ({tested_level / trained_level:.2g} times at the 99th percentile)"
+                )
+            elif tested_level > 0 and trained_level > MIN_RATIO_OF_PERCENTILES * tested_level:
+                short.append(f"{word} ({tested_level / trained_level:.2g} times)")
+        if exceeded:
+            sentences.append(
+                f"Test set `{test_set}` goes beyond the training ranges in {listed(exceeded)}: estimators extrapolate there."
             )
         if short:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than the training."
             )
-        kinds = [artefacts.kinds_of(own) for own in (spans, artefacts.split.train)]
+        kinds = [
+            artefacts.kinds_of(tested_level) for tested_level in (spans, artefacts.split.train)
+        ]
         if kinds[0] != kinds[1]:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}` is {kinds[0]}, the training ranges are {kinds[1]}."
             )
-    return found
+    return sentences
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
     runs = runs_of(artefacts)
-    found = list[str]()
+    estimators = list[str]()
     for name, models in by_name(artefacts.models).items():
         ended = 0
         for model in models:
@@ -168,12 +176,14 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             limit = model.training.get("max_epochs")
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
-            found.append(
+            estimators.append(
                 f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)"
             )
     return (
-        [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."]
-        if found
+        [
+            f"Training ended at its limit, and longer training may lower the error: {listed(estimators)}."
+        ]
+        if estimators
         else []
     )
 
@@ -199,16 +209,16 @@ def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, Flo
         if (span.dataset, span.recording) not in artefacts.references:
             continue
         recording = artefacts.reference(span)
-        own = recording.cut(max(span.start, -math.inf), span.stop)
-        if "ay" not in own:
+        segment = recording.cut(max(span.start, -math.inf), span.stop)
+        if "ay" not in segment:
             parts.pop("ay", None)
         min_speed = artefacts.protocol.min_sideslip_speed_on(span.dataset)
-        known = is_fast_enough(own["vx"], own["vy_ref"], min_speed)
-        known &= np.isfinite(own["ay"]) if "ay" in parts else True
+        is_scored = is_fast_enough(segment["vx"], segment["vy_ref"], min_speed)
+        is_scored &= np.isfinite(segment["ay"]) if "ay" in parts else True
         if "ay" in parts:
-            parts["ay"].append(own["ay"][known])
-        parts["vx"].append(own["vx"][known])
-        parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
+            parts["ay"].append(segment["ay"][is_scored])
+        parts["vx"].append(segment["vx"][is_scored])
+        parts["sideslip"].append(np.arctan2(segment["vy_ref"], segment["vx"])[is_scored])
     return {
         name: np.concatenate([*values, np.zeros(0 if any(map(len, values)) else 1)])
         for name, values in parts.items()
